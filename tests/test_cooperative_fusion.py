@@ -15,11 +15,12 @@ from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
-from log2sim.perception.alignment import align_parts, moving_boxes
 from log2sim.perception.cooperative import (
     SeenBoxes,
+    align_parts,
     match_by_covariance,
     merge_by_covariance,
+    moving_boxes,
     refine_by_views,
     take_off_offset,
 )

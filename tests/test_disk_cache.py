@@ -45,7 +45,7 @@ def test_the_limit_holds_over_all_folders_and_while_a_run_goes_on(tmp_path: Path
     assert sum(p.stat().st_size for p in files(tmp_path)) <= 160_000 * (1 + 1 / 16) + 16 * 1000
     assert all(any((tmp_path / digit).iterdir()) for digit in DIGITS)
     cache.finish({"found": 3})
-    assert sum(DiskCache(tmp_path).usage().bytes.values()) <= 160_000
+    assert sum(size for _, size in DiskCache(tmp_path).usage().values()) <= 160_000
     assert cache.last_run == {"found": 3}
 
 
@@ -79,4 +79,4 @@ def test_processes_share_a_folder_that_is_too_small_for_them(tmp_path: Path) -> 
     cache = DiskCache(tmp_path, max_bytes=16 * 4000)
     cache.put(name(0), b"")
     cache.finish({})
-    assert 0 < sum(cache.usage().bytes.values()) <= 4000
+    assert 0 < sum(size for _, size in cache.usage().values()) <= 4000

@@ -17,11 +17,10 @@ from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream
 from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.first_pass import observe
+from log2sim.perception.first_pass import base_pose, observe
 from log2sim.perception.frames import AHEAD, give_pictures, work_ahead
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, obstacles_of, sample_rays
-from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import synchronize

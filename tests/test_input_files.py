@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from log2sim.config import Config
@@ -20,7 +21,7 @@ from log2sim.logs.kitti.labels import read_text as read_kitti_text
 from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.nuscenes.tables import scan_records
 from log2sim.logs.pandaset.unpickle import read_pickled_table
-from log2sim.logs.records import read_image, read_sweep
+from log2sim.logs.records import image_stream, read_sweep
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.containers import ChunkedFile
 from log2sim.logs.waymo.tfrecord import RecordFile
@@ -33,7 +34,7 @@ READERS: dict[str, tuple[str, type[Exception], Callable[[Path], Any]]] = {
     "scenario": ("a.json", ScenarioError, lambda p: read_json(p, ScenarioError)),
     "config": ("a.toml", ConfigError, lambda p: Config.load(p)),
     "xosc": ("a.xosc", ScenarioError, read_xml),
-    "image": ("a.png", RecordError, lambda p: read_image(p, 0, 4, 4)),
+    "image": ("a.png", RecordError, lambda p: image_stream("a", np.zeros(1, np.int64), [p], (4, 4)).read(0)),
     "sweep": ("a.npz", RecordError, lambda p: read_sweep(p, 0)),
     "table": ("a.csv", LogError, lambda p: read_csv_table(p, {"t_ns": "int"})),
     "pickle": ("a.pkl.gz", RecordError, read_pickled_table),

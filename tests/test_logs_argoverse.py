@@ -169,9 +169,9 @@ def drop(name: str) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("file", "edit", "words"),
     [
-        (POSES, set_cell("qw", 3, 9.0), "row 3: quaternion"),
-        (POSES, set_cell("tx_m", 2, float("nan")), "row 2: quaternion"),
-        (POSES, set_cell("tx_m", 2, 1e300), "row 2: quaternion"),
+        (POSES, set_cell("qw", 3, 9.0), "row 3: position"),
+        (POSES, set_cell("tx_m", 2, float("nan")), "row 2: position"),
+        (POSES, set_cell("tx_m", 2, 1e300), "row 2: position"),
         (POSES, drop("tz_m"), "no column 'tz_m'"),
         (POSES, set_cell("timestamp_ns", 0, None), "column 'timestamp_ns': is int64 with 1 missing values"),
         (POSES, lambda c: c.update({k: [] for k in c}), "expected"),
@@ -181,7 +181,7 @@ def drop(name: str) -> Callable[[dict[str, Any]], None]:
         (INTRINSICS, set_cell("width_px", 0, 10**6), "row 0 ('ring_front_center')"),
         (ANNOTATIONS, set_cell("length_m", 4, 0.0), "row 4: size [0.0,"),
         (ANNOTATIONS, set_cell("category", 1, None), "row 1: no 'category'"),
-        (ANNOTATIONS, set_cell("qz", 0, float("inf")), "row 0: quaternion"),
+        (ANNOTATIONS, set_cell("qz", 0, float("inf")), "row 0: position"),
         (ANNOTATIONS, drop("num_interior_pts"), "no column 'num_interior_pts'"),
     ],
 )

@@ -16,6 +16,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
+from log2sim.logs.records import decode_image
 from log2sim.logs.stamps import transverse_mercator
 from log2sim.logs.validation import validate_log
 
@@ -233,7 +234,13 @@ def test_a_fault_of_a_table_names_its_line_and_field(folder: Path, fault: str) -
 
 
 @pytest.mark.parametrize(
-    ("name", "words"), [(b"x" * 300 + b".jpg", "longer than"), (b"front/\xff\xfe.jpg", "not text in UTF-8: byte 0xff")]
+    ("name", "words"),
+    [
+        (b"x" * 300 + b".jpg", "longer than"),
+        (b"x" * 300 + b"/a.jpg", "longer than"),
+        (b"ab/" * 3000 + b"a.jpg", "longer than"),
+        (b"front/\xff\xfe.jpg", "not text in UTF-8: byte 0xff"),
+    ],
 )
 def test_a_file_name_that_cannot_be_is_named_by_table_and_line(folder: Path, name: bytes, words: str) -> None:
     table = folder / "front/index.csv"
@@ -288,3 +295,12 @@ def test_a_record_that_cannot_be_read_is_one_record(folder: Path, fault: str) ->
     assert str(T0_NS + 200_000_000) in str(caught.value)
     stream.read(1)
     assert len([p for p in validate_log(folder) if file.name in p]) == 1
+
+
+@pytest.mark.parametrize("beside", [b"iCCPx\0\0garbage", b"gAMA\0\0", b"sRGB\x09"])
+def test_what_a_png_says_beside_its_picture_prints_nothing(beside: bytes, capfd: pytest.CaptureFixture[str]) -> None:
+    plain = png(30, 20)
+    chunk = struct.pack(">I", len(beside) - 4) + beside + struct.pack(">I", zlib.crc32(beside))
+    image = decode_image(plain[:33] + chunk + plain[33:], "a.png", (30, 20))
+    assert np.array_equal(image, decode_image(plain, "a.png", (30, 20)))
+    assert capfd.readouterr().err == ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
 from statistics import median
@@ -39,27 +38,20 @@ MEDIANS = ("recall", "precision", "position_median_m", "yaw_median_deg", "size_m
 DIGITS = 4
 
 
-@dataclass(frozen=True)
-class Scope:
-    """What is compared, as for one scenario."""
-
-    max_range_m: float | None = None
-    categories: Sequence[str] | None = None
-
-
 def evaluate_batch(
     folder: BatchFolder,
     truth: Path,
     load_truth: LoadTruth,
-    scope: Scope,
     *,
+    max_range_m: float | None = None,
+    categories: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Figures:
     """Measure each scenario of a batch against the truth of its log.
 
     `truth`: folder in which the logs have the same places as in the batch's own. `load_truth`: returns the truth of a log for
-    a scenario. `progress`: called as `progress(done, total)`. Returns the document of `schemas/batch-metrics-1.json`. Raises
-    `LogError` when no log below `truth` is one of the batch.
+    a scenario. `max_range_m`, `categories`: what is compared, as for one scenario. `progress`: called as `progress(done, total)`.
+    Returns the document of `schemas/batch-metrics-1.json`. Raises `LogError` when no log below `truth` is one of the batch.
     """
     names = sorted(path.parent.name for path in (folder.path / LOGS).glob(f"*/{SCENARIO_FILE}"))
     rows = [row for name in names if (row := folder.read_row(name)) is not None and row.is_done]
@@ -72,32 +64,19 @@ def evaluate_batch(
         entry: Figures = {"log": row.log, "name": row.name}
         try:
             scenario = Scenario.load(folder.log_folder(row.name) / SCENARIO_FILE)
-            found = evaluate(
-                scenario, load_truth(place, scenario), max_range_m=scope.max_range_m, categories=scope.categories
-            )
-            entries.append(entry | _figures(found))
+            found = evaluate(scenario, load_truth(place, scenario), max_range_m=max_range_m, categories=categories)
+            judged, kept = found["correctness"], {name: found[name] for name in (*OF_A_LOG, "counts", "coverage")}
+            entries.append(entry | kept | {"judged_ticks": judged["ticks"], "wrong_ticks": judged["wrong"]["ticks"]})
         except Log2SimError as error:
             entries.append(entry | {"error": str(error)})
         progress(k + 1, len(known))
     return {
         "batch_metrics_version": VERSION,
-        "max_range_m": scope.max_range_m,
-        "categories": None if scope.categories is None else sorted(scope.categories),
+        "max_range_m": max_range_m,
+        "categories": None if categories is None else sorted(categories),
         "without_truth": len(rows) - len(known),
         "total": pool([entry for entry in entries if "error" not in entry]),
         "logs": entries,
-    }
-
-
-def _figures(found: Figures) -> Figures:
-    """Return what is kept of the metrics of one scenario."""
-    judged = found["correctness"]
-    return {
-        **{name: found[name] for name in OF_A_LOG},
-        "counts": found["counts"],
-        "coverage": found["coverage"],
-        "judged_ticks": judged["ticks"],
-        "wrong_ticks": judged["wrong"]["ticks"],
     }
 
 
@@ -111,50 +90,43 @@ def pool(entries: Sequence[Figures]) -> Figures:
     counts = {name: sum(e["counts"][name] for e in entries) for name in (entries[0]["counts"] if entries else ())}
     matched, false = counts.get("matched_ticks", 0), counts.get("false_ticks", 0)
     truth, switches = counts.get("truth_ticks", 0), sum(e["id_switches"] for e in entries)
-    judged, wrong = (sum(e[name] for e in entries) for name in ("judged_ticks", "wrong_ticks"))
+    known = {name: [e for e in entries if e[name] is not None] for name in (*POOLED_BY_SQUARE, *MEDIANS)}
+    squares = {}
+    for name in POOLED_BY_SQUARE:
+        ticks = [e["counts"]["matched_ticks"] for e in known[name]]
+        total = sum(count * e[name] ** 2 for count, e in zip(ticks, known[name]))
+        squares[name] = rounded(sqrt(total / sum(ticks)), DIGITS) if sum(ticks) else None
     covered = [e["coverage"] for e in entries if "coverage" in e]
+    coverage: Figures = {}
+    if covered:
+        # What LiDARs hit is that of the logs with points.
+        hits = [c for c in covered if c["hit"] is not None]
+        hit, hit_matched = (sum(c[key] for c in hits) if hits else None for key in ("hit", "hit_matched"))
+        coverage = {
+            **{key: sum(c[key] for c in covered) for key in ("labeled", "counted")},
+            "why_not": {name: sum(c["why_not"][name] for c in covered) for name in covered[0]["why_not"]},
+            "hit": hit,
+            "hit_matched": hit_matched,
+            "hit_recall": None if hit_matched is None else _share(hit_matched, hit or 0),
+        }
     return {
         "logs": len(entries),
         "recall": _share(matched, truth),
         "precision": _share(matched, matched + false),
-        **{name: _pooled_root(entries, name) for name in POOLED_BY_SQUARE},
+        **squares,
         "id_switches": switches,
         "mota": mota(truth, truth - matched, false, switches) if truth else None,
-        "wrong_share": _share(wrong, judged),
-        **({"coverage": _pooled_coverage(covered)} if covered else {}),
+        "wrong_share": _share(sum(e["wrong_ticks"] for e in entries), sum(e["judged_ticks"] for e in entries)),
+        **({"coverage": coverage} if coverage else {}),
         "counts": counts,
-        "median_of_logs": {name: _median(entries, name) for name in MEDIANS},
-    }
-
-
-def _pooled_coverage(covered: Sequence[Figures]) -> Figures:
-    """Add up what was labeled and counted in each log; what LiDARs hit is that of the logs with points."""
-    hits = [c for c in covered if c["hit"] is not None]
-    hit, matched = (sum(c[key] for c in hits) if hits else None for key in ("hit", "hit_matched"))
-    return {
-        "labeled": sum(c["labeled"] for c in covered),
-        "counted": sum(c["counted"] for c in covered),
-        "why_not": {name: sum(c["why_not"][name] for c in covered) for name in covered[0]["why_not"]},
-        "hit": hit,
-        "hit_matched": matched,
-        "hit_recall": _share(matched, hit) if hit and matched is not None else None,
+        "median_of_logs": {
+            name: rounded(median(e[name] for e in known[name]), DIGITS) if known[name] else None for name in MEDIANS
+        },
     }
 
 
 def _share(part: int, whole: int) -> float | None:
     return rounded(part / whole, DIGITS) if whole else None
-
-
-def _pooled_root(entries: Sequence[Figures], name: str) -> float | None:
-    """Return the root mean square over the matched ticks of all logs of a figure that is one for each."""
-    known = [(e["counts"]["matched_ticks"], e[name]) for e in entries if e[name] is not None]
-    ticks = sum(count for count, _ in known)
-    return rounded(sqrt(sum(count * value**2 for count, value in known) / ticks), DIGITS) if ticks else None
-
-
-def _median(entries: Sequence[Figures], name: str) -> float | None:
-    known = [e[name] for e in entries if e[name] is not None]
-    return rounded(median(known), DIGITS) if known else None
 
 
 def format_batch_verdict(document: Figures) -> str:
@@ -168,22 +140,15 @@ def format_batch_verdict(document: Figures) -> str:
         ticks = counts["matched_ticks"] + counts["false_ticks"]
         lines.append(("precision", f"{percent(total['precision'])} of {ticks} reconstructed agent-ticks"))
     if total["position_rmse_m"] is not None:
-        lines.append(
-            (
-                "errors",
-                error_text(
-                    {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in POOLED_BY_SQUARE}}
-                ),
-            )
-        )
+        figures = {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in POOLED_BY_SQUARE}}
+        lines.append(("errors", error_text(figures)))
     if total["wrong_share"] is not None:
         lines.append(("wrong", f"{percent(total['wrong_share'])} of the reconstructed agents' ticks"))
     low = sorted((e["recall"], e["log"]) for e in compared if e["recall"] is not None and e["recall"] < 1)
     if low and len(compared) > 1:
         lines.append(("lowest", "; ".join(f"{log} recall {percent(recall)}" for recall, log in low[:MAX_NAMED])))
-    notes = [f"{document['without_truth']} logs are not below the folder with the truth"] * bool(
-        document["without_truth"]
-    )
+    missing = document["without_truth"]
+    notes = [f"{missing} logs are not below the folder with the truth"] if missing else []
     notes += [f"{entry['log']}: {entry['error']}" for entry in document["logs"] if "error" in entry]
     return verdict_text([*lines, *(("note:", note) for note in notes)])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import glob
-import hashlib
 import html
 import re
 import secrets
@@ -50,28 +49,22 @@ class Job:
 
 def make_jobs(logs: Sequence[FoundLog], out: Path, token: str, *, cache: bool = True) -> list[Job]:
     """Return a job for each log, with a name for its folder that no other has and that any file system takes."""
-    plain = [_plain_name(log.id) for log in logs]
+
+    def plain(text: str) -> str:
+        if len(text) <= MAX_NAME_CHARS and _SAFE.fullmatch(text):
+            return text
+        return _UNSAFE_CHARS.sub("_", text).strip("._-")[-MAX_NAME_CHARS:] or "log"
+
     # Some file systems do not tell upper from lower case.
-    count = Counter(name.lower() for name in plain)
-    names = [
-        name if name == log.id and count[name.lower()] == 1 else f"{name}-{_hash(f'{log.format}:{log.id}')}"
-        for log, name in zip(logs, plain)
-    ]
-    return [
-        Job(str(out.absolute()), token, name, log.id, str(log.path.absolute()), log.format, log.sequence, cache)
-        for log, name in zip(logs, names)
-    ]
-
-
-def _plain_name(text: str) -> str:
-    """Return a text with letters, digits, "._-" alone, no dot in front, and of a limited length."""
-    if len(text) <= MAX_NAME_CHARS and _SAFE.fullmatch(text):
-        return text
-    return _UNSAFE_CHARS.sub("_", text).strip("._-")[-MAX_NAME_CHARS:] or "log"
-
-
-def _hash(text: str) -> str:
-    return sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:HASH_DIGITS]
+    count = Counter(plain(log.id).lower() for log in logs)
+    jobs = []
+    for log in logs:
+        name = plain(log.id)
+        if name != log.id or count[name.lower()] > 1:
+            name += f"-{sha256(f'{log.format}:{log.id}'.encode('utf-8', 'surrogateescape')).hexdigest()[:HASH_DIGITS]}"
+        place = str(log.path.absolute())
+        jobs.append(Job(str(out.absolute()), token, name, log.id, place, log.format, log.sequence, cache))
+    return jobs
 
 
 MAX_ERROR_CHARS = 2000  # of a message in a table; `error.txt` has all of it
@@ -118,6 +111,9 @@ class Row(BaseModel):
         return self.status == "done"
 
 
+IDENTITY = ("name", "log", "format", "sequence")
+
+
 def done_row(job: Job, report: dict[str, Any], spent: dict[str, Any]) -> Row:
     """Return the row of a log that was reconstructed, with what it took: `seconds`, `cpu_s` and `peak_memory_mib`."""
     agents = report["agents"]
@@ -142,10 +138,8 @@ def failed_row(job: Job, kind: str, message: str, spent: dict[str, Any] | None =
 
 
 def _identity(job: Job) -> dict[str, Any]:
-    texts = {key: getattr(job, key) for key in ("name", "log", "format", "sequence")}
-    return {key: text.encode("utf-8", "backslashreplace").decode() for key, text in texts.items()} | {
-        "attempts": job.attempts
-    }
+    texts = {key: getattr(job, key).encode("utf-8", "backslashreplace").decode() for key in IDENTITY}
+    return {**texts, "attempts": job.attempts}
 
 
 SUMMED = ("ticks", "duration_s", "agents", "static", "doubtful", "faults", "unreadable", "seconds", "cpu_s")
@@ -216,7 +210,7 @@ class BatchSettings(BaseModel):
 
     def differences(self, other: BatchSettings) -> list[str]:
         """List the settings in which two batches differ, as "name: ours, theirs"."""
-        mine, theirs = (_flat(_compared(s)) for s in (self, other))
+        mine, theirs = (_flat(s.model_dump(exclude={"token", "batch_version"})) for s in (self, other))
         names = [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
         return [f"{name}: {mine.get(name)!r}, before {theirs.get(name)!r}" for name in names]
 
@@ -302,10 +296,6 @@ class BatchFolder:
                 remove(path)
 
 
-def _compared(settings: BatchSettings) -> dict[str, Any]:
-    return {key: value for key, value in settings.model_dump().items() if key not in ("token", "batch_version")}
-
-
 def is_batch(path: Path) -> bool:
     """Return whether a folder is that of a batch."""
     return (path / SETTINGS_FILE).is_file()
@@ -320,23 +310,13 @@ def _flat(document: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 MAX_ROWS = 5000  # of each table, which browsers lay out in a second; the Parquet file has all
+# Field of the row, title, and format of a number.
 COLUMNS = (
-    ("log", "log", ""),
-    ("format", "format", ""),
-    ("ticks", "ticks", "d"),
-    ("duration_s", "duration s", ".1f"),
-    ("agents", "agents", "d"),
-    ("static", "static", "d"),
-    ("doubtful", "doubtful", "d"),
-    ("faults", "faults", "d"),
-    ("unreadable", "unreadable", "d"),
-    ("cross_track_max_m", "off path m", ".3f"),
-    ("new_collisions", "collisions", "d"),
-    ("seconds", "seconds", ".2f"),
-    ("cpu_s", "CPU s", ".2f"),
-    ("peak_memory_mib", "peak MiB", ".0f"),
-    ("attempts", "attempts", "d"),
-)
+    ("log", "log", ""), ("format", "format", ""), ("ticks", "ticks", "d"), ("duration_s", "duration s", ".1f"), ("agents", "agents", "d"),
+    ("static", "static", "d"), ("doubtful", "doubtful", "d"), ("faults", "faults", "d"), ("unreadable", "unreadable", "d"),
+    ("cross_track_max_m", "off path m", ".3f"), ("new_collisions", "collisions", "d"), ("seconds", "seconds", ".2f"),
+    ("cpu_s", "CPU s", ".2f"), ("peak_memory_mib", "peak MiB", ".0f"), ("attempts", "attempts", "d"),
+)  # fmt: skip
 
 
 def write_batch_page(path: Path, rows: Sequence[Row], settings: BatchSettings, *, total: int) -> None:
@@ -350,10 +330,14 @@ def write_batch_page(path: Path, rows: Sequence[Row], settings: BatchSettings, *
 
 def html_of(rows: Sequence[Row], settings: BatchSettings, total: int) -> str:
     """Assemble the page; its content security policy allows its own script and style by their hashes and nothing else."""
-    style, script = (_file(name) for name in ("page.css", "page.js"))
+    style, script, page = (
+        resources.files("log2sim.batch").joinpath(name).read_text(encoding="utf-8")
+        for name in ("page.css", "page.js", "page.html")
+    )
+    hashes = [f"sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}" for text in (style, script)]
     failed, done = ([row for row in rows if row.is_done == wanted] for wanted in (False, True))
     parts = {
-        "policy": f"default-src 'none'; script-src '{_page_hash(script)}'; style-src '{_page_hash(style)}'; img-src data:; "
+        "policy": f"default-src 'none'; script-src '{hashes[1]}'; style-src '{hashes[0]}'; img-src data:; "
         "base-uri 'none'; form-action 'none'",
         "style": style,
         "script": script,
@@ -364,19 +348,18 @@ def html_of(rows: Sequence[Row], settings: BatchSettings, total: int) -> str:
         "logs": _logs(done),
     }
     # One pass: inserted text is not searched again, so no name of a log can be taken for a placeholder.
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], page)
 
 
 def _figures(rows: Sequence[Row], total: int) -> Iterable[str]:
     """Yield the sums as entries of a list of descriptions."""
     sums = sum_up(rows)
-    agents = f"{sums['agents']:,.0f} ({sums['static']:,.0f} static, {sums['doubtful']:,.0f} doubtful)"
     figures = {
         "logs": f"{total:,}",
         "done": f"{sums['done']:,.0f}",
         "failed": f"{sums['failed']:,.0f}",
         "not run yet": f"{total - len(rows):,}" if total > len(rows) else "",
-        "agents": agents,
+        "agents": f"{sums['agents']:,.0f} ({sums['static']:,.0f} static, {sums['doubtful']:,.0f} doubtful)",
         "recorded": f"{sums['duration_s'] / 3600:,.2f} h, {sums['ticks']:,.0f} ticks",
         "CPU time": f"{sums['cpu_s'] / 3600:,.2f} h",
     }
@@ -430,11 +413,3 @@ def _cell(row: Row, name: str, form: str) -> str:
 def _linked(row: Row) -> str:
     """Return the name of a log as a link to its folder beside the page."""
     return f'<a href="logs/{html.escape(row.name)}/">{html.escape(row.log)}</a>'
-
-
-def _page_hash(text: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def _file(name: str) -> str:
-    return resources.files("log2sim.batch").joinpath(name).read_text(encoding="utf-8")

@@ -35,7 +35,6 @@ from log2sim.batch.folder import (
     write_parquet,
 )
 from log2sim.config import Config
-from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, Log2SimError, MissingExtra
 from log2sim.files.documents import write_json
 from log2sim.files.inputs import following_links, follows_links
@@ -60,28 +59,11 @@ def _batch_of(out: str, token: str) -> tuple[BatchFolder, Config]:
     folder = BatchFolder.load(Path(out))
     if folder.settings.token != token:
         raise ConfigError(f"{where}: {out} holds another batch there; workers need the same folders")
-    _require_version(folder.settings, where)
+    if folder.settings.log2sim_version != __version__:
+        begun = folder.settings.log2sim_version
+        raise ConfigError(f"{where}: has log2sim {__version__}, the batch was begun with {begun}")
     cv2.setNumThreads(usable_threads())
     return folder, Config.load(**folder.settings.config)
-
-
-def _require_version(settings: BatchSettings, where: str) -> None:
-    if settings.log2sim_version != __version__:
-        raise ConfigError(f"{where}: has log2sim {__version__}, the batch was begun with {settings.log2sim_version}")
-
-
-def _stopwatch() -> Callable[[], dict[str, float]]:
-    """Return a function that says what was spent since."""
-    wall, used = time.perf_counter(), time.process_time()
-
-    def spent() -> dict[str, float]:
-        return {
-            "seconds": round(time.perf_counter() - wall, 4),
-            "cpu_s": round(time.process_time() - used, 4),
-            "peak_memory_mib": round(peak_memory_mib(), 1),
-        }
-
-    return spent
 
 
 # Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for
@@ -267,18 +249,9 @@ def plan_batch(
 def run_batch(batch: Batch, connect: Connect, *, progress: Progress = lambda done, total: None) -> list[Row]:
     """Run the logs of a batch that are missing, and write its tables, however it ends.
 
-    Parameters
-    ----------
-    connect : callable
-        Returns a context manager of workers. It is called if there is something to do, and again for what is repeated, so that workers
-        that are started for it are fresh ones.
-    progress : callable
-        Called as `progress(done, total)`.
-
-    Returns
-    -------
-    list of Row
-        Of all logs, those of earlier runs among them.
+    `connect`: returns a context manager of workers. It is called if there is something to do, and again for what is repeated, so
+    that workers that are started for it are fresh ones. `progress`: called as `progress(done, total)`. Returns the rows of all
+    logs, those of earlier runs among them.
     """
     rows, finished = dict(batch.done), len(batch.done)
     try:
@@ -312,34 +285,10 @@ def reconstruct_all(
 ) -> list[Row]:
     """Reconstruct all logs below a folder, several at once, or go on with that; see `plan_batch` and `run_batch`.
 
-    Parameters
-    ----------
-    root, out : Path or str
-        Folder with logs, and folder for the results.
-    config : Config, optional
-        Settings of all runs.
-    format : str
-        Format of the logs, or "auto".
-    jobs : int, optional
-        Worker processes on this machine; one for each core by default.
-    scheduler : str, optional
-        Address of a Dask scheduler, whose workers are used instead.
-    overwrite : bool
-        Whether to start over, without the results of earlier runs.
-    cache : bool
-        Whether detections in pictures are taken from the caches of the workers, and kept there.
-    replay : bool
-        Whether each scenario is replayed, too.
-    progress : callable, optional
-        Called as `progress(done, total)`.
+    `root`, `out`: folder with logs, and folder for the results. `jobs`: worker processes on this machine, one for each core by
+    default. `scheduler`: address of a Dask scheduler, whose workers are used instead. Returns the rows of all logs; those that
+    failed say why.
 
-    Returns
-    -------
-    list of Row
-        Of all logs; those that failed say why.
-
-    Notes
-    -----
     Worker processes import the script that calls this, which needs `if __name__ == "__main__":` around the call.
     """
     planned = plan_batch(
@@ -378,7 +327,11 @@ def _run_once(
 
     def submit(count: int) -> None:
         for job in islice(waiting, count):
-            future = _submit(workers, job, avoided)
+            others = workers.others_than(avoided[job.name]) if job.name in avoided else []
+            preferred = {"workers": others, "allow_other_workers": True} if others else {}
+            # A key of its own for each run: Dask returns the result that it has under a known one.
+            key = f"log2sim-{job.token}-{job.name}-{secrets.token_hex(KEY_BYTES)}"
+            future = workers.client.submit(_run_on_worker, job, key=key, pure=False, **preferred)
             running[future.key] = job
             futures.add(future)
 
@@ -395,15 +348,26 @@ def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
     or with the settings. Raises `ConfigError` where the folder of the batch is not visible, or of another version.
     """
     folder, config = _batch_of(job.out, job.token)
-    target, spent = folder.log_folder(job.name), _stopwatch()
+    target, wall, used = folder.log_folder(job.name), time.perf_counter(), time.process_time()
+
+    def spent() -> dict[str, float]:
+        seconds, cpu_s = time.perf_counter() - wall, time.process_time() - used
+        return {"seconds": round(seconds, 4), "cpu_s": round(cpu_s, 4), "peak_memory_mib": round(peak_memory_mib(), 1)}
+
     try:
         with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
             log = open_log(job.path, format=job.format, sequence=job.sequence)
             result = reconstruct(log, config, cache=job.cache, jobs=1)
             result.scenario.save(unfinished / SCENARIO_FILE)
             write_json(unfinished / REPORT_FILE, result.report)
-            replayed = _replay(result.scenario, unfinished / REPLAY_FILE) if folder.settings.replay else {}
-            row = done_row(job, result.report, spent() | replayed)
+            figures = spent()
+            if folder.settings.replay:
+                begun = time.process_time()
+                replayed = replay(result.scenario)
+                replayed.save(unfinished / REPLAY_FILE)
+                figures |= {key: replayed.metrics[key] for key in ("cross_track_max_m", "new_collisions")}
+                figures["replay_s"] = round(time.process_time() - begun, 4)
+            row = done_row(job, result.report, figures)
             write_json(unfinished / ROW_FILE, row.model_dump())
         return row.model_dump(), False
     except Log2SimError as error:
@@ -413,23 +377,6 @@ def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
         may_repeat, text = True, traceback.format_exc()
     folder.write_failure(row, text)
     return row.model_dump(), may_repeat
-
-
-def _replay(scenario: Scenario, out: Path) -> dict[str, float]:
-    """Replay a scenario into a file, and return the figures of its row."""
-    used = time.process_time()
-    result = replay(scenario)
-    result.save(out)
-    figures = {key: result.metrics[key] for key in ("cross_track_max_m", "new_collisions")}
-    return {"replay_s": round(time.process_time() - used, 4), **figures}
-
-
-def _submit(workers: Workers, job: Job, avoided: Mapping[str, str]) -> Future:
-    others = workers.others_than(avoided[job.name]) if job.name in avoided else []
-    preferred = {"workers": others, "allow_other_workers": True} if others else {}
-    # A key of its own for each run: Dask returns the result that it has under a known one.
-    key = f"log2sim-{job.token}-{job.name}-{secrets.token_hex(KEY_BYTES)}"
-    return workers.client.submit(_run_on_worker, job, key=key, pure=False, **preferred)
 
 
 def _ended(workers: Workers, future: Future, job: Job, folder: BatchFolder) -> Finished:

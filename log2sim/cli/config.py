@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from log2sim.cli.options import ConfigFile, Settings, say
+from log2sim.cli import options as opt
 
 
-def config(file: ConfigFile = None, settings: Settings = None) -> None:
+def config(file: opt.ConfigFile = None, settings: opt.Settings = None) -> None:
     """Print all settings as TOML.
 
     Each with its meaning, unit, choices and default; with --config or --set, the values that these give.
@@ -17,4 +17,4 @@ def config(file: ConfigFile = None, settings: Settings = None) -> None:
     """
     from log2sim.config import Config
 
-    say(Config.load(file, settings or ()).to_toml(comments=True).rstrip())
+    opt.say(Config.load(file, settings or ()).to_toml(comments=True).rstrip())

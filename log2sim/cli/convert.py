@@ -6,35 +6,21 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import (
-    Cameras,
-    Format,
-    LabelFile,
-    LogPath,
-    Overwrite,
-    Quiet,
-    SequenceName,
-    Start,
-    Stop,
-    camera_names,
-    counted,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 from log2sim.errors import ConfigError
 
 
 def convert(
-    log: LogPath,
-    out: Annotated[Path, write_to("DIR", "Folder to write.")],
-    format: Format = "auto",
-    sequence: SequenceName = None,
-    start: Start = None,
-    stop: Stop = None,
-    cameras: Cameras = None,
-    labels: LabelFile = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    log: opt.LogPath,
+    out: Annotated[Path, opt.write_to("DIR", "Folder to write.")],
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
+    start: opt.Start = None,
+    stop: opt.Stop = None,
+    cameras: opt.Cameras = None,
+    labels: opt.LabelFile = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are.
 
@@ -49,7 +35,7 @@ def convert(
     from log2sim.logs.native.writer import refuse_target, write_log
     from log2sim.logs.opening import open_log
 
-    names = camera_names(cameras)
+    names = opt.camera_names(cameras)
     refuse_target(out, overwrite=overwrite)
     check_folder(out, overwrite=overwrite)
     if out.resolve() in (log.resolve(), *log.resolve().parents):
@@ -57,8 +43,7 @@ def convert(
     part = cut_log(
         open_log(log, format=format, sequence=sequence, labels=labels), cameras=names, start_s=start, stop_s=stop
     )
-    for note in part.notes:
-        say(f"note: {note}", quiet=quiet)
+    opt.say_all("note", part.notes, quiet=quiet)
     problems: list[str] = []
     with progress(quiet=quiet) as report_progress:
         write_log(
@@ -69,8 +54,10 @@ def convert(
             progress=partial(report_progress, "convert"),
             problems=problems,
         )
-    for problem in problems:
-        say(f"note: left out: {problem}", quiet=quiet)
+    opt.say_all("note: left out", problems, quiet=quiet)
     records = sum(len(stream.t_ns) for stream in part.streams.values()) - len(problems)
     size_mb = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
-    say(f"{out}: {counted(records, 'record')} of {counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB", quiet=quiet)
+    opt.say(
+        f"{out}: {opt.counted(records, 'record')} of {opt.counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB",
+        quiet=quiet,
+    )

@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, SequenceName, counted, option, say, write_to
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
 
 
 def correct(
-    scenario: ScenarioPath,
+    scenario: opt.ScenarioPath,
     corrections: Annotated[
         Path, typer.Argument(metavar="CORRECTIONS", help="File of corrections, see schemas/corrections-1.json.")
     ],
-    out: Annotated[Path, write_to("FILE", "Scenario file to write.")],
+    out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
     log: Annotated[
-        Path | None, option("Log of the scenario, whose LiDAR points in the corrected boxes are counted.", "LOG")
+        Path | None, opt.option("Log of the scenario, whose LiDAR points in the corrected boxes are counted.", "LOG")
     ] = None,
-    sequence: SequenceName = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    sequence: opt.SequenceName = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Apply corrections that a person made: merged, split, moved and deleted agents, categories, fronts, sizes, colors, lines.
 
@@ -59,11 +59,10 @@ def correct(
 
         corrected = tag(corrected)
     corrected.save(out)
-    for line in lines:
-        say(f"warning: {line}", quiet=quiet)
+    opt.say_all("warning", lines, quiet=quiet)
     done = len(document["corrections"]) - len(result.unmatched)
     lost = f", {len(result.unmatched)} without its agent" if result.unmatched else ""
-    say(f"{out}: {counted(done, 'correction')} applied{lost}", quiet=quiet)
+    opt.say(f"{out}: {opt.counted(done, 'correction')} applied{lost}", quiet=quiet)
 
 
 def _with_points(scenario: Scenario, changed: set[str], log: Path, sequence: str | None) -> tuple[Scenario, list[str]]:

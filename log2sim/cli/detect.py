@@ -4,50 +4,33 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from log2sim.cli.options import (
-    ConfigFile,
-    Format,
-    LabelFile,
-    LogPath,
-    Overwrite,
-    Poses,
-    Quiet,
-    SequenceName,
-    Settings,
-    Start,
-    Stop,
-    complete_plugins,
-    counted,
-    option,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 
 def detect(
-    log: LogPath,
-    out: Annotated[Path, write_to("FILE", "Boxes file to write.")],
+    log: opt.LogPath,
+    out: Annotated[Path, opt.write_to("FILE", "Boxes file to write.")],
     detector: Annotated[
         str,
-        option(
+        opt.option(
             "Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
             "the log).",
             "lidar:NAME|lidar:MODEL.onnx",
-            completes=complete_plugins("lidar_detector", prefix="lidar:"),
+            completes=opt.complete_plugins("lidar_detector", prefix="lidar:"),
         ),
     ] = "lidar:vehicle",
-    format: Format = "auto",
-    sequence: SequenceName = None,
-    start: Start = None,
-    stop: Stop = None,
-    poses: Poses = None,
-    labels: LabelFile = None,
-    config: ConfigFile = None,
-    settings: Settings = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
+    start: opt.Start = None,
+    stop: opt.Stop = None,
+    poses: opt.Poses = None,
+    labels: opt.LabelFile = None,
+    config: opt.ConfigFile = None,
+    settings: opt.Settings = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Detect road users in the LiDAR sweeps of a log.
 
@@ -58,30 +41,24 @@ def detect(
     log2sim detect LOG --detector lidar:labels --labels openlabel.json -o boxes.json
     """
     from log2sim.cli.progress import progress
-    from log2sim.cli.reconstruct import pose_lines
-    from log2sim.config import Config
+    from log2sim.cli.reconstruct import pose_reasons
     from log2sim.evaluation.detection.detect_log import detect_log
     from log2sim.files.documents import check_targets
     from log2sim.logs.opening import open_log
     from log2sim.perception.detect3d.detectors import describe_weakness
 
     check_targets(out, overwrite=overwrite)
-    changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "detect": {"name": detector}}
-    if poses is not None:
-        changes["poses"] = {"source": poses}
-    chosen = Config.load(config, settings or (), **changes)
+    chosen = opt.load_config(config, settings, detector=detector, poses=poses, start_s=start, stop_s=stop)
     opened = open_log(log, format=format, sequence=sequence, labels=labels)
-    for note in opened.notes:
-        say(f"note: {note}", quiet=quiet)
-    if weakness := describe_weakness(detector):
-        say(f"note: {weakness}", quiet=quiet)
+    weakness = describe_weakness(detector)
+    opt.say_all("note", [*opened.notes, *([weakness] if weakness else [])], quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = detect_log(opened, chosen, progress=partial(report_progress, "detect"))
     result.found.save(out)
-    for line in (*pose_lines(result.poses.to_dict()), *(f"note: {finding}" for finding in result.findings)):
-        say(line, quiet=quiet)
+    opt.say_all("poses", pose_reasons(result.poses.to_dict()), quiet=quiet)
+    opt.say_all("note", result.findings, quiet=quiet)
     if result.left_out:
-        say(f"note: {counted(result.left_out, 'sweep')} left out, without points or a known pose", quiet=quiet)
+        opt.say(f"note: {opt.counted(result.left_out, 'sweep')} left out, without points or a known pose", quiet=quiet)
     boxes = sum(len(found) for found in result.found.boxes)
-    words = f"{boxes} box{'es' * (boxes != 1)} in {counted(len(result.found.t_ns), 'sweep')}"
-    say(f"{out}: {words} by {result.found.detector}", quiet=quiet)
+    words = f"{boxes} box{'es' * (boxes != 1)} in {opt.counted(len(result.found.t_ns), 'sweep')}"
+    opt.say(f"{out}: {words} by {result.found.detector}", quiet=quiet)

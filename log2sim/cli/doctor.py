@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterator
+import tomllib
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from packaging.requirements import InvalidRequirement, Requirement
 
-from log2sim.cli.options import AsJson, fail, say
+from log2sim.cli import options as opt
+from log2sim.cli.shared import format_rows
 from log2sim.errors import Log2SimError, install_command
 from log2sim.version import __version__
 
-OK, MISSING, OUTDATED, BROKEN = "ok", "missing", "outdated", "broken"
 MIN_PYTHON = (3, 11)
+BROKEN_CODE = 5  # as where an extra is missing: something has to be installed
 
 # Modules of packages whose names differ by more than a hyphen.
 MODULES = {"opencv-contrib-python-headless": "cv2", "scikit-image": "skimage"}
@@ -53,8 +55,8 @@ class Package:
     """A package that log2sim needs."""
 
     name: str
-    version: str | None  # none where it is missing
-    state: str  # {"ok", "missing", "outdated", "broken"}, broken: it is there and cannot be imported
+    version: str | None  # None where it is missing
+    state: str  # "ok", "missing", "outdated", or "broken": it is there and cannot be imported
     problem: str = ""  # what is wrong, for people; empty without a problem
 
 
@@ -65,133 +67,99 @@ class Extra:
     name: str
     missing: tuple[str, ...]  # packages of it that are missing or too old
     purpose: str  # empty for extras that are for development
-    install: str  # A line for the shell that adds it
+    install: str  # a line for the shell that adds it
 
 
 @dataclass(frozen=True)
 class Installation:
     """What `log2sim doctor` shows."""
 
-    # log2sim, python, system: versions; the system with its processor.
-    log2sim: str
+    log2sim: str  # versions of it, of Python and of the system with its processor
     python: str
     system: str
     program: str  # the Python that runs
     packages: tuple[Package, ...]  # those that are needed
     extras: tuple[Extra, ...]
     models: dict[str, str]  # by detector: "ready", or what it needs
-    cache: str  # folder of the cache
-    cache_bytes: int  # size of what is in it
-    # cores, usable_cores: processors of the machine, and those that this process may use.
-    cores: int
+    cache: str  # folder of the cache, and the size of what is in it
+    cache_bytes: int
+    cores: int  # processors of the machine, and those that this process may use
     usable_cores: int
     threads: dict[str, str]  # variables of the environment that limit threads
-    browser: str | None  # A browser that shows the pages of `log2sim view`
+    browser: str | None  # a browser that shows the pages of `log2sim view`
     broken: tuple[str, ...]  # what is needed and does not work, each with what to do
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as a JSON document."""
-        return asdict(self)
 
 
 def examine() -> Installation:
     """Look at everything; imports all packages that log2sim needs."""
-    requirements = read_requirements()
-    packages = tuple(examine_package(r) for r in requirements if not r.marker or "extra" not in str(r.marker))
-    cache = find_cache()
-    models, unusable = find_models()
-    # Add up the sizes of the files in a folder, bytes; 0 without it.
-    total = 0
+    from log2sim.files.cache import cache_folder
+
+    # What log2sim requires: from the checkout it runs from, else from the installed package.
+    project = Path(__file__).resolve().parents[2] / "pyproject.toml"
+    if project.is_file():
+        table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+        by_extra = {"": table["dependencies"], **table["optional-dependencies"]}
+    else:
+        by_extra = {}
+        for line in metadata.requires("log2sim") or []:
+            text, _, extra = line.partition("extra == ")
+            by_extra.setdefault(extra.strip("'\") "), []).append(text.rstrip(" ;(").removesuffix(" and"))
+    requirements: dict[str, list[Requirement]] = {}
+    for extra, lines in by_extra.items():
+        requirements[extra] = []
+        for line in lines:
+            with suppress(InvalidRequirement):
+                requirements[extra].append(Requirement(line))
+    packages = tuple(_examine_package(r) for r in requirements.pop(""))
+    extras = []
+    for extra in sorted(requirements, key=lambda name: (name not in PURPOSES, name)):
+        needed = [r for r in requirements[extra] if r.marker is None or r.marker.evaluate()]
+        missing = tuple(r.name for r in needed if not _is_met(r, version_of(r.name)))
+        extras.append(Extra(extra, missing, PURPOSES.get(extra, ""), install_command(extra)))
+    cache, cache_bytes = cache_folder(), 0
     for place, _, files in os.walk(cache):
         for file in files:
-            try:
-                total += os.lstat(os.path.join(place, file)).st_size
-            except OSError:  # gone in the meantime
-                continue
+            with suppress(OSError):  # gone in the meantime
+                cache_bytes += os.lstat(os.path.join(place, file)).st_size
+    broken = [f"{p.name}: {p.problem}" for p in packages if p.problem]
+    if sys.version_info < MIN_PYTHON:
+        wanted = ".".join(map(str, MIN_PYTHON))
+        broken.insert(0, f"Python {platform.python_version()} is too old: log2sim needs {wanted}")
     return Installation(
         log2sim=__version__,
         python=platform.python_version(),
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         program=sys.executable,
         packages=packages,
-        extras=tuple(examine_extras(requirements)),
-        models=models,
+        extras=tuple(extras),
+        models=_find_models(cache, broken),
         cache=str(cache),
-        cache_bytes=total,
+        cache_bytes=cache_bytes,
         cores=os.cpu_count() or 1,
-        usable_cores=count_usable_cores(),
+        usable_cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         threads={name: os.environ[name] for name in THREAD_VARIABLES if os.environ.get(name)},
         browser=next((found for name in BROWSERS if (found := shutil.which(name))), None),
-        broken=(*find_python_problem(), *(f"{p.name}: {p.problem}" for p in packages if p.problem), *unusable),
+        broken=tuple(broken),
     )
 
 
-def read_requirements() -> list[Requirement]:
-    """Read what log2sim requires: from the checkout it runs from, else from the installed package."""
-    project = Path(__file__).resolve().parents[2] / "pyproject.toml"
-    if project.is_file():
-        import tomllib
-
-        table = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
-        lines = list(table["dependencies"])
-        for extra, wanted in table["optional-dependencies"].items():
-            lines += [_requirement_of_extra(line, extra) for line in wanted]
-    else:
-        lines = metadata.requires("log2sim") or []
-    found = []
-    for line in lines:
-        try:
-            found.append(Requirement(line))
-        except InvalidRequirement:
-            continue
-    return found
-
-
-def _requirement_of_extra(line: str, extra: str) -> str:
-    """Return a requirement of an extra as the metadata of packages state it."""
-    package, _, marker = line.partition(";")
-    condition = f"({marker.strip()}) and " if marker else ""
-    return f"{package.strip()}; {condition}extra == '{extra}'"
-
-
-def examine_package(requirement: Requirement) -> Package:
+def _examine_package(requirement: Requirement) -> Package:
     """Import a package that is needed, and compare its version with what is required."""
-    name = MODULES.get(requirement.name, requirement.name.replace("-", "_"))
-    version = version_of(requirement.name)
+    name, wanted = requirement.name, f"pip install '{requirement.name}{requirement.specifier}'"
+    version = version_of(name)
     try:
-        module = importlib.import_module(name)
+        module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
     except Exception as error:  # whatever a broken package raises
         if version is None:
-            return Package(
-                requirement.name, None, MISSING, f"is missing: pip install '{requirement.name}{requirement.specifier}'"
-            )
-        return Package(requirement.name, version, BROKEN, f"cannot be imported: {type(error).__name__}: {error}")
+            return Package(name, None, "missing", f"is missing: {wanted}")
+        return Package(name, version, "broken", f"cannot be imported: {type(error).__name__}: {error}")
     version = version or str(getattr(module, "__version__", "")) or None  # the module of another distribution
-    if version is not None and not requirement.specifier.contains(version, prereleases=True):
-        wanted = f"{requirement.name}{requirement.specifier}"
-        return Package(requirement.name, version, OUTDATED, f"{version} is too old: pip install '{wanted}'")
-    return Package(requirement.name, version, OK)
+    if version is not None and not _is_met(requirement, version):
+        return Package(name, version, "outdated", f"{version} is too old: {wanted}")
+    return Package(name, version, "ok")
 
 
-def examine_extras(requirements: list[Requirement]) -> Iterator[Extra]:
-    """Yield each extra with those of its packages that are missing, those for users first."""
-    names = dict.fromkeys(extra for r in requirements if (extra := extra_of(r)))
-    for extra in sorted(names, key=lambda name: (name not in PURPOSES, name)):
-        needed = [r for r in requirements if r.marker and extra_of(r) == extra and r.marker.evaluate({"extra": extra})]
-        missing = tuple(r.name for r in needed if not is_module_installed(r))
-        yield Extra(extra, missing, PURPOSES.get(extra, ""), install_command(extra))
-
-
-def extra_of(requirement: Requirement) -> str | None:
-    """Return the extra that a requirement belongs to; None for what is always needed."""
-    marker = str(requirement.marker or "")
-    _, found, after = marker.partition('extra == "')
-    return after.split('"')[0] if found else None
-
-
-def is_module_installed(requirement: Requirement) -> bool:
-    """Return whether a package is there in a version that is good enough."""
-    version = version_of(requirement.name)
+def _is_met(requirement: Requirement, version: str | None) -> bool:
     return version is not None and requirement.specifier.contains(version, prereleases=True)
 
 
@@ -203,56 +171,27 @@ def version_of(name: str) -> str | None:
         return None
 
 
-def find_python_problem() -> tuple[str, ...]:
-    """Say where Python is too old; nothing elsewhere."""
-    if sys.version_info >= MIN_PYTHON:
-        return ()
-    return (f"Python {platform.python_version()} is too old: log2sim needs {'.'.join(map(str, MIN_PYTHON))}",)
-
-
-def find_models() -> tuple[dict[str, str], tuple[str, ...]]:
-    """Return the built-in detectors with what they need, and what should be there and is not."""
+def _find_models(cache: Path, broken: list[str]) -> dict[str, str]:
+    """Return the built-in detectors with what they need; `broken` takes what should be there and is not."""
     folder = Path(__file__).resolve().parents[1] / "perception" / "detect3d" / "weights"
-    models, broken = {}, []
+    models = {}
     for name in ("vehicle", "roadside"):
         model = folder / f"{name}.onnx"
         models[f"lidar:{name}"] = "ready" if model.is_file() else f"{model} is missing"
-        if not model.is_file():
-            broken.append(f"{model}: is missing; install log2sim again")
+        broken += [] if model.is_file() else [f"{model}: is missing; install log2sim again"]
     try:
-        models["ssd-mobilenet-v2"] = _state_of_image_detector()
+        from log2sim.perception.detect.ssd_mobilenet import NAME, graph_bytes
+
+        state = "ready"
+        if not any(cache.glob(f"{NAME}-*.onnx")):
+            graph_bytes()
+            state = "ready; converted into the cache at its first use"
     except (Log2SimError, ImportError) as error:
-        models["ssd-mobilenet-v2"] = str(error)
-    return models, tuple(broken)
+        state = str(error)
+    return models | {"ssd-mobilenet-v2": state}
 
 
-def _state_of_image_detector() -> str:
-    from log2sim.perception.detect.ssd_mobilenet import NAME, graph_bytes
-
-    if any(find_cache().glob(f"{NAME}-*.onnx")):
-        return "ready"
-    graph_bytes()
-    return "ready; converted into the cache at its first use"
-
-
-def find_cache() -> Path:
-    """Return the folder of the cache."""
-    from log2sim.files.cache import cache_folder
-
-    return cache_folder()
-
-
-def count_usable_cores() -> int:
-    """Count the processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-BROKEN_CODE = 5  # as where an extra is missing: something has to be installed
-
-
-def doctor(as_json: AsJson = False) -> None:
+def doctor(as_json: opt.AsJson = False) -> None:
     """Show versions, extras, models, cache and processors, and what is missing with the line that installs it.
 
     Exits with 0, or with 5 when something is broken that every command needs; a missing extra is not.
@@ -262,39 +201,29 @@ def doctor(as_json: AsJson = False) -> None:
     log2sim doctor
     log2sim doctor --json
     """
-    import json
-
     found = examine()
-    say(json.dumps(found.to_dict(), indent=2) if as_json else "\n".join(describe_installation(found)))
+    opt.say(json.dumps(asdict(found), indent=2) if as_json else "\n".join(_describe(found)))
     if found.broken:
-        fail("; ".join(found.broken), BROKEN_CODE)
+        opt.fail("; ".join(found.broken), BROKEN_CODE)
 
 
-def describe_installation(found: Installation) -> list[str]:
+def _describe(found: Installation) -> list[str]:
     """Describe an installation in lines for people."""
-    from log2sim.cli.shared import format_rows
-
-    cores = f"{found.usable_cores} of {found.cores} cores"
-    limits = ", ".join(f"{name}={value}" for name, value in found.threads.items())
+    limits = "".join(f", {name}={value}" for name, value in found.threads.items())
+    extras = [extra for extra in found.extras if extra.purpose]
+    absent = [extra for extra in extras if extra.missing]
     facts = [
         ("log2sim", found.log2sim),
         ("Python", f"{found.python}, {found.program}"),
         ("system", found.system),
-        ("processor", f"{cores}, {limits}" if limits else cores),
+        ("processor", f"{found.usable_cores} of {found.cores} cores{limits}"),
         ("cache", f"{found.cache}, {found.cache_bytes / 1e6:.0f} MB"),
         ("browser", found.browser or "none found; open the pages of log2sim view on another machine"),
     ]
-    packages = [(p.name, p.version or "-", p.state) for p in found.packages]
-    extras = [
-        (extra.name, "missing" if extra.missing else "installed", extra.purpose, extra.install if extra.missing else "")
-        for extra in found.extras
-        if extra.purpose
-    ]
-    lines = ["", *format_rows(facts)]
-    lines += ["", "packages", *format_rows(packages, indent=2)]
+    lines = format_rows(facts)
+    lines += ["", "packages", *format_rows([(p.name, p.version or "-", p.state) for p in found.packages], indent=2)]
     lines += ["", "detectors", *format_rows(list(found.models.items()), indent=2)]
-    lines += ["", "extras", *format_rows([row[:3] for row in extras], indent=2)]
-    absent = [extra for extra in found.extras if extra.purpose and extra.missing]
+    states = [(extra.name, "missing" if extra.missing else "installed", extra.purpose) for extra in extras]
+    lines += ["", "extras", *format_rows(states, indent=2)]
     lines += ["", "to add one:", *(f"  {extra.install}" for extra in absent)] if absent else []
-    verdict = "nothing needed is missing" if not found.broken else f"{len(found.broken)} problems"
-    return [*lines[1:], "", verdict]
+    return [*lines, "", "nothing needed is missing" if not found.broken else f"{len(found.broken)} problems"]

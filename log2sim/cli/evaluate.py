@@ -10,19 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import (
-    LabelFile,
-    Overwrite,
-    Poses,
-    Quiet,
-    SequenceName,
-    Verbose,
-    complete,
-    option,
-    report_written,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
@@ -40,36 +28,36 @@ def evaluate(
     ],
     truth: Annotated[
         Path,
-        option(
+        opt.option(
             "Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
             "TRUTH",
         ),
     ],
-    labels: LabelFile = None,
-    sequence: SequenceName = None,
-    poses: Poses = None,
-    range: Annotated[
-        float | None, option("Compare agents or boxes up to this distance from the ego, in m.", "M")
-    ] = None,
-    categories: Annotated[str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B")] = None,
+    labels: opt.LabelFile = None,
+    sequence: opt.SequenceName = None,
+    poses: opt.Poses = None,
+    range: opt.Range = None,
+    categories: opt.Categories = None,
     protocol: Annotated[
         str | None,
-        option(
+        opt.option(
             "Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
             "(nuScenes).",
             "kitti|dair|center",
-            completes=complete("kitti", "dair", "center"),
+            completes=opt.complete("kitti", "dair", "center"),
             default=PROTOCOL,
         ),
     ] = None,
     score: Annotated[
-        float | None, option("Of boxes: score from which precision and recall count them.", "S", default="0.5")
+        float | None, opt.option("Of boxes: score from which precision and recall count them.", "S", default="0.5")
     ] = None,
-    plot: Annotated[Path | None, option("Reliability diagram of confidences or scores to write.", "FILE.png")] = None,
-    out: Annotated[Path | None, write_to("FILE", "Metrics file to write.")] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    plot: Annotated[
+        Path | None, opt.option("Reliability diagram of confidences or scores to write.", "FILE.png")
+    ] = None,
+    out: Annotated[Path | None, opt.write_to("FILE", "Metrics file to write.")] = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Compare a scenario, or detected boxes, with the ground truth.
 
@@ -80,6 +68,7 @@ def evaluate(
     log2sim evaluate boxes.json --truth kitti_tracking/ --sequence 0000 --protocol kitti
     """
     from log2sim.cli.progress import progress
+    from log2sim.datatypes import Scenario
     from log2sim.errors import ConfigError, ScenarioError
     from log2sim.evaluation.detection.boxes import is_boxes_document
     from log2sim.evaluation.metrics.evaluator import evaluate as run
@@ -89,34 +78,23 @@ def evaluate(
     from log2sim.files.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
-    wanted = [c.strip() for c in categories.split(",")] if categories else None
+    wanted = list(opt.split_names(categories)) or None
     only_boxes = {"--protocol": protocol, "--score": score}
     if path.is_dir():
         only_files = {**only_boxes, "--sequence": sequence, "--poses": poses, "--plot": plot, "--labels": labels}
         for name in (name for name, value in only_files.items() if value is not None):
             raise ConfigError(f"{name}: is for single files; {path} is a folder, so leave it out")
         result, table = _batch_figures(path, truth, range, wanted, quiet=quiet, verbose=verbose)
-        if out is not None:
-            write_json(out, result)
-        say(table, quiet=quiet)
-        report_written(out, quiet=quiet)
-        return
-    document = read_json(path, ScenarioError)
-    if is_boxes_document(document):
+    elif is_boxes_document(document := read_json(path, ScenarioError)):
         options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
         options |= {} if score is None else {"min_score": score}
-        result, table = _boxes_figures(
-            path,
-            document,
-            _log_of(truth, sequence, labels, _stated(document.get("poses"), poses)),
-            options,
-            quiet=quiet,
-            verbose=verbose,
-        )
+        provenance = _stated(document.get("poses"), poses)
+        opened = partial(_open_truth, truth, sequence, labels, provenance)
+        result, table = _boxes_figures(path, document, options, opened, quiet=quiet, verbose=verbose)
     else:
         for name in (name for name, value in only_boxes.items() if value is not None):
             raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
-        scenario = _scenario(path, document)
+        scenario = Scenario.load(path)
         if poses is not None:
             stated = _stated(scenario.provenance.get("poses"), poses)
             scenario = replace(scenario, provenance={**scenario.provenance, **stated})
@@ -125,19 +103,18 @@ def evaluate(
                 truth, scenario, sequence=sequence, labels=labels, points=True,
                 progress=partial(report_progress, "count points"),
             )  # fmt: skip
-        for note in known.provenance.get("notes", ()) if labels is not None else ():
-            say(f"note: {note}", quiet=quiet)
+        opt.say_all("note", known.provenance.get("notes", ()) if labels is not None else (), quiet=quiet)
         result = run(scenario, known, max_range_m=range, categories=wanted)
         if result["placement"]["method"] == "same_map" and (note := _other_map(scenario, truth)) is not None:
-            say(f"note: {note}", quiet=quiet)
+            opt.say(f"note: {note}", quiet=quiet)
         table = format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
     with together():
         if out is not None:
             write_json(out, result)
         if plot is not None:
             _plot_reliability(result, plot)
-    say(table, quiet=quiet)
-    report_written(out, plot, quiet=quiet)
+    opt.say(table, quiet=quiet)
+    opt.report_written(out, plot, quiet=quiet)
 
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
@@ -187,21 +164,11 @@ def _plot_reliability(result: dict[str, Any], path: Path) -> None:
     write_reliability(diagrams, path)
 
 
-def _scenario(path: Path, document: Any) -> Scenario:
-    from log2sim.datatypes import Scenario
-    from log2sim.errors import ScenarioError
-
-    try:
-        return Scenario.from_dict(document)
-    except ScenarioError as error:
-        raise ScenarioError(f"{path}: {error}") from None
-
-
 def _batch_figures(
     path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
     """Compare all scenarios of a batch with the labels of their logs."""
-    from log2sim.batch.evaluation import Scope, evaluate_batch, format_batch_table, format_batch_verdict
+    from log2sim.batch.evaluation import evaluate_batch, format_batch_table, format_batch_verdict
     from log2sim.batch.folder import BatchFolder, is_batch
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError
@@ -216,30 +183,27 @@ def _batch_figures(
             BatchFolder.load(path),
             truth,
             lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
-            Scope(max_range_m, categories),
+            max_range_m=max_range_m,
+            categories=categories,
             progress=partial(report_progress, "logs"),
         )
     table = f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
     return result, format_batch_verdict(result) + table
 
 
-def _log_of(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Callable[[], Log]:
-    """Return a function that opens the log with the true boxes, once everything else is known to be right."""
+def _open_truth(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Log:
+    """Open the log with the true boxes."""
+    from log2sim.errors import LogError
+    from log2sim.localization.choice import localize_like
+    from log2sim.logs.opening import is_log_file, open_log
 
-    def opened() -> Log:
-        from log2sim.errors import LogError
-        from log2sim.localization.choice import localize_like
-        from log2sim.logs.opening import is_log_file, open_log
-
-        if path.is_file() and not is_log_file(path):
-            raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
-        return localize_like(open_log(path, sequence=sequence, labels=labels), provenance)
-
-    return opened
+    if path.is_file() and not is_log_file(path):
+        raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
+    return localize_like(open_log(path, sequence=sequence, labels=labels), provenance)
 
 
 def _boxes_figures(
-    path: Path, document: Any, truth: Callable[[], Log], options: dict[str, Any], *, quiet: bool, verbose: bool
+    path: Path, document: Any, options: dict[str, Any], truth: Callable[[], Log], *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
     from log2sim.cli.progress import progress
     from log2sim.errors import LogError

@@ -5,49 +5,47 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, choose, complete_plugins, option, say, write_to
+from log2sim.cli import options as opt
 
 MAX_NOTES = 5
 FORMATS = "openscenario, carla, csv, scenarionet, commonroad, lanelet2, openlabel, osi, mcap, rerun"  # written out: --help imports nothing
 
 
 def export(
-    scenario: ScenarioPath,
-    to: Annotated[str, option(f"One of {FORMATS}.", "FORMAT", "--to", completes=complete_plugins("export"))],
-    out: Annotated[Path, write_to("DIR", "Folder to write into.")],
+    scenario: opt.ScenarioPath,
+    to: Annotated[str, opt.option(f"One of {FORMATS}.", "FORMAT", "--to", completes=opt.complete_plugins("export"))],
+    out: Annotated[Path, opt.write_to("DIR", "Folder to write into.")],
     revision: Annotated[
-        str | None, choose("--revision", "1.0", "1.1", "1.2", help="openscenario: its version.", default="the newest")
+        str | None, opt.choose("--revision", "1.0|1.1|1.2", "openscenario: its version.", default="the newest")
     ] = None,
     map: Annotated[
-        Path | None, option("openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")
+        Path | None, opt.option("openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")
     ] = None,
-    mode: Annotated[
-        str | None, choose("--mode", "exact", "pid", help="carla: how agents move.", default="exact")
-    ] = None,
+    mode: Annotated[str | None, opt.choose("--mode", "exact|pid", "carla: how agents move.", default="exact")] = None,
     log: Annotated[
         Path | None,
-        option("mcap, rerun: log whose images and points are included; openlabel: whose pictures have boxes.", "LOG"),
+        opt.option(
+            "mcap, rerun: log whose images and points are included; openlabel: whose pictures have boxes.", "LOG"
+        ),
     ] = None,
     ego: Annotated[
         str | None,
-        option(
+        opt.option(
             "Agent to take as the ego, where the scenario has none; openscenario: external, another program drives the ego.",
             "AGENT|external",
         ),
     ] = None,
     doubtful: Annotated[
         str,
-        choose(
+        opt.choose(
             "--doubtful",
-            "keep",
-            "drop",
-            "all",
-            help="Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
+            "keep|drop|all",
+            "Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
         ),
     ] = "keep",
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Write a scenario in the format of a simulator or viewer.
 
@@ -74,11 +72,10 @@ def export(
     options = Options(revision, map, mode, opened, driver)
     files = run(chosen, to, out, options, quarantined=doubtful == "all", overwrite=overwrite)
     for file in files:
-        say(f"{file}: written", quiet=quiet)
+        opt.say(f"{file}: written", quiet=quiet)
     notes = export_notes(chosen)
     if loaded.doubtful:
-        say(f"note: {doubtful_note(loaded, chosen)}", quiet=quiet)
-    for note in notes if verbose else notes[:MAX_NOTES]:
-        say(f"note: {note}", quiet=quiet)
+        opt.say(f"note: {doubtful_note(loaded, chosen)}", quiet=quiet)
+    opt.say_all("note", notes if verbose else notes[:MAX_NOTES], quiet=quiet)
     if len(notes) > MAX_NOTES and not verbose:
-        say(f"note: and {len(notes) - MAX_NOTES} more", quiet=quiet)
+        opt.say(f"note: and {len(notes) - MAX_NOTES} more", quiet=quiet)

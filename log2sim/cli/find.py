@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from log2sim.cli.options import AsJson, Overwrite, Quiet, counted, option, report_written, say, write_to
+from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
 
 if TYPE_CHECKING:
@@ -32,25 +32,26 @@ def find(
             help="Such as 'cut_in and ttc_s < 2 and ego.speed_mps > 10'; without one, all tags are counted.",
         ),
     ] = "",
-    out: Annotated[Path | None, write_to("FILE.html", "Page of the hits to write, with pictures.")] = None,
-    table: Annotated[Path | None, option("Parquet file of the hits to write.", "FILE.parquet")] = None,
+    out: Annotated[Path | None, opt.write_to("FILE.html", "Page of the hits to write, with pictures.")] = None,
+    table: Annotated[Path | None, opt.option("Parquet file of the hits to write.", "FILE.parquet")] = None,
     open_: Annotated[
-        int | None, option("Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)
+        int | None, opt.option("Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)
     ] = None,
     probability: Annotated[
-        float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
+        float, opt.option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
     ] = 0.3,
-    fields: Annotated[bool, option("List the fields of these scenarios' tags.", None, "--fields")] = False,
+    fields: Annotated[bool, opt.option("List the fields of these scenarios' tags.", None, "--fields")] = False,
     fresh: Annotated[
-        bool, option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")
+        bool, opt.option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")
     ] = False,
-    jobs: Annotated[int | None, option("Processes that tag.", "N", min=1, default="one for each core")] = None,
+    jobs: Annotated[int | None, opt.option("Processes that tag.", "N", min=1, default="one for each core")] = None,
     scheduler: Annotated[
-        str | None, option("Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")
+        str | None,
+        opt.option("Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT"),
     ] = None,
-    as_json: AsJson = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    as_json: opt.AsJson = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Find situations in many scenarios by a condition on their tags.
 
@@ -74,44 +75,39 @@ def find(
 
     check_targets(out, table, overwrite=overwrite)
     quiet = quiet or as_json
-    if scheduler is not None and jobs is not None:
-        raise ConfigError("--jobs: the scheduler decides how many workers there are; leave out --jobs or --scheduler")
+    opt.require_own_workers(jobs, scheduler)
     with progress(quiet=quiet) as report_progress:
         index = open_index(
             path, fresh=fresh, jobs=jobs, map_files=_on_workers(scheduler) if scheduler else None,
             progress=lambda done, total: report_progress("scenarios", done, total),
         )  # fmt: skip
-    for problem in index.problems:
-        say(f"left out: {problem}", quiet=quiet)
+    opt.say_all("left out", index.problems, quiet=quiet)
     if fields or not condition:
         for line in format_rows(_overview(index, fields=fields)):
-            say(line)
+            opt.say(line)
         return
     found = ask(index, condition, min_probability=probability)
     if as_json:
         import json
 
-        say(json.dumps(list(found.rows), ensure_ascii=False))
+        opt.say(json.dumps(list(found.rows), ensure_ascii=False))
     for k, row in enumerate(found.rows[:MAX_LISTED]):
-        say(
-            f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}",
-            quiet=quiet,
-        )
+        opt.say(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}", quiet=quiet)
     more = len(found.rows) - MAX_LISTED
     if more > 0:
-        say(f"and {more} more; --out and --table have all", quiet=quiet)
-    say(f"{counted(len(found.rows), 'hit')} in {counted(index.scenarios, 'scenario')}", quiet=quiet)
+        opt.say(f"and {more} more; --out and --table have all", quiet=quiet)
+    opt.say(f"{opt.counted(len(found.rows), 'hit')} in {opt.counted(index.scenarios, 'scenario')}", quiet=quiet)
     for line in found.closest:
-        say(line, quiet=quiet)
+        opt.say(line, quiet=quiet)
     if out is not None:
         write_hits(out, index, condition, found.rows)
     if table is not None:
         write_table(table, found.rows)
-    report_written(out, table, quiet=quiet)
+    opt.report_written(out, table, quiet=quiet)
     if open_ is not None:
         if open_ > len(found.rows):
-            raise ConfigError(f"--open {open_}: there are {counted(len(found.rows), 'hit')}")
-        say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet)
+            raise ConfigError(f"--open {open_}: there are {opt.counted(len(found.rows), 'hit')}")
+        opt.say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet)
 
 
 def _on_workers(scheduler: str) -> MapFiles:

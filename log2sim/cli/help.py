@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import say
+from log2sim.cli import options as opt
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 
@@ -38,9 +38,9 @@ def help_(
     """
     known = pages()
     if topic is None:
-        say("\n".join(f"{name:<11} {text.partition(chr(10))[0].lstrip('# ')}" for name, text in known.items()))
+        opt.say("\n".join(f"{name:<11} {text.partition(chr(10))[0].lstrip('# ')}" for name, text in known.items()))
         return
     if topic not in known:
         raise ConfigError(f"no page '{topic}'{nearest(topic, list(known))}; log2sim help lists them")
     text = re.sub(r"^!\[.*\n\n?", "", known[topic].rstrip(), flags=re.MULTILINE)
-    say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", text))
+    opt.say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", text))

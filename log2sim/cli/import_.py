@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, report_written, write_to
+from log2sim.cli import options as opt
 
 
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
-    out: Annotated[Path, write_to("SCENARIO", "Scenario file to write.")],
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    out: Annotated[Path, opt.write_to("SCENARIO", "Scenario file to write.")],
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Convert an OpenSCENARIO file to a scenario.
 
@@ -27,4 +27,4 @@ def import_(
 
     check_targets(out, overwrite=overwrite)
     load(file).save(out)
-    report_written(out, quiet=quiet)
+    opt.report_written(out, quiet=quiet)

@@ -8,20 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import (
-    AsJson,
-    Cameras,
-    Format,
-    Overwrite,
-    Quiet,
-    SequenceName,
-    Verbose,
-    camera_names,
-    counted,
-    option,
-    report_written,
-    say,
-)
+from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows, wrap
 from log2sim.errors import ConfigError
 
@@ -48,7 +35,7 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
 def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]:
     """Describe a scenario: its agents, the road, how the ego keeps its lane, and notes."""
     agents, lanes, ego = scenario["agents"], scenario["lanes"], scenario["ego"]
-    total = counted(agents["count"], "agent") + (" and the ego" if ego is not None else "")
+    total = opt.counted(agents["count"], "agent") + (" and the ego" if ego is not None else "")
     inferred = "" if lanes["in_file"] or not lanes["count"] else ", inferred from paths now"
     facts = [
         ("agents", f"{agents['count']}: {_counts(agents['categories'])}" if agents["count"] else "none"),
@@ -57,8 +44,8 @@ def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]
         ("colors", _counts(agents["colors"]) or "none"),
         ("markings", _counts(scenario["markings"]) or "none"),
         ("borders", _counts(scenario["borders"]) or "none"),
-        ("lanes", f"{lanes['count']}, {counted(lanes['junctions'], 'junction')}{inferred}"),
-        ("lights", counted(scenario["signals"], "traffic light")),
+        ("lanes", f"{lanes['count']}, {opt.counted(lanes['junctions'], 'junction')}{inferred}"),
+        ("lights", opt.counted(scenario["signals"], "traffic light")),
         ("ego", _lane_keeping(ego, scenario["ego_in_lane"])),
     ]
     lines = [f"{scenario['name']}: a scenario with {total} over {scenario['duration_s']:.1f} s", ""]
@@ -85,13 +72,13 @@ def _ego(ego: Document | None) -> str:
     rate = "" if ego["rate_hz"] is None else f" at {ego['rate_hz']:.1f} Hz"
     length, width, height = ego["size_m"]
     way = f"{ego['distance_m']:.1f} m driven, at most {ego['top_speed_mps']:.1f} m/s"
-    return f"{counted(ego['records'], 'pose')}{rate}, {way}, {length:g} x {width:g} x {height:g} m"
+    return f"{opt.counted(ego['records'], 'pose')}{rate}, {way}, {length:g} x {width:g} x {height:g} m"
 
 
 def _labels(labels: Document | None) -> str:
     if labels is None:
         return "none"
-    tracks = f"{counted(labels['tracks'], 'object')}: {_counts(labels['tracks_by_category'])}"
+    tracks = f"{opt.counted(labels['tracks'], 'object')}: {_counts(labels['tracks_by_category'])}"
     return f"{labels['boxes']} boxes of {tracks}"
 
 
@@ -141,20 +128,20 @@ def _notes(notes: Sequence[str], *, verbose: bool) -> list[str]:
 
 def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log, or a scenario.json.")],
-    format: Format = "auto",
-    sequence: SequenceName = None,
-    as_json: AsJson = False,
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
+    as_json: opt.AsJson = False,
     overlay: Annotated[
         Path | None,
-        option("Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png"),
+        opt.option("Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png"),
     ] = None,
     at: Annotated[
-        float | None, option("Time to draw, in s after the first tick.", "S", default="in the middle")
+        float | None, opt.option("Time to draw, in s after the first tick.", "S", default="in the middle")
     ] = None,
-    cameras: Cameras = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    cameras: opt.Cameras = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Describe the content of a log, or of a scenario.json, or draw one tick of a log.
 
@@ -182,9 +169,9 @@ def inspect(
 
         document = summarize_scenario(Scenario.load(log))
         lines = [json.dumps(document, indent=2)] if as_json else describe_scenario(document, verbose=verbose)
-        say("\n".join(lines), quiet=quiet)
+        opt.say("\n".join(lines), quiet=quiet)
         return
-    names = camera_names(cameras)
+    names = opt.camera_names(cameras)
     check_targets(overlay, overwrite=overwrite)
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
@@ -192,9 +179,9 @@ def inspect(
     if overlay is None:
         document = summarize(opened)
         lines = [json.dumps(document, indent=2)] if as_json else describe_log(document, verbose=verbose)
-        say("\n".join(lines), quiet=quiet)
+        opt.say("\n".join(lines), quiet=quiet)
         return
     from log2sim.visualization.overlay import read_moment, write_overlay
 
     write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-    report_written(overlay, quiet=quiet)
+    opt.report_written(overlay, quiet=quiet)

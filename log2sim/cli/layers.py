@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from log2sim.cli.options import counted, say
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -90,8 +90,10 @@ def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Repla
     others = [a.id for a in loaded.agents if a.id != EGO]
     unknown = [id for id in others if id not in known]
     if loaded.scenario != scenario.name:
-        say(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; the two may not match", quiet=quiet)
+        opt.say(
+            f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; the two may not match", quiet=quiet
+        )
     elif unknown:
-        count = f"{len(unknown)} of its {counted(len(others), 'agent')} {'is' if len(unknown) == 1 else 'are'}"
-        say(f"warning: {path} replays another version of '{scenario.name}': {count} not in it", quiet=quiet)
+        count = f"{len(unknown)} of its {opt.counted(len(others), 'agent')} {'is' if len(unknown) == 1 else 'are'}"
+        opt.say(f"warning: {path} replays another version of '{scenario.name}': {count} not in it", quiet=quiet)
     return loaded

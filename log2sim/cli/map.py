@@ -5,37 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from log2sim.cli.options import (
-    Format,
-    LogPath,
-    Overwrite,
-    Quiet,
-    SequenceName,
-    choose,
-    option,
-    report_written,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
 
 
 def map_(
-    log: LogPath,
-    out: Annotated[Path, write_to("FILE", "Map to write: .tif (GeoTIFF), .png or .jpg (with a world file).")],
+    log: opt.LogPath,
+    out: Annotated[Path, opt.write_to("FILE", "Map to write: .tif (GeoTIFF), .png or .jpg (with a world file).")],
     scenario: Annotated[
-        Path | None, option("Scenario of the log; its agents are left out of the map.", "SCENARIO")
+        Path | None, opt.option("Scenario of the log; its agents are left out of the map.", "SCENARIO")
     ] = None,
     layer: Annotated[
-        str, choose("--layer", "color", "intensity", "height", help="What is written; intensity is that of the LiDAR.")
+        str, opt.choose("--layer", "color|intensity|height", "What is written; intensity is that of the LiDAR.")
     ] = "color",
-    cell: Annotated[float, option("Edge of a cell, in m.", "M")] = 0.05,
-    format: Format = "auto",
-    sequence: SequenceName = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    cell: Annotated[float, opt.option("Edge of a cell, in m.", "M")] = 0.05,
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Make a map of the ground of a log: its color, its height, or how strongly it reflects the LiDAR.
 
@@ -79,8 +68,7 @@ def map_(
     if chosen != "color" and not opened.lidars:
         raise ConfigError(f"{opened.name}: the log has no LiDAR; take --layer color")
     opened, loaded, note = _agents_of(opened, scenario)
-    for line in (*opened.notes, *((note,) if note else ())):
-        say(f"note: {line}", quiet=quiet)
+    opt.say_all("note", (*opened.notes, *((note,) if note else ())), quiet=quiet)
     records = RecordSource(opened)
     with progress(quiet=quiet) as report_progress:
         whole = map_ground(opened, loaded, settings, records, report_progress)
@@ -99,12 +87,11 @@ def map_(
         notes.append(
             f"heights in {out.name}: value 1 is {lowest_m(ground):.2f} m, {HEIGHT_STEP_M:g} m a step, 0 is unknown"
         )
-    for line in notes:
-        say(f"note: {line}", quiet=quiet)
+    opt.say_all("note", notes, quiet=quiet)
     rows, columns = ground.alpha.shape
     d = ground.resolution_m
-    report_written(world, quiet=quiet)
-    say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
+    opt.report_written(world, quiet=quiet)
+    opt.say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
 
 
 def _agents_of(log: Log, scenario: Path | None) -> tuple[Log, Scenario, str | None]:

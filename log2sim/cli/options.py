@@ -7,16 +7,17 @@ and `--help` are added to all of them by `log2sim.cli.shared`.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import BUILT_IN
 
-POSES = ("given", "lidar", "camera", "auto")
+if TYPE_CHECKING:
+    from log2sim.config import Config
 
 
 def complete(*choices: str) -> Callable[[str], list[str]]:
@@ -43,9 +44,9 @@ def option(
     return typer.Option(*flags, metavar=metavar, help=help, show_default=default, autocompletion=completes, **more)
 
 
-def choose(flag: str, *choices: str, help: str, default: Any = True) -> Any:
-    """Make an option that takes one of a few words: `help` lists them, and a shell completes them."""
-    return option(help, "|".join(choices), flag, completes=complete(*choices), default=default)
+def choose(flag: str, choices: str, help: str, *, default: Any = True) -> Any:
+    """Make an option that takes one of a few words, "a|b", which a shell completes."""
+    return option(help, choices, flag, completes=complete(*choices.split("|")), default=default)
 
 
 def write_to(metavar: str, help: str) -> Any:
@@ -84,7 +85,7 @@ ConfigFile = Annotated[Path | None, option("File with settings; see log2sim conf
 Start = Annotated[float | None, option("First time to use, in s from the start of the log.", "S", default="the start")]
 Stop = Annotated[float | None, option("Last time to use, in s from the start of the log.", "S", default="the end")]
 Range = Annotated[
-    float | None, option("Compare agents up to this distance from the ego, in m.", "M", default="no limit")
+    float | None, option("Compare agents or boxes up to this distance from the ego, in m.", "M", default="no limit")
 ]
 Categories = Annotated[
     str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B", default="all")
@@ -102,9 +103,8 @@ Poses = Annotated[
     str | None,
     choose(
         "--poses",
-        *POSES,
-        help="Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the "
-        "sensors best.",
+        "given|lidar|camera|auto",
+        "Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the sensors best.",
         default="the log's own; what fits best for a log without any",
     ),
 ]
@@ -133,6 +133,12 @@ def say(text: str, *, quiet: bool = False) -> None:
         sys.stdout.flush()
 
 
+def say_all(kind: str, lines: Iterable[object], *, quiet: bool) -> None:
+    """Print lines that each begin with their kind, such as "note"."""
+    for line in lines:
+        say(f"{kind}: {line}", quiet=quiet)
+
+
 def report_written(*paths: Path | None, quiet: bool) -> None:
     """Name the files that a command wrote; None stands for one that was not asked for."""
     written = [str(path) for path in paths if path is not None]
@@ -140,15 +146,39 @@ def report_written(*paths: Path | None, quiet: bool) -> None:
         say(f"{', '.join(written)}: written", quiet=quiet)
 
 
-def camera_names(text: str | None) -> tuple[str, ...]:
-    """Split what `--cameras` takes; none stands for all.
+def split_names(text: str | None) -> tuple[str, ...]:
+    """Split names that are separated by commas; none stands for all."""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
-    Raises `ConfigError` when it is empty.
-    """
-    names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+def camera_names(text: str | None) -> tuple[str, ...]:
+    """Split what `--cameras` takes; raises `ConfigError` when it is empty."""
+    names = split_names(text)
     if text is not None and not names:
         raise ConfigError("--cameras: is empty; name cameras separated by commas, or leave it out to use all")
     return names
+
+
+def load_config(
+    file: Path | None,
+    settings: list[str] | None,
+    *,
+    detector: str | None = None,
+    poses: str | None = None,
+    **options: Any,
+) -> Config:
+    """Return the settings of a file and of --set with those that options give; None leaves one as it is."""
+    from log2sim.config import Config
+
+    options["detect"] = None if detector is None else {"name": detector}
+    options["poses"] = None if poses is None else {"source": poses}
+    return Config.load(file, settings or (), **options)
+
+
+def require_own_workers(jobs: int | None, scheduler: str | None) -> None:
+    """Raise `ConfigError` where the workers of a scheduler are to be used, and a number of them is given."""
+    if scheduler is not None and jobs is not None:
+        raise ConfigError("--jobs: the scheduler decides how many workers there are; leave out --jobs or --scheduler")
 
 
 def counted(count: int, noun: str) -> str:

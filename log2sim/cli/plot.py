@@ -5,52 +5,47 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import (
-    Overwrite,
-    Quiet,
-    ScenarioPath,
-    SequenceName,
-    Truth,
-    option,
-    report_written,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 
 def plot(
-    scenario: ScenarioPath,
-    out: Annotated[Path, write_to("FILE", "Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write.")],
-    replay: Annotated[Path | None, option("Replay to draw over the scenario.", "REPLAY")] = None,
-    truth: Truth = None,
+    scenario: opt.ScenarioPath,
+    out: Annotated[Path, opt.write_to("FILE", "Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write.")],
+    replay: Annotated[Path | None, opt.option("Replay to draw over the scenario.", "REPLAY")] = None,
+    truth: opt.Truth = None,
     background: Annotated[
-        Path | None, option("Log whose map of the ground is the background, or a map of log2sim map.", "LOG|MAP.png")
+        Path | None,
+        opt.option("Log whose map of the ground is the background, or a map of log2sim map.", "LOG|MAP.png"),
     ] = None,
-    predict: Annotated[float | None, option("Draw where movers were expected to go for this long, in s.", "S")] = None,
+    predict: Annotated[
+        float | None, opt.option("Draw where movers were expected to go for this long, in s.", "S")
+    ] = None,
     start: Annotated[
-        float | None, option("First time of the scenario to show, in s.", "S", default="the start")
+        float | None, opt.option("First time of the scenario to show, in s.", "S", default="the start")
     ] = None,
-    stop: Annotated[float | None, option("Last time of the scenario to show, in s.", "S", default="the end")] = None,
+    stop: Annotated[
+        float | None, opt.option("Last time of the scenario to show, in s.", "S", default="the end")
+    ] = None,
     extent: Annotated[
-        str | None, option("Two corners of the part of the map to show, in m.", "X0,Y0,X1,Y1", default="what moves")
+        str | None, opt.option("Two corners of the part of the map to show, in m.", "X0,Y0,X1,Y1", default="what moves")
     ] = None,
-    agents: Annotated[str | None, option("Show these agents alone.", "ID,ID", default="all")] = None,
-    label_static: Annotated[bool, option("Write the ids of static agents too.", None, "--label-static")] = False,
+    agents: Annotated[str | None, opt.option("Show these agents alone.", "ID,ID", default="all")] = None,
+    label_static: Annotated[bool, opt.option("Write the ids of static agents too.", None, "--label-static")] = False,
     size: Annotated[
-        str | None, option("Size in pixels, such as 1280x720; not of .svg and .pdf.", "WxH", default="what fits")
+        str | None, opt.option("Size in pixels, such as 1280x720; not of .svg and .pdf.", "WxH", default="what fits")
     ] = None,
-    fps: Annotated[float | None, option("Frames of a film a second.", "N", default="25, of a .gif 10")] = None,
+    fps: Annotated[float | None, opt.option("Frames of a film a second.", "N", default="25, of a .gif 10")] = None,
     speed: Annotated[
         float | None,
-        option(
+        opt.option(
             "Times faster than real time that a film plays.",
             "X",
             default="1, or what fits into a minute, half a minute for a .gif",
         ),
     ] = None,
-    sequence: SequenceName = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    sequence: opt.SequenceName = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Draw a scenario from above: a picture or a film.
 
@@ -78,11 +73,11 @@ def plot(
     replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
     known = None if truth is None else load_placed_truth(truth, loaded, sequence)
     if picture.note is not None:
-        say(f"note: {picture.note}", quiet=quiet)
+        opt.say(f"note: {picture.note}", quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         ground = None if background is None else load_background(background, loaded, sequence, report_progress)
         plot_tracks(
             loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
             overwrite=overwrite, progress=report_progress,
         )  # fmt: skip
-    report_written(picture.path, quiet=quiet)
+    opt.report_written(picture.path, quiet=quiet)

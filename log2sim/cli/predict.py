@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, report_written, say, write_to
+from log2sim.cli import options as opt
 
 
 def predict(
-    scenario: ScenarioPath,
-    horizon: Annotated[float, option("Longest prediction in s, from 0.1 to 10.", "S")] = 3.0,
+    scenario: opt.ScenarioPath,
+    horizon: Annotated[float, opt.option("Longest prediction in s, from 0.1 to 10.", "S")] = 3.0,
     method: Annotated[
-        str | None, option("Only these methods: velocity, turn, smoothed, path.", "A,B", default="all")
+        str | None, opt.option("Only these methods: velocity, turn, smoothed, path.", "A,B", default="all")
     ] = None,
-    out: Annotated[Path | None, write_to("FILE", "Figures file to write.")] = None,
+    out: Annotated[Path | None, opt.write_to("FILE", "Figures file to write.")] = None,
     positions: Annotated[
-        bool, option("With --out: write every predicted position with its sigma, too.", None, "--positions")
+        bool, opt.option("With --out: write every predicted position with its sigma, too.", None, "--positions")
     ] = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Predict each agent at each tick from its past, and estimate how far off that is.
 
@@ -41,7 +41,7 @@ def predict(
     document = prediction_document(loaded, predict_scenario(loaded, horizon, methods=methods), with_positions=positions)
     if out is not None:
         write_json(out, document)
-    say(format_figures(document), quiet=quiet)
+    opt.say(format_figures(document), quiet=quiet)
     if loaded.is_reconstruction:
-        say("note: the states were smoothed over the whole log and depend a little on what came next", quiet=quiet)
-    report_written(out, quiet=quiet)
+        opt.say("note: the states were smoothed over the whole log and depend a little on what came next", quiet=quiet)
+    opt.report_written(out, quiet=quiet)

@@ -8,30 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from log2sim.cli.options import (
-    Cameras,
-    ConfigFile,
-    Format,
-    LogPath,
-    NoCache,
-    Overwrite,
-    Poses,
-    Quiet,
-    SequenceName,
-    Settings,
-    Start,
-    Stop,
-    Verbose,
-    camera_names,
-    choose,
-    complete_detectors,
-    counted,
-    report_written,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -79,7 +56,7 @@ def known_ticks(report: dict[str, Any]) -> list[str]:
     """Say how many ticks were not looked at, since an earlier run had done it."""
     cache = report["detection_cache"]
     found = 0 if cache is None else cache["found"]
-    return [f"{counted(found, 'tick')} known from earlier runs"] if found else []
+    return [f"{opt.counted(found, 'tick')} known from earlier runs"] if found else []
 
 
 def described(scenario: Scenario) -> list[str]:
@@ -87,7 +64,7 @@ def described(scenario: Scenario) -> list[str]:
     features = scenario.map_features
     counts = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
     counts.append((len(scenario.signals), "traffic light"))
-    return [counted(count, name) for count, name in counts if count]
+    return [opt.counted(count, name) for count, name in counts if count]
 
 
 def doubt_lines(scenario: Scenario, findings: Sequence[Finding], *, verbose: bool = False) -> list[str]:
@@ -106,7 +83,7 @@ def doubt_lines(scenario: Scenario, findings: Sequence[Finding], *, verbose: boo
     options = {KINDS[f.kind].option for f in findings if f.kind in KINDS and f.treatment != "corrected"} - {""}
     return [
         *lines,
-        f"{len(others)} of {counted(len(scenario.others), 'agent')}: {named}",
+        f"{len(others)} of {opt.counted(len(scenario.others), 'agent')}: {named}",
         *([quarantined] if gone else []),
         *([f"perhaps since sensors are off (see the notes): try {' '.join(sorted(options))}"] if options else []),
     ]
@@ -135,92 +112,85 @@ def view_command(log: Path, sequence: str | None, out: Path) -> str:
     return shlex.join(["log2sim", "view", str(out), "--log", str(log), *chosen, "-o", page])
 
 
-def pose_lines(poses: dict[str, Any]) -> list[str]:
+def pose_reasons(poses: dict[str, Any]) -> list[str]:
     """Say which poses were used and why; nothing of the log's own where no others were asked for."""
     own = poses["source"] == "none" or poses["source"] == poses["requested"] == "given"
-    return [] if own else [f"poses: {poses['source']} ({poses['reason']})"]
+    return [] if own else [f"{poses['source']} ({poses['reason']})"]
 
 
 def reconstruct(
-    log: LogPath,
-    out: Annotated[Path, write_to("FILE", "Scenario file to write.")],
-    format: Format = "auto",
-    sequence: SequenceName = None,
+    log: opt.LogPath,
+    out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
     detector: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME|MODEL.onnx|labels|lidar:NAME",
-            help="Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR "
-            "sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
-            autocompletion=complete_detectors,
-            show_default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow",
+        opt.option(
+            "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
+            "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
+            "NAME|MODEL.onnx|labels|lidar:NAME",
+            completes=opt.complete_detectors,
+            default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow",
         ),
     ] = None,
-    cameras: Cameras = None,
-    start: Start = None,
-    stop: Stop = None,
-    poses: Poses = None,
+    cameras: opt.Cameras = None,
+    start: opt.Start = None,
+    stop: opt.Stop = None,
+    poses: opt.Poses = None,
     static_for_all: Annotated[
         bool | None,
-        typer.Option(
+        opt.option(
+            "Static agents exist all the time unless the log shows their place free, or only while observed.",
+            None,
             "--static-for-all/--as-observed",
-            help="Static agents exist all the time unless the log shows their place free, or only while observed.",
-            show_default="--static-for-all",
+            default="--static-for-all",
         ),
     ] = None,
     fix_time: Annotated[
-        bool, typer.Option("--fix-time", help="Correct stamps of sensors by the offsets that the log shows.")
+        bool, opt.option("Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")
     ] = False,
     fix_calibration: Annotated[
-        bool, typer.Option("--fix-calibration", help="Correct mounts of sensors by the rotations that the log shows.")
+        bool, opt.option("Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")
     ] = False,
     ends: Annotated[
         str | None,
-        choose(
+        opt.choose(
             "--ends",
-            "both",
-            "vehicle",
-            "road",
+            "both|vehicle|road",
+            "Use only the sensors on the vehicle, or only those at the road.",
             default="both",
-            help="Use only the sensors on the vehicle, or only those at the road.",
         ),
     ] = None,
     fusion: Annotated[
         str | None,
-        choose(
+        opt.choose(
             "--fusion",
-            "points",
-            "boxes",
-            "tracks",
+            "points|boxes|tracks",
+            "What of the vehicle's and the road's LiDARs is joined.",
             default="see log2sim config",
-            help="What of the vehicle's and the road's LiDARs is joined.",
         ),
     ] = None,
     corrections: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.json", help="Corrections by hand to apply to the result, see log2sim correct."),
+        Path | None, opt.option("Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")
     ] = None,
-    config: ConfigFile = None,
-    settings: Settings = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of all random numbers.", show_default="0")] = None,
-    report: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Report file to write.")] = None,
-    topdown: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Bird's-eye image of all cameras to write.")
-    ] = None,
+    config: opt.ConfigFile = None,
+    settings: opt.Settings = None,
+    seed: Annotated[int | None, opt.option("Seed of all random numbers.", "N", default="0")] = None,
+    report: Annotated[Path | None, opt.option("Report file to write.", "FILE.json")] = None,
+    topdown: Annotated[Path | None, opt.option("Bird's-eye image of all cameras to write.", "FILE.png")] = None,
     jobs: Annotated[
         int | None,
-        typer.Option(
-            "--jobs",
-            metavar="N",
+        opt.option(
+            "Processes that share the ticks; the result is the same for any number.",
+            "N",
             min=1,
-            help="Processes that share the ticks; the result is the same for any number.",
-            show_default="the usable cores",
+            default="the usable cores",
         ),
     ] = None,
-    no_cache: NoCache = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    no_cache: opt.NoCache = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Reconstruct the scenario of a log.
 
@@ -236,20 +206,18 @@ def reconstruct(
     from log2sim.visualization.progress import OPENING
 
     check_targets(out, report, topdown, overwrite=overwrite)
-    changes: dict[str, Any] = {"start_s": start, "stop_s": stop, "seed": seed}
-    changes["cameras"] = None if cameras is None else camera_names(cameras)
-    if detector is not None:
-        changes["detect"] = {"name": detector}
-    if static_for_all is not None:
-        changes["track"] = {"static_for_all": static_for_all}
-    if poses is not None:
-        changes["poses"] = {"source": poses}
-    changes["cooperation"] = {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None}
     fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
-    changes["calibration"] = {name: True for name, chosen in fixes.items() if chosen}
+    changes: dict[str, Any] = {
+        "cameras": None if cameras is None else opt.camera_names(cameras),
+        "start_s": start,
+        "stop_s": stop,
+        "seed": seed,
+        "track": None if static_for_all is None else {"static_for_all": static_for_all},
+        "cooperation": {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None},
+        "calibration": {name: True for name, chosen in fixes.items() if chosen},
+    }
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
-        from log2sim.config import Config
         from log2sim.edit.corrections import correct, load_corrections
         from log2sim.errors import ConfigError, MissingExtra
         from log2sim.logs.opening import open_log
@@ -259,26 +227,24 @@ def reconstruct(
         from log2sim.plan import IMAGE_DETECTOR, choose_detector
         from log2sim.report import unused_records
 
-        chosen = Config.load(config, settings or (), **changes)
+        chosen = opt.load_config(config, settings, detector=detector, poses=poses, **changes)
         by_hand = None if corrections is None else load_corrections(corrections)
         check_detectors(chosen)
         opened = open_log(log, format=format, sequence=sequence)
     if topdown is not None and not opened.cameras:
         raise ConfigError(f"--topdown: {opened.name}: the log has no camera, so there is no picture of the ground")
-    for note in opened.notes:
-        say(f"note: {note}", quiet=quiet)
-    chosen = choose_detector(opened, chosen)
+    chosen, notes = choose_detector(opened, chosen), list(opened.notes)
     if opened.cameras and not chosen.detect.in_images and detector is None:
-        say(f"note: no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}", quiet=quiet)
+        notes.append(f"no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}")
     if weakness := describe_weakness(chosen.detect.in_sweeps or ""):
-        say(f"note: {weakness}", quiet=quiet)
+        notes.append(weakness)
+    opt.say_all("note", notes, quiet=quiet)
     with progress(quiet=quiet) as report_progress:
         result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs)
     if by_hand is not None:
         corrected = correct(result.scenario, by_hand)
         result = replace(result, scenario=corrected.scenario)
-        for line in corrected.unmatched:
-            say(f"warning: {line}", quiet=quiet)
+        opt.say_all("warning", corrected.unmatched, quiet=quiet)
     with together():
         if topdown is not None:
             _write_topdown(result, topdown, overwrite=overwrite)
@@ -286,11 +252,11 @@ def reconstruct(
             write_json(report, result.report)
         result.scenario.save(out)
     findings = (*result.findings, *unused_records(result.report))
-    for line in (*pose_lines(result.report["poses"]), *(f"note: {finding}" for finding in findings)):
-        say(line, quiet=quiet)
-    report_written(report, topdown, quiet=quiet)
+    opt.say_all("poses", pose_reasons(result.report["poses"]), quiet=quiet)
+    opt.say_all("note", findings, quiet=quiet)
+    opt.report_written(report, topdown, quiet=quiet)
     for line in summarize_run(result, view_command(log, sequence, out), out, verbose=verbose):
-        say(line, quiet=quiet)
+        opt.say(line, quiet=quiet)
 
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:

@@ -6,115 +6,100 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from log2sim.cli.options import (
-    DropDoubtful,
-    Overwrite,
-    Quiet,
-    ScenarioPath,
-    Verbose,
-    choose,
-    option,
-    report_written,
-    say,
-    write_to,
-)
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
 
 
 def replay(
-    scenario: ScenarioPath,
-    out: Annotated[Path | None, write_to("FILE", "Replay file to write.")] = None,
+    scenario: opt.ScenarioPath,
+    out: Annotated[Path | None, opt.write_to("FILE", "Replay file to write.")] = None,
     mode: Annotated[
         str,
-        choose(
-            "--mode",
-            "pid",
-            "exact",
-            help="pid: vehicles follow their trajectories by a controller; exact: no controller.",
+        opt.choose(
+            "--mode", "pid|exact", "pid: vehicles follow their trajectories by a controller; exact: no controller."
         ),
     ] = "pid",
     model: Annotated[
         str,
-        choose(
+        opt.choose(
             "--model",
-            "auto",
-            "kinematic",
-            "dynamic",
-            "single-track",
-            help="Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
+            "auto|kinematic|dynamic|single-track",
+            "Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
         ),
     ] = "auto",
-    dt: Annotated[float, option("Time step in s, from 0.0005 to 1.", "S")] = 0.01,
+    dt: Annotated[float, opt.option("Time step in s, from 0.0005 to 1.", "S")] = 0.01,
     ego: Annotated[
         str | None,
-        option(
+        opt.option(
             "Policy that drives the ego: a plug-in, or of a module or file.", "NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE"
         ),
     ] = None,
     log: Annotated[
         Path | None,
-        option("--ego: what the policy sees by its observations' sweep and image comes from this log.", "LOG"),
+        opt.option("--ego: what the policy sees by its observations' sweep and image comes from this log.", "LOG"),
     ] = None,
     recorded: Annotated[
         Path | None,
-        option("--log: what was reconstructed from it, where the scenario is an edit. [default: the scenario]", "FILE"),
+        opt.option(
+            "--log: what was reconstructed from it, where the scenario is an edit. [default: the scenario]", "FILE"
+        ),
     ] = None,
     warn: Annotated[
         str | None,
-        choose(
+        opt.choose(
             "--warn",
-            "vehicle",
-            "road",
-            "both",
-            help="Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
+            "vehicle|road|both",
+            "Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
         ),
     ] = None,
-    brake: Annotated[bool, option("With --warn: the ego brakes when it is warned.", None, "--brake")] = False,
-    horizon: Annotated[float, option("--warn: predict collisions for so long, in s.", "S")] = 5.0,
-    reaction: Annotated[float, option("--warn: from the warning until the brakes work, in s.", "S")] = 1.0,
-    deceleration: Annotated[float, option("--warn: how hard the ego brakes, in m/s2.", "MPS2")] = 8.0,
+    brake: Annotated[bool, opt.option("With --warn: the ego brakes when it is warned.", None, "--brake")] = False,
+    horizon: Annotated[float, opt.option("--warn: predict collisions for so long, in s.", "S")] = 5.0,
+    reaction: Annotated[float, opt.option("--warn: from the warning until the brakes work, in s.", "S")] = 1.0,
+    deceleration: Annotated[float, opt.option("--warn: how hard the ego brakes, in m/s2.", "MPS2")] = 8.0,
     agents: Annotated[
         str,
-        choose(
+        opt.choose(
             "--agents",
-            "scenario",
-            "reactive",
-            help="Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
+            "scenario|reactive",
+            "Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
         ),
     ] = "scenario",
-    react: Annotated[str | None, option("Make only these agents reactive.", "ID,ID")] = None,
+    react: Annotated[str | None, opt.option("Make only these agents reactive.", "ID,ID")] = None,
     foresight: Annotated[
         str,
-        choose(
+        opt.choose(
             "--foresight",
-            "path",
-            "motion",
-            help="What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.",
+            "path|motion",
+            "What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.",
         ),
     ] = "path",
     confidence: Annotated[
         float | None,
-        option("Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.", "MIN"),
+        opt.option(
+            "Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.", "MIN"
+        ),
     ] = None,
-    drop_doubtful: DropDoubtful = False,
+    drop_doubtful: opt.DropDoubtful = False,
     simulator: Annotated[
-        str, choose("--simulator", "own", "carla", help="own, or carla: agents move in a CARLA server.")
+        str, opt.choose("--simulator", "own|carla", "own, or carla: agents move in a CARLA server.")
     ] = "own",
-    host: Annotated[str | None, option("carla: address of the server.", "NAME", default="127.0.0.1")] = None,
-    port: Annotated[int | None, option("carla: port of the server.", "N", min=1, max=65535, default="2000")] = None,
-    map: Annotated[str | None, option("carla: map to load first.", "TOWN|FILE.xodr")] = None,
+    host: Annotated[str | None, opt.option("carla: address of the server.", "NAME", default="127.0.0.1")] = None,
+    port: Annotated[int | None, opt.option("carla: port of the server.", "N", min=1, max=65535, default="2000")] = None,
+    map: Annotated[str | None, opt.option("carla: map to load first.", "TOWN|FILE.xodr")] = None,
     strict: Annotated[
         bool,
-        option("Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path.", None, "--strict"),
+        opt.option(
+            "Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path.", None, "--strict"
+        ),
     ] = False,
     limit: Annotated[
-        list[str] | None, option("Report agents beyond this limit, e.g. min_ttc_s=1; see --strict.", "METRIC=VALUE")
+        list[str] | None, opt.option("Report agents beyond this limit, e.g. min_ttc_s=1; see --strict.", "METRIC=VALUE")
     ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Simulate a scenario.
 
@@ -181,15 +166,13 @@ def replay(
     result = changed(result, left_out=left_out, warnings=warned)
     if out is not None:
         result.save(out)
-    say(summarize(result, limit=None if verbose else MAX_LISTED), quiet=quiet)
+    opt.say(summarize(result, limit=None if verbose else MAX_LISTED), quiet=quiet)
     note = doubtful_note(kept, kept)
-    for line in [*([note] if note else []), *export_notes(kept)]:
-        say(f"note: {line}", quiet=quiet)
-    report_written(out, quiet=quiet)
+    opt.say_all("note", [*([note] if note else []), *export_notes(kept)], quiet=quiet)
+    opt.report_written(out, quiet=quiet)
     if strict:
         require_strict(result, limits)
-    for broken in check_limits(result, limits):
-        say(f"limit exceeded: {broken}", quiet=quiet)
+    opt.say_all("limit exceeded", check_limits(result, limits), quiet=quiet)
 
 
 def _trusted(scenario: Scenario, confidence: float | None, *, drop_doubtful: bool) -> tuple[Scenario, dict[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, option, report_written, say, write_to
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
@@ -13,24 +13,25 @@ if TYPE_CHECKING:
 
 
 def resimulate(
-    scenario: ScenarioPath,
-    log: Annotated[Path, option("Log that the scenario was reconstructed from.", "LOG")],
-    out: Annotated[Path, write_to("DIR", "Log folder to write.")],
+    scenario: opt.ScenarioPath,
+    log: Annotated[Path, opt.option("Log that the scenario was reconstructed from.", "LOG")],
+    out: Annotated[Path, opt.write_to("DIR", "Log folder to write.")],
     replay: Annotated[
-        Path | None, option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE")
+        Path | None,
+        opt.option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE"),
     ] = None,
     sensors: Annotated[
-        str | None, option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
+        str | None, opt.option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
     ] = None,
-    cameras: Annotated[bool, option("All cameras, too.", None, "--cameras")] = False,
-    sequence: Annotated[str | None, option("Sequence of a log with several.", "NAME")] = None,
+    cameras: Annotated[bool, opt.option("All cameras, too.", None, "--cameras")] = False,
+    sequence: Annotated[str | None, opt.option("Sequence of a log with several.", "NAME")] = None,
     film: Annotated[
         Path | None,
-        option("Film of a LiDAR, and a camera where they are simulated: recorded, simulated, now.", "FILE.webm"),
+        opt.option("Film of a LiDAR, and a camera where they are simulated: recorded, simulated, now.", "FILE.webm"),
     ] = None,
-    seed: Annotated[int, option("Seed of noise and lost returns.", min=0)] = 0,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    seed: Annotated[int, opt.option("Seed of noise and lost returns.", min=0)] = 0,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Write what the LiDARs and cameras of a log would have recorded from where the ego drives now, among its agents.
 
@@ -52,16 +53,14 @@ def resimulate(
     filmed = None if film is None else _film(film, overwrite=overwrite)
     source = Scenario.load(scenario)
     now = source if replay is None else _happening(replay, source)
-    names = tuple(name.strip() for name in sensors.split(",")) if sensors else ()
     with progress(quiet=quiet) as report:
         recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
         notes = run(
-            recorded, source, now, out, sensors=names, cameras=cameras, seed=seed, overwrite=overwrite, progress=report,
+            recorded, source, now, out, sensors=opt.split_names(sensors), cameras=cameras, seed=seed, overwrite=overwrite, progress=report,
             then=lambda simulation: None if filmed is None else write_film(simulation, source, filmed),
         )  # fmt: skip
-    for note in (*notes, *([filmed.note] if filmed is not None and filmed.note else [])):
-        say(f"note: {note}", quiet=quiet)
-    report_written(out, None if filmed is None else filmed.path, quiet=quiet)
+    opt.say_all("note", (*notes, *([filmed.note] if filmed is not None and filmed.note else [])), quiet=quiet)
+    opt.report_written(out, None if filmed is None else filmed.path, quiet=quiet)
 
 
 def _film(path: Path, *, overwrite: bool) -> FilmFile:

@@ -10,7 +10,7 @@ import signal
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Annotated, Any, TextIO
@@ -25,10 +25,7 @@ SIGNAL_CODE = 128  # a shell adds the number of the signal to this as the exit c
 
 
 class Ended:
-    """Which signal ended the process.
-
-    `signal`: 0 while there was none.
-    """
+    """Which signal ended the process; 0 while there was none."""
 
     signal = 0
 
@@ -120,7 +117,7 @@ def tolerating_lost_output() -> Iterator[None]:
         sys.stdout, sys.stderr = before
 
 
-MIN_COLUMNS = 40  # narrower terminals are treated as this wide: a word a line reads no better
+MIN_COLUMNS = 40
 
 
 def format_rows(rows: Sequence[Sequence[str]], indent: int = 0) -> list[str]:
@@ -139,20 +136,14 @@ def format_rows(rows: Sequence[Sequence[str]], indent: int = 0) -> list[str]:
 
 def wrap(line: str, indent: int = 2) -> list[str]:
     """Break a line at the width of the terminal, the rest indented; elsewhere, in a pipe or a file, lines stay whole."""
-    width = terminal_width()
-    if width is None or len(line) <= width:
+    # Narrower terminals are treated as wider: a word a line reads no better.
+    width = max(shutil.get_terminal_size().columns, MIN_COLUMNS) if sys.stdout.isatty() else len(line)
+    if len(line) <= width:
         return [line.rstrip()]
     room = " " * min(indent, width // 2)
     return textwrap.wrap(
         line, width, subsequent_indent=room, break_long_words=False, break_on_hyphens=False, drop_whitespace=True
     )
-
-
-def terminal_width() -> int | None:
-    """Return the width of the terminal that output goes to, characters; None where it goes elsewhere."""
-    if not sys.stdout.isatty():
-        return None
-    return max(shutil.get_terminal_size().columns, MIN_COLUMNS)
 
 
 # Kinds of plug-ins that an option takes, and what stands before their names.
@@ -175,26 +166,19 @@ class CommandWithPlugins(TyperCommand):
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Write the installed plug-ins by option, then the examples."""
+        from log2sim.files.plugins import installed, package_of
+
         options = {name for parameter in self.params for name in parameter.opts}
         found = []
         for option in [o for o in KINDS if o in options and ONLY_OF.get(o, self.name) == self.name]:
             kinds = {k: prefix for k, prefix in KINDS[option].items() if (self.name, k) != (SWEEPS_ALONE, "detector")}
-            found += [(f"{option} {name}", package) for name, package in list_plugins(kinds)]
+            for kind, prefix in kinds.items():
+                entries = sorted(installed(kind), key=lambda entry: entry.name)
+                found += [(f"{option} {prefix}{entry.name}", package_of(entry)) for entry in entries]
         if found:
             with formatter.section("Plug-ins that are installed"):
                 formatter.write_dl(found)
         super().format_epilog(ctx, formatter)
-
-
-def list_plugins(kinds: Mapping[str, str]) -> list[tuple[str, str]]:
-    """List names, each behind the prefix of its kind, and packages of plug-ins, without importing them."""
-    from log2sim.files.plugins import installed, package_of
-
-    return [
-        (f"{prefix}{entry.name}", package_of(entry))
-        for kind, prefix in kinds.items()
-        for entry in sorted(installed(kind), key=lambda entry: entry.name)
-    ]
 
 
 DEBUG = "--debug"
@@ -212,8 +196,10 @@ def add_command(app: typer.Typer, command: Callable[..., None], name: str | None
     text, _, examples = (inspect.getdoc(command) or "").partition("\nExamples\n--------\n")
     # With defaults of its own, since those of the program for its option `--help` are not those of a command `help`.
     settings: dict[str, Any] | None = {"default_map": {}} if name == "help" else None
-    help_text, epilog = text.strip(), format_examples(examples)
-    add = app.command(name=name, cls=CommandWithPlugins, help=help_text, epilog=epilog, context_settings=settings)
+    lines = [line.strip() for line in examples.splitlines() if line.strip()]
+    # A paragraph that begins with \b keeps its lines.
+    epilog = "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)]) if lines else None
+    add = app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=epilog, context_settings=settings)
     add(add_shared_options(command))
 
 
@@ -233,12 +219,3 @@ def add_shared_options(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
-
-
-def format_examples(lines: str) -> str | None:
-    """Format examples for the end of a help text, a line each; None without any."""
-    found = [line.strip() for line in lines.splitlines() if line.strip()]
-    if not found:
-        return None
-    # A paragraph that begins with \b keeps its lines.
-    return "\n".join(["\b", "Examples:" if len(found) > 1 else "Example:", *(f"  {line}" for line in found)])

@@ -8,30 +8,31 @@ from typing import Annotated, Any
 
 import typer
 
-from log2sim.cli.options import Cameras, Quiet, ScenarioPath, SequenceName, camera_names, option, say
+from log2sim.cli import options as opt
 
 
 def studio(
-    scenario: ScenarioPath,
+    scenario: opt.ScenarioPath,
     log: Annotated[
-        Path | None, option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")
+        Path | None,
+        opt.option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG"),
     ] = None,
     corrections: Annotated[
         Path | None,
-        option(
+        opt.option(
             "File of corrections to write, and to go on with where it is there.",
             "FILE.json",
             default="beside the scenario",
         ),
     ] = None,
-    cameras: Cameras = None,
-    max_mb: Annotated[float, option("Size of the page, in millions of bytes.", "MB", default="40")] = 40.0,
+    cameras: opt.Cameras = None,
+    max_mb: Annotated[float, opt.option("Size of the page, in millions of bytes.", "MB", default="40")] = 40.0,
     port: Annotated[
         int, typer.Option(metavar="N", min=0, max=65535, help="Port of this computer.", show_default="a free one")
     ] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
-    sequence: SequenceName = None,
-    quiet: Quiet = False,
+    sequence: opt.SequenceName = None,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Correct a scenario on a page: the doubtful agents first, merging, moving, turning, sizes, categories; with undo.
 
@@ -56,7 +57,9 @@ def studio(
     layers: dict[str, Any] = {}
     with progress(quiet=quiet) as report_progress:
         if log is not None:
-            recorded = open_recorded(log, loaded, sequence, round(max_mb * 1e6), camera_names(cameras), report_progress)
+            recorded = open_recorded(
+                log, loaded, sequence, round(max_mb * 1e6), opt.camera_names(cameras), report_progress
+            )
             layers["recorded"] = recorded
             if shows_ground(recorded.log):
                 layers["background"] = map_of(recorded.log, loaded, report_progress)
@@ -65,14 +68,13 @@ def studio(
         except OSError as error:
             raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
         served.page()  # its pictures take long to gather: not while a browser waits
-    for line in served.result.unmatched:
-        say(f"warning: {line}", quiet=quiet)
+    opt.say_all("warning", served.result.unmatched, quiet=quiet)
     try:
-        say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")
+        opt.say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")
         if browser:
             webbrowser.open(served.address)
         served.serve()
     except KeyboardInterrupt:
         count = len(served.document["corrections"])
         words = f"{path}: {count} correction{'s' * (count != 1)}"
-        say(f"{words}; log2sim correct {scenario} {path} --out corrected.json applies them" if count else words)
+        opt.say(f"{words}; log2sim correct {scenario} {path} --out corrected.json applies them" if count else words)

@@ -2,76 +2,50 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from log2sim.cli.options import Overwrite, Quiet, option, report_written, write_to
+from log2sim.cli import options as opt
 from log2sim.errors import ConfigError
 
 
-class SceneTraffic(StrEnum):
-    """Where the LiDAR of random traffic is."""
-
-    vehicle = "vehicle"
-    roadside = "roadside"
-
-
-class SceneLayout(StrEnum):
-    """Layout of data of random traffic."""
-
-    kitti = "kitti"
-    log2sim = "log2sim"
-
-
-class LightName(StrEnum):
-    """Light of a scene."""
-
-    noon = "noon"
-    overcast = "overcast"
-    dusk = "dusk"
-    night = "night"
-
-
-class WeatherName(StrEnum):
-    """Weather of a scene."""
-
-    clear = "clear"
-    rain = "rain"
-    fog = "fog"
-
-
 def synth(
-    out: Annotated[Path, write_to("DIR", "Folder to write.")],
+    out: Annotated[Path, opt.write_to("DIR", "Folder to write.")],
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
     traffic: Annotated[
-        SceneTraffic | None,
-        option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
+        Literal["vehicle", "roadside"] | None,
+        opt.option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
     ] = None,
-    scenes: Annotated[int, option("Number of random scenes.", min=1, max=1_000_000)] = 10,
+    scenes: Annotated[int, opt.option("Number of random scenes.", min=1, max=1_000_000)] = 10,
     sensor: Annotated[
         str | None,
-        option("LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"),
+        opt.option(
+            "LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"
+        ),
     ] = None,
     layout: Annotated[
-        SceneLayout | None,
-        option(
+        Literal["kitti", "log2sim"] | None,
+        opt.option(
             "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
             "pictures]"
         ),
     ] = None,
-    duration: Annotated[float, option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
-    light: Annotated[LightName | None, option("Light; random scenes draw it otherwise.")] = None,
-    weather: Annotated[WeatherName | None, option("Weather; random scenes draw it otherwise.")] = None,
+    duration: Annotated[float, opt.option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
+    light: Annotated[
+        Literal["noon", "overcast", "dusk", "night"] | None, opt.option("Light; random scenes draw it otherwise.")
+    ] = None,
+    weather: Annotated[
+        Literal["clear", "rain", "fog"] | None, opt.option("Weather; random scenes draw it otherwise.")
+    ] = None,
     no_pictures: Annotated[
-        bool, option("Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")
+        bool, opt.option("Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")
     ] = False,
-    seed: Annotated[int, option("Seed of all random numbers.", min=0)] = 0,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    seed: Annotated[int, opt.option("Seed of all random numbers.", min=0)] = 0,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Generate a synthetic log with exact ground truth, or random traffic for training and tests.
 
@@ -90,7 +64,7 @@ def synth(
     with progress(quiet=quiet) as report_progress:
         if scene is not None:
             loaded = load_scene(scene)
-            changes = {k: v.value for k, v in (("light", light), ("weather", weather)) if v is not None}
+            changes = {k: v for k, v in (("light", light), ("weather", weather)) if v is not None}
             if no_pictures and not loaded.lidar:
                 raise ConfigError(f"{scene}: has no LiDAR, so that nothing is left without pictures")
             cameras = () if no_pictures else loaded.camera
@@ -105,11 +79,9 @@ def synth(
         elif traffic is not None:
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic
 
-            chosen = layout or (SceneLayout.log2sim if no_pictures else SceneLayout.kitti)
+            chosen = layout or ("log2sim" if no_pictures else "kitti")
             settings = TrafficSettings(
-                traffic.value, scenes, seed, sensor, chosen.value, duration,
-                None if light is None else light.value, None if weather is None else weather.value,
-                pictures=not no_pictures,
+                traffic, scenes, seed, sensor, chosen, duration, light, weather, pictures=not no_pictures
             )  # fmt: skip
             write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
-    report_written(out, quiet=quiet)
+    opt.report_written(out, quiet=quiet)

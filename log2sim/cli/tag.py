@@ -5,23 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from log2sim.cli.options import Overwrite, Quiet, ScenarioPath, Verbose, option, report_written, say, write_to
+from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
 
 
 def tag(
-    scenario: ScenarioPath,
-    out: Annotated[Path | None, write_to("FILE", "Scenario file to write, with the tags in it.")] = None,
+    scenario: opt.ScenarioPath,
+    out: Annotated[Path | None, opt.write_to("FILE", "Scenario file to write, with the tags in it.")] = None,
     criticality: Annotated[
         Path | None,
-        option(
+        opt.option(
             "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
             "FILE.csv",
         ),
     ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Find lane changes, cut-ins, overtaking, near misses and more, of the ego and of all others.
 
@@ -46,11 +46,11 @@ def tag(
         for g in shown
     ]  # fmt: skip
     for line in format_rows([head, *rows]):
-        say(line, quiet=quiet)
+        opt.say(line, quiet=quiet)
     counts = {name: sum(g.tag == name for g in shown) for name in TAGS}
-    say(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag", quiet=quiet)
+    opt.say(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag", quiet=quiet)
     if out is not None:
         tagged.save(out)
     if criticality is not None:
         write_criticality(criticality, criticality_table(tagged))
-    report_written(out, criticality, quiet=quiet)
+    opt.report_written(out, criticality, quiet=quiet)

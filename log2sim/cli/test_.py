@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from log2sim.cli.options import Quiet, choose, counted, option, say, write_to
+from log2sim.cli import options as opt
 
 if TYPE_CHECKING:
     from log2sim.geometry import Array
@@ -18,26 +18,24 @@ def run_test(
     policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy for the ego, as replay --ego takes it.")],
     path: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch.")],
     condition: Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")],
-    out: Annotated[Path, write_to("DIR", "Folder for the report and the worst runs.")],
-    runs: Annotated[int, option("Runs in all.", "N", min=40, max=100_000)] = 400,
+    out: Annotated[Path, opt.write_to("DIR", "Folder for the report and the worst runs.")],
+    runs: Annotated[int, opt.option("Runs in all.", "N", min=40, max=100_000)] = 400,
     limit: Annotated[
         list[str] | None,
-        option("A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE"),
+        opt.option("A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE"),
     ] = None,
-    agents: Annotated[
-        str, choose("--agents", "scenario", "reactive", help="Behavior of the other agent.")
-    ] = "scenario",
+    agents: Annotated[str, opt.choose("--agents", "scenario|reactive", "Behavior of the other agent.")] = "scenario",
     latency: Annotated[
-        str, option("How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")
+        str, opt.option("How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")
     ] = "0",
     noise: Annotated[
-        float, option("Standard deviation of where it sees them, m, on each axis.", "M", min=0.0, max=10.0)
+        float, opt.option("Standard deviation of where it sees them, m, on each axis.", "M", min=0.0, max=10.0)
     ] = 0.0,
-    worst: Annotated[int, option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
-    seed: Annotated[int, option("Seed of all draws.", min=0)] = 0,
-    jobs: Annotated[int | None, option("Processes.", "N", min=1, default="one for each core")] = None,
-    overwrite: Annotated[bool, option("Replace the folder of an earlier run.", None, "--overwrite", "-f")] = False,
-    quiet: Quiet = False,
+    worst: Annotated[int, opt.option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
+    seed: Annotated[int, opt.option("Seed of all draws.", min=0)] = 0,
+    jobs: Annotated[int | None, opt.option("Processes.", "N", min=1, default="one for each core")] = None,
+    overwrite: Annotated[bool, opt.option("Replace the folder of an earlier run.", None, "--overwrite", "-f")] = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Test a policy in variations of a situation: where it fails, how critical, how likely.
 
@@ -130,11 +128,11 @@ def run_test(
             ],
         )  # fmt: skip
     failures = int((found.margins <= 0).sum())
-    say(
-        f"{counted(failures, 'failure')} in {counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}",
+    opt.say(
+        f"{opt.counted(failures, 'failure')} in {opt.counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}",
         quiet=quiet,
     )
     errors = sum(bool(o.problem) for o in outcomes)
     if errors:
-        say(f"the policy raised in {counted(errors, 'run')}; the report has the traceback", quiet=quiet)
-    say(f"{out / 'report.html'}: written", quiet=quiet)
+        opt.say(f"the policy raised in {opt.counted(errors, 'run')}; the report has the traceback", quiet=quiet)
+    opt.say(f"{out / 'report.html'}: written", quiet=quiet)

@@ -8,7 +8,12 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Format, Quiet, SequenceName, say
+from log2sim.cli import options as opt
+
+SCHEMAS = {
+    f"{name.replace('-', '_')}_version": f"{name}-1"
+    for name in ("metrics", "detection-metrics", "report", "prediction", "bench")
+}
 
 
 def validate(
@@ -19,9 +24,9 @@ def validate(
             help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.",
         ),
     ],
-    format: Format = "auto",
-    sequence: SequenceName = None,
-    quiet: Quiet = False,
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Validate a file, or every record of a log.
 
@@ -46,12 +51,10 @@ def validate(
         with progress(quiet=quiet) as report_progress:
             problems = validate_log(opened, progress=partial(report_progress, VALIDATING))
         # Those of native logs are among the problems.
-        for note in () if opened.format == READER.name else opened.notes:
-            say(f"note: {note}", quiet=quiet)
-        for gap in list_gaps(opened):
-            say(f"note: {gap}", quiet=quiet)
+        notes = () if opened.format == READER.name else opened.notes
+        opt.say_all("note", [*notes, *list_gaps(opened)], quiet=quiet)
         if problems:
-            raise LogError(f"{path}: {len(problems)} problem{'s' * (len(problems) > 1)}\n  " + "\n  ".join(problems))
+            raise LogError(f"{path}: {opt.counted(len(problems), 'problem')}\n  " + "\n  ".join(problems))
     else:
         from log2sim.datatypes import Scenario
         from log2sim.errors import ScenarioError
@@ -61,20 +64,13 @@ def validate(
 
         document = read_json(path, ScenarioError)
         keys = document if isinstance(document, dict) else {}
-        if "replay_version" in keys:
+        schema = next((name for key, name in SCHEMAS.items() if key in keys), None)
+        if schema is not None:
+            check(document, schema, ScenarioError)
+        elif "replay_version" in keys:
             Replay.load(path)
-        elif "metrics_version" in keys:
-            check(document, "metrics-1", ScenarioError)
-        elif "detection_metrics_version" in keys:
-            check(document, "detection-metrics-1", ScenarioError)
         elif is_boxes_document(document):
             DetectedBoxes.load(path)
-        elif "report_version" in keys:
-            check(document, "report-1", ScenarioError)
-        elif "prediction_version" in keys:
-            check(document, "prediction-1", ScenarioError)
-        elif "bench_version" in keys:
-            check(document, "bench-1", ScenarioError)
         else:
             Scenario.load(path)
-    say(f"{path}: valid", quiet=quiet)
+    opt.say(f"{path}: valid", quiet=quiet)

@@ -7,26 +7,26 @@ from typing import Annotated
 
 import typer
 
-from log2sim.cli.options import Quiet, choose, counted, option, say, write_to
+from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
 
 
 def vary(
     path: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch.")],
     condition: Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")],
-    out: Annotated[Path, write_to("DIR", "Folder for the concrete scenarios, their table and the distribution.")],
-    count: Annotated[int, option("Concrete scenarios to draw.", "N", min=1, max=100_000)] = 64,
-    sampler: Annotated[str, choose("--sampler", "sobol", "lhs", "random", help="How parameters are drawn.")] = "sobol",
-    seed: Annotated[int, option("Seed of the draw.", min=0)] = 0,
+    out: Annotated[Path, opt.write_to("DIR", "Folder for the concrete scenarios, their table and the distribution.")],
+    count: Annotated[int, opt.option("Concrete scenarios to draw.", "N", min=1, max=100_000)] = 64,
+    sampler: Annotated[str, opt.choose("--sampler", "sobol|lhs|random", "How parameters are drawn.")] = "sobol",
+    seed: Annotated[int, opt.option("Seed of the draw.", min=0)] = 0,
     probability: Annotated[
-        float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
+        float, opt.option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
     ] = 0.3,
-    keep: Annotated[bool, option("Write those, too, that something speaks against.", None, "--keep")] = False,
+    keep: Annotated[bool, opt.option("Write those, too, that something speaks against.", None, "--keep")] = False,
     openscenario: Annotated[
-        bool, option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")
+        bool, opt.option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")
     ] = False,
-    overwrite: Annotated[bool, option("Replace the folder of an earlier run.", None, "--overwrite", "-f")] = False,
-    quiet: Quiet = False,
+    overwrite: Annotated[bool, opt.option("Replace the folder of an earlier run.", None, "--overwrite", "-f")] = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Vary a situation: fit the distribution of its parameters over all that are found, and draw concrete scenarios.
 
@@ -82,12 +82,14 @@ def vary(
         for name, p in described.items()
     ]
     for line in format_rows([head, *shown]):
-        say(line, quiet=quiet)
-    say(
-        f"{out}: {counted(len(kept), 'concrete scenario')} of {count}, by {counted(len(logical.values), 'hit')}; base {chosen['agent']} "
+        opt.say(line, quiet=quiet)
+    opt.say(
+        f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "
         f"in {chosen['file']} at {chosen['t_s']:.1f} s",
         quiet=quiet,
     )
     refused = [row["problem"] for row in table if row["problem"]]
     if refused:
-        say(f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}", quiet=quiet)
+        opt.say(
+            f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}", quiet=quiet
+        )

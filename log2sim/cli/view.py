@@ -3,56 +3,46 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from log2sim.cli.options import (
-    Cameras,
-    Overwrite,
-    Quiet,
-    ScenarioPath,
-    SequenceName,
-    camera_names,
-    option,
-    say,
-    write_to,
-)
-
-if TYPE_CHECKING:
-    pass
+from log2sim.cli import options as opt
 
 
 def view(
-    scenario: ScenarioPath,
-    out: Annotated[Path, write_to("FILE.html", "Page to write.")],
+    scenario: opt.ScenarioPath,
+    out: Annotated[Path, opt.write_to("FILE.html", "Page to write.")],
     log: Annotated[
-        Path | None, option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")
+        Path | None,
+        opt.option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG"),
     ] = None,
     max_mb: Annotated[
         float | None,
-        option(
+        opt.option(
             "Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
             "MB",
             default="40",
         ),
     ] = None,
-    cameras: Cameras = None,
-    truth: Annotated[Path | None, option("Ground truth: a scenario file or a log with labels.", "TRUTH")] = None,
-    replay: Annotated[Path | None, option("Replay to show as a layer.", "REPLAY")] = None,
+    cameras: opt.Cameras = None,
+    truth: opt.Truth = None,
+    replay: Annotated[Path | None, opt.option("Replay to show as a layer.", "REPLAY")] = None,
     metrics: Annotated[
-        Path | None, option("Metrics file of log2sim evaluate, to show beside the map.", "METRICS")
+        Path | None, opt.option("Metrics file of log2sim evaluate, to show beside the map.", "METRICS")
     ] = None,
-    predict: Annotated[float | None, option("Show where agents were expected to go for this long, in s.", "S")] = None,
+    predict: Annotated[
+        float | None, opt.option("Show where agents were expected to go for this long, in s.", "S")
+    ] = None,
     background: Annotated[
         Path | None,
-        option(
+        opt.option(
             "Log whose map of the ground is shown below, or a map of log2sim map.",
             "LOG|MAP.png",
             default="that of --log",
         ),
     ] = None,
-    sequence: SequenceName = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    sequence: opt.SequenceName = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Write an interactive HTML page of a scenario.
 
@@ -86,15 +76,17 @@ def view(
             from log2sim.visualization.recording import DEFAULT_MAX_BYTES
 
             max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
-            layers["recorded"] = open_recorded(log, loaded, sequence, max_bytes, camera_names(cameras), report_progress)
+            layers["recorded"] = open_recorded(
+                log, loaded, sequence, max_bytes, opt.camera_names(cameras), report_progress
+            )
         if background is not None:
             layers["background"] = load_background(background, loaded, sequence, report_progress)
         elif log is not None and shows_ground(opened := layers["recorded"].log):
             layers["background"] = map_of(opened, loaded, report_progress)
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:
-        say(note, quiet=quiet)
-    say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}", quiet=quiet)
+        opt.say(note, quiet=quiet)
+    opt.say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}", quiet=quiet)
 
 
 def _metrics(path: Path) -> tuple[str, str]:

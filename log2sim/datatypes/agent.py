@@ -114,54 +114,29 @@ MIN_DISCONTINUITY_MPS = 15.0
 
 
 class TrajectoryStates(NamedTuple):
-    """Box centers on a trajectory, map frame.
+    """Box centers on a trajectory, map frame."""
 
-    Attributes
-    ----------
-    x_m, y_m, z_m : (N,) float64, m
-    yaw_rad : (N,) float64, in [-pi, pi)
-    speed_mps : (N,) float64, m/s
-        Along the heading.
-    """
-
-    x_m: Array
-    y_m: Array
-    z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
+    x_m: Array  # (N,), m
+    y_m: Array  # (N,), m
+    z_m: Array  # (N,), m
+    yaw_rad: Array  # (N,), in [-pi, pi)
+    speed_mps: Array  # (N,), m/s: along the heading
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Cubic Hermite spline through the waypoints of a box center.
+    """Cubic Hermite spline through the waypoints of a box center."""
 
-    Attributes
-    ----------
-    t_s : (T,) float64, s
-    x_m, y_m : (T,) float64, m
-        Relative to `origin_m`, which keeps digits far from the origin of the map.
-    z_m : (T,) float64, m
-    yaw_rad : (T,) float64
-        Unwrapped.
-    speed_mps : (T,) float64, m/s
-    velocity_x_mps, velocity_y_mps : (T,) float64, m/s
-        Tangents of the spline.
-    discontinuous : (T - 1,) bool
-        Steps over which the log jumps instead of moving.
-    origin_m : (2,) tuple of float, m
-        The first waypoint.
-    """
-
-    t_s: Array
-    x_m: Array
+    t_s: Array  # (T,), s
+    x_m: Array  # (T,), m: relative to `origin_m`, which keeps digits far from the origin of the map, as `y_m`
     y_m: Array
-    z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    velocity_x_mps: Array
+    z_m: Array  # (T,), m
+    yaw_rad: Array  # (T,): unwrapped
+    speed_mps: Array  # (T,), m/s
+    velocity_x_mps: Array  # (T,), m/s: tangents of the spline, as `velocity_y_mps`
     velocity_y_mps: Array
-    discontinuous: NDArray[np.bool_]
-    origin_m: tuple[float, float]
+    discontinuous: NDArray[np.bool_]  # (T - 1,): steps over which the log jumps instead of moving
+    origin_m: tuple[float, float]  # the first waypoint
 
     @classmethod
     def through(cls, waypoints: Waypoints, rear_axle_offset_m: float = 0.0) -> Trajectory:
@@ -267,26 +242,16 @@ COLOR_NAMES = ("black", "white", "gray", "silver", "red", "blue", "green", "yell
 
 @dataclass(frozen=True, eq=False)
 class AgentStates:
-    """States of one agent at requested times; NaN where not valid.
-
-    Attributes
-    ----------
-    valid : (T,) bool
-        Whether the trajectory covers the time.
-    x_m, y_m, z_m : (T,) float64, m
-        Box center, map frame.
-    yaw_rad : (T,) float64
-    speed_mps : (T,) float64, m/s
-    """
+    """States of one agent at requested times; NaN where not valid."""
 
     __repr__ = short_repr
 
-    valid: NDArray[np.bool_]
-    x_m: Array
+    valid: NDArray[np.bool_]  # (T,): whether the trajectory covers the time
+    x_m: Array  # (T,), m: box center, map frame
     y_m: Array
     z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
+    yaw_rad: Array  # (T,)
+    speed_mps: Array  # (T,), m/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,13 +324,8 @@ class Agent:
     def at(self, t_s: ArrayLike, max_gap_s: float = math.inf, margin_s: float = MARGIN_S) -> AgentStates:
         """Evaluate the trajectory at times: positions by cubics with the logged velocities, yaw along the shorter arc.
 
-        Parameters
-        ----------
-        t_s : float or (T,), s
-        max_gap_s : float, s
-            Times inside a longer gap between waypoints are not valid.
-        margin_s : float, s
-            Times up to this far outside the trajectory take its nearest end.
+        `t_s`: s, one or (T,). `max_gap_s`: times inside a longer gap between waypoints are not valid. `margin_s`: times up to this
+        far outside the trajectory take its nearest end.
         """
         t, w = np.atleast_1d(np.asarray(t_s, dtype=np.float64)), self.waypoints
         valid = (t >= w.t_s[0] - margin_s) & (t <= w.t_s[-1] + margin_s)
@@ -405,10 +365,7 @@ def agent_to_dict(agent: Agent) -> dict[str, Any]:
 def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     """Build an agent from an entry that keeps the schema.
 
-    Raises
-    ------
-    ScenarioError
-        For an unknown category, columns of different lengths or an impossible trajectory.
+    Raises `ScenarioError` for an unknown category, columns of different lengths or an impossible trajectory.
     """
     where = f"agent '{entry['id']}'"
     if entry["category"] not in CATEGORIES:

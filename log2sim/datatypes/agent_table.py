@@ -18,36 +18,22 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class AgentTable:
-    """Boxes of A agents at T times, map frame; NaN where an agent is absent.
-
-    Attributes
-    ----------
-    agents : tuple of A Agent
-    t_s : (T,) float64, s
-    center_m : (A, T, 3) float64, m
-    yaw_rad : (A, T) float64, in [-pi, pi)
-    speed_mps : (A, T) float64, m/s
-        Along the heading, negative when reversing.
-    """
+    """Boxes of A agents at T times, map frame; NaN where an agent is absent."""
 
     __repr__ = short_repr
 
     agents: tuple[Agent, ...]
-    t_s: Array
-    center_m: Array
-    yaw_rad: Array
-    speed_mps: Array
+    t_s: Array  # (T,), s
+    center_m: Array  # (A, T, 3), m
+    yaw_rad: Array  # (A, T), in [-pi, pi)
+    speed_mps: Array  # (A, T), m/s: along the heading, negative when reversing
 
     @classmethod
     def of(cls, agents: Sequence[Agent], t_s: Array, *, margin_s: float = MARGIN_S, permanent: bool = False) -> Self:
         """Evaluate agents at times (T,).
 
-        Parameters
-        ----------
-        margin_s : float, s
-            Up to this far before and after its life an agent moves on as it starts and ends.
-        permanent : bool
-            Whether agents with `is_permanent` are there at all times.
+        Up to `margin_s` before and after its life an agent moves on as it starts and ends. `permanent`: whether agents with
+        `is_permanent` are there at all times.
         """
         columns = np.full((5, len(agents), len(t_s)), np.nan)
         for k, agent in enumerate(agents):

@@ -84,17 +84,8 @@ def name_indices(lab: Array) -> NDArray[np.intp]:
 def name_probabilities(lab: Array, sigma: Array) -> Array:
     """Compute how probable each name is of a color that is known up to errors with a normal distribution.
 
-    Parameters
-    ----------
-    lab : (3,)
-        The color in CIELAB.
-    sigma : (3,)
-        Standard deviations of lightness, of chroma, and across the chroma, all in units of CIELAB.
-
-    Returns
-    -------
-    (len(COLOR_NAMES),) float64
-        They sum to 1; a name's share of a fixed sample, times how frequent it is.
+    `lab` (3,): in CIELAB. `sigma` (3,): standard deviations of lightness, of chroma, and across the chroma, in units of CIELAB.
+    Returns (len(COLOR_NAMES),) float64 that sum to 1: a name's share of a fixed sample, times how frequent it is.
     """
     chroma = float(np.hypot(lab[1], lab[2]))
     along = np.array([lab[1], lab[2]]) / chroma if chroma > 0 else np.array([1.0, 0.0])

@@ -18,40 +18,21 @@ from log2sim.geometry import Array
 
 @dataclass(frozen=True, eq=False)
 class Boxes3D:
-    """Boxes of M road users, map frame.
-
-    Attributes
-    ----------
-    t_ns : (M,) int64
-        Time of the points in each box, absolute.
-    center_m : (M, 3) float64
-        Box centers, m.
-    size_m : (M, 3) float64
-        Length, width, height, m.
-    yaw_rad : (M,) float64
-        Heading, counter-clockwise from the map's x axis.
-    heading_score : (M,) float64
-        Probability in [0.5, 1] that front and back are not swapped.
-    category : (M,) str
-    score : (M,) float64
-        Calibrated probability in [0, 1] that the box is right.
-    points : (M,) int64
-        Number of points in the box.
-    seen_by : (M, 2) bool, optional
-        Which of the `ENDS` found it; None where their clouds were searched as one.
-    """
+    """Boxes of M road users, map frame."""
 
     __repr__ = short_repr
 
-    t_ns: NDArray[np.int64]
-    center_m: Array
-    size_m: Array
-    yaw_rad: Array
-    heading_score: Array
-    category: NDArray[np.str_]
-    score: Array
-    points: NDArray[np.int64]
-    seen_by: NDArray[np.bool_] | None = None
+    t_ns: NDArray[np.int64]  # (M,): time of the points in each box, absolute
+    center_m: Array  # (M, 3): box centers, m
+    size_m: Array  # (M, 3): length, width, height, m
+    yaw_rad: Array  # (M,): heading, counter-clockwise from the map's x axis
+    heading_score: Array  # (M,): probability in [0.5, 1] that front and back are not swapped
+    category: NDArray[np.str_]  # (M,)
+    score: Array  # (M,): calibrated probability in [0, 1] that the box is right
+    points: NDArray[np.int64]  # (M,): number of points in the box
+    seen_by: NDArray[np.bool_] | None = (
+        None  # (M, 2): which of the `ENDS` found it; None where their clouds were searched as one
+    )
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -89,24 +70,14 @@ TUPLES = ("cluster", "others")
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """2D boxes of one camera frame.
-
-    Attributes
-    ----------
-    box_px : (M, 4) float64
-        u0, v0, u1, v1.
-    score : (M,) float64
-        In [0, 1].
-    category : (M,) str
-    traffic_lights : (K, 5) float64
-        Boxes u0, v0, u1, v1 and scores of traffic lights in the frame, which are no road users.
-    """
+    """2D boxes of one camera frame."""
 
     __repr__ = short_repr
 
-    box_px: Array
-    score: Array
-    category: NDArray[np.str_]
+    box_px: Array  # (M, 4): u0, v0, u1, v1
+    score: Array  # (M,): in [0, 1]
+    category: NDArray[np.str_]  # (M,)
+    # (K, 5): boxes u0, v0, u1, v1 and scores of traffic lights in the frame, which are no road users
     traffic_lights: Array = field(default_factory=lambda: np.zeros((0, 5)))
 
     def __len__(self) -> int:
@@ -125,94 +96,52 @@ class Detections:
 
 @dataclass(frozen=True, eq=False)
 class OtherView:
-    """What a second LiDAR, far from the first, shows of an object at the same tick.
+    """What a second LiDAR, far from the first, shows of an object at the same tick."""
 
-    Attributes
-    ----------
-    sensor_m : (3,) float64
-        Viewpoint, m, map frame.
-    ends_visible : (2,) bool
-        Whether the right and the left end of the points, as seen from there, are ends of the object.
-    cluster : (n, 4) float64
-        These points, subsampled: x, y, z in m, and the time after `t_ns` of the row in s.
-    """
-
-    sensor_m: Array
-    ends_visible: NDArray[np.bool_]
-    cluster: NDArray[np.float64]
+    sensor_m: Array  # (3,): viewpoint, m, map frame
+    ends_visible: NDArray[
+        np.bool_
+    ]  # (2,): whether the right and the left end of the points, as seen from there, are ends of the object
+    cluster: NDArray[
+        np.float64
+    ]  # (n, 4): these points, subsampled: x, y, z in m, and the time after `t_ns` of the row in s
 
 
 @dataclass(frozen=True, eq=False)
 class BoxEvidence:
-    """What cameras and LiDARs observed of each object, map frame; nothing unobserved is completed but by a 3D detector.
-
-    Attributes
-    ----------
-    t_ns : (M,) int64
-        Mean time of the object's LiDAR points, else the stamp of the camera frame.
-    category : (M,) str
-    score : (M,) float64
-        Of the detector, in [0, 1].
-    camera : (M,) str
-        "" for an object that no camera detected.
-    box_px : (M, 4) float64
-        u0, v0, u1, v1; NaN without camera.
-    truncated : (M,) bool
-        Whether the image border cuts the box.
-    height_px_m : (M,) float64
-        Height in m that the image box spans at the object's depth, or above where a homography places its foot; NaN where
-        neither is known.
-    points : (M,) int64
-        Number of LiDAR points on the object.
-    cluster : M arrays (n, 4) or (n, 3) float64
-        These points, subsampled: x, y, z in m, and where it is known the time after `t_ns` in s at which each was measured.
-    sensor_m : (M, 3) float64
-        Viewpoint.
-    yaw_rad : (M,) float64
-        Direction of the object's length up to half turns, for short sides up to quarter turns; NaN without points.
-    low_m, high_m : (M, 2) float64
-        Ends of the points along the length and the width axis, relative to the viewpoint; NaN without points.
-    ends_visible : (M, 2) bool
-        Whether the right and the left end of the points, as seen from the viewpoint, are ends of the object.
-    bottom_m, top_m : (M,) float64
-        Heights of the ground under the object and of its highest points; NaN where unknown.
-    box_center_m : (M, 3) float64
-        Center of the box that a detector found in the LiDAR's sweep, m; NaN without one, as in the next three.
-    box_size_m : (M, 3) float64
-        Its length, width, height, m.
-    box_yaw_rad : (M,) float64
-        Its heading.
-    heading_score : (M,) float64
-        Probability in [0.5, 1] that its front and back are not swapped.
-    seen_by : (M, 2) bool
-        Which of the `ENDS` measured it.
-    others : M OtherView or None
-        What a second viewpoint shows, None for rows without; empty where no row has one.
-    """
+    """What cameras and LiDARs observed of each object, map frame; nothing unobserved is completed but by a 3D detector."""
 
     __repr__ = short_repr
 
-    t_ns: NDArray[np.int64]
-    category: NDArray[np.str_]
-    score: Array
-    camera: NDArray[np.str_]
-    box_px: Array
-    truncated: NDArray[np.bool_]
+    t_ns: NDArray[np.int64]  # (M,): mean time of the object's LiDAR points, else the stamp of the camera frame
+    category: NDArray[np.str_]  # (M,)
+    score: Array  # (M,): of the detector, in [0, 1]
+    camera: NDArray[np.str_]  # (M,): "" for an object that no camera detected
+    box_px: Array  # (M, 4): u0, v0, u1, v1; NaN without camera
+    truncated: NDArray[np.bool_]  # (M,): whether the image border cuts the box
+    # (M,): height in m that the image box spans at the object's depth, or above where a homography places its foot; NaN where neither
+    # is known
     height_px_m: Array
-    points: NDArray[np.int64]
+    points: NDArray[np.int64]  # (M,): number of LiDAR points on the object
+    # M arrays (n, 4) or (n, 3): these points, subsampled: x, y, z in m, and where it is known the time after `t_ns` in s at which each
+    # was measured
     cluster: Sequence[NDArray[np.float64]]
-    sensor_m: Array
-    yaw_rad: Array
-    low_m: Array
+    sensor_m: Array  # (M, 3): viewpoint
+    yaw_rad: Array  # (M,): direction of the object's length up to half turns, for short sides up to quarter turns; NaN without points
+    low_m: Array  # (M, 2): ends of the points along the length and the width axis, relative to the viewpoint; NaN without points
     high_m: Array
+    # (M, 2): whether the right and the left end of the points, as seen from the viewpoint, are ends of the object
     ends_visible: NDArray[np.bool_]
-    bottom_m: Array
+    bottom_m: (
+        Array  # (M,): heights of the ground under the object and, `top_m`, of its highest points; NaN where unknown
+    )
     top_m: Array
-    box_center_m: Array
-    box_size_m: Array
-    box_yaw_rad: Array
-    heading_score: Array
-    seen_by: NDArray[np.bool_]
+    box_center_m: Array  # (M, 3): center of the box that a detector found in the LiDAR's sweep, m; NaN without one, as in the next three
+    box_size_m: Array  # (M, 3): its length, width, height, m
+    box_yaw_rad: Array  # (M,): its heading
+    heading_score: Array  # (M,): probability in [0.5, 1] that its front and back are not swapped
+    seen_by: NDArray[np.bool_]  # (M, 2): which of the `ENDS` measured it
+    # M: what a second viewpoint shows, None for rows without; empty where no row has one
     others: tuple[OtherView | None, ...] = field(default=(), kw_only=True)
 
     def __len__(self) -> int:
@@ -244,24 +173,15 @@ class BoxEvidence:
 
 @dataclass(frozen=True, eq=False)
 class Measurements(BoxEvidence):
-    """Evidence for the objects of one tick with a provisional position of each, for gating and tracking.
-
-    Attributes
-    ----------
-    center_m : (M, 3) float64
-        Box center, m, NaN without a position. It assumes the typical size of the category where no end was observed; the
-        final size and positions are estimated from the evidence of a whole track.
-    covariance : (M, 2, 2) float64
-        Of the center's x, y, m2.
-    source : (M,) str
-        "lidar", "topdown", or "" without a position.
-    """
+    """Evidence for the objects of one tick with a provisional position of each, for gating and tracking."""
 
     __repr__ = short_repr
 
+    # (M, 3): box center, m, NaN without a position. It assumes the typical size of the category where no end was observed; the final
+    # size and positions are estimated from the evidence of a whole track.
     center_m: Array
-    covariance: Array
-    source: NDArray[np.str_]
+    covariance: Array  # (M, 2, 2): of the center's x, y, m2
+    source: NDArray[np.str_]  # (M,): "lidar", "topdown", or "" without a position
 
     @classmethod
     def join(cls, parts: Sequence[Measurements]) -> Measurements:
@@ -329,26 +249,13 @@ class Rays:
     """A sample of the rays of one tick that ended on the ground or on an obstacle, evenly spread over directions.
 
     Positions are in m, map axes, relative to the origin of the cloud.
-
-    Attributes
-    ----------
-    end : (K, 3) float32
-        The points that they hit.
-    t_s : (K,) float32
-        Times relative to the stamp of the cloud.
-    sensor : (K,) uint8
-        Number of the LiDAR.
-    position : (S, 3) float32
-        Of the LiDARs at the stamp of the cloud.
-    velocity_mps : (S, 3) float32
-        Of the LiDARs.
     """
 
-    end: NDArray[np.float32]
-    t_s: NDArray[np.float32]
-    sensor: NDArray[np.uint8]
-    position: NDArray[np.float32]
-    velocity_mps: NDArray[np.float32]
+    end: NDArray[np.float32]  # (K, 3): the points that they hit
+    t_s: NDArray[np.float32]  # (K,): times relative to the stamp of the cloud
+    sensor: NDArray[np.uint8]  # (K,): number of the LiDAR
+    position: NDArray[np.float32]  # (S, 3): of the LiDARs at the stamp of the cloud
+    velocity_mps: NDArray[np.float32]  # (S, 3): of the LiDARs
 
     def __len__(self) -> int:
         """Return the number of rays."""
@@ -362,34 +269,20 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Points above the ground at one tick, one a voxel; points and rays may be given as functions that read them.
-
-    Attributes
-    ----------
-    origin : (3,) float64
-        m, map frame.
-    xyz : (N, 3) float32
-        m, map axes, relative to `origin`.
-    t_s : (N,) float32
-        Times relative to `stamp_ns`.
-    sensor : (3,) float32
-        Position of the sensor relative to `origin`, mean over several; of viewpoints far from each other the first.
-    free : Rays, optional
-        A sample of all rays, those that end on the ground too: where they passed is nothing.
-    viewpoints : (V, 3) float32, optional
-        Positions of LiDARs far from each other relative to `origin`; None where all points are seen from `sensor`.
-    seen_from : (N,) uint8, optional
-        The viewpoint of each point.
-    """
+    """Points above the ground at one tick, one a voxel; points and rays may be given as functions that read them."""
 
     stamp_ns: int
-    origin: Array
-    xyz: Deferred[NDArray[np.float32]] = Deferred()  # a descriptor
-    t_s: Deferred[NDArray[np.float32]] = Deferred()  # a descriptor
+    origin: Array  # (3,): m, map frame
+    xyz: Deferred[NDArray[np.float32]] = Deferred()  # (N, 3): m, map axes, relative to `origin`
+    t_s: Deferred[NDArray[np.float32]] = Deferred()  # (N,): times relative to `stamp_ns`
+    # (3,): position of the sensor relative to `origin`, mean over several; of viewpoints far from each other the first
     sensor: NDArray[np.float32]  # type: ignore[misc]  # those before it are descriptors, they have no default
-    free: Deferred[Rays | None] = Deferred(None)  # a descriptor
+    free: Deferred[Rays | None] = Deferred(
+        None
+    )  # a sample of all rays, those that end on the ground too: where they passed is nothing
+    # (V, 3): positions of LiDARs far from each other relative to `origin`; None where all points are seen from `sensor`
     viewpoints: NDArray[np.float32] | None = None
-    seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # a descriptor
+    seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # (N,): the viewpoint of each point
 
     def sensor_of(self, index: NDArray[np.intp]) -> NDArray[np.float32]:
         """Return the position (3,) of the sensor that sees most of the points at `index`."""
@@ -418,27 +311,17 @@ class Obstacles:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One object over time.
-
-    Attributes
-    ----------
-    tick : (n,) int64
-        Strictly increasing indices of ticks.
-    measurements : Measurements
-        n rows, one at each of these ticks.
-    unrecorded : (U,) int64
-        Increasing indices of ticks at which no sensor that measured it recorded anything: that it was not measured there says
-        nothing.
-    searched : float
-        Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone.
-    """
+    """One object over time."""
 
     __repr__ = short_repr
 
     category: str
-    tick: NDArray[np.int64]
-    measurements: Measurements
+    tick: NDArray[np.int64]  # (n,): strictly increasing indices of ticks
+    measurements: Measurements  # n rows, one at each of these ticks
+    # (U,): increasing indices of ticks at which no sensor that measured it recorded anything: that it was not measured there says
+    # nothing
     unrecorded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone
     searched: float = 1.0
 
     def __len__(self) -> int:

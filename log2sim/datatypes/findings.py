@@ -210,10 +210,7 @@ SENSOR_KINDS: Mapping[str, Kind] = {
     ),
     "camera_rotation": Kind(
         "the mount of a camera is rotated against its calibration",
-        {
-            "camera": BY_EDGES + "; {done}",
-            "either": BY_EDGES + ", or the mount of {other} is; {done}",
-        },
+        {"camera": BY_EDGES + "; {done}", "either": BY_EDGES + ", or the mount of {other} is; {done}"},
         TURN,
         FIX,
     ),
@@ -241,10 +238,7 @@ SENSOR_KINDS: Mapping[str, Kind] = {
     ),
     "road_pose": Kind(
         "the pose of a roadside unit is off against the ego's map",
-        {
-            "all": OFF_MAP + "corrected",
-            "height_and_tilt": OFF_MAP + "its height and tilt are corrected",
-        },
+        {"all": OFF_MAP + "corrected", "height_and_tilt": OFF_MAP + "its height and tilt are corrected"},
         ROAD_POSE,
     ),
     "road_clock": Kind(

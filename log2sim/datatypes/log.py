@@ -63,30 +63,14 @@ QUATERNION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class LabelView:
-    """The images of one camera in which objects were labeled.
+    """The images of one camera in which objects were labeled."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Its mount is not used.
-    t_s : (F,) float64, s
-        Strictly increasing stamps since the start of the truth.
-    translation_m : (F, 3) float64, m
-        Of the camera in the map.
-    rotation_wxyz : (F, 4) float64
-        Unit quaternions of the camera in the map, scalar first.
-    region_frame : (R,) int64
-        Index into `t_s` of each region.
-    region_px : (R, 4) float64, px
-        u0, v0, u1, v1 of each part of an image without labels.
-    """
-
-    camera: Camera
-    t_s: Array
-    translation_m: Array
-    rotation_wxyz: Array
-    region_frame: NDArray[np.int64]
-    region_px: Array
+    camera: Camera  # its mount is not used
+    t_s: Array  # (F,), s: strictly increasing stamps since the start of the truth
+    translation_m: Array  # (F, 3), m: of the camera in the map
+    rotation_wxyz: Array  # (F, 4): unit quaternions of the camera in the map, scalar first
+    region_frame: NDArray[np.int64]  # (R,): index into `t_s` of each region
+    region_px: Array  # (R, 4), px: u0, v0, u1, v1 of each part of an image without labels
 
     @property
     def map_T_cam(self) -> Array:
@@ -96,21 +80,11 @@ class LabelView:
 
 @dataclass(frozen=True, eq=False)
 class IgnoreRegions:
-    """Where reconstructed objects are neither right nor false, because nothing was labeled there.
+    """Where reconstructed objects are neither right nor false, because nothing was labeled there."""
 
-    Attributes
-    ----------
-    views : tuple of LabelView
-        One for each labeled camera.
-    outside_views : bool
-        Whether objects outside all views were left without labels too.
-    categories : tuple of str
-        Categories that were left without labels everywhere.
-    """
-
-    views: tuple[LabelView, ...]
-    outside_views: bool
-    categories: tuple[str, ...] = ()
+    views: tuple[LabelView, ...]  # one for each labeled camera
+    outside_views: bool  # whether objects outside all views were left without labels too
+    categories: tuple[str, ...] = ()  # categories that were left without labels everywhere
 
     def to_dict(self) -> dict[str, Any]:
         """Return the part `unlabeled` of a document of `schemas/scenario-1.json`."""
@@ -121,29 +95,34 @@ class IgnoreRegions:
     def from_dict(cls, document: Mapping[str, Any]) -> IgnoreRegions:
         """Build them from the part `unlabeled` of a document that keeps the schema.
 
-        Raises
-        ------
-        ScenarioError
-            When columns do not fit each other.
+        Raises `ScenarioError` when columns do not fit each other.
         """
         views = tuple(_view_from_dict(v, f"unlabeled.views[{k}]") for k, v in enumerate(document["views"]))
         return cls(views, bool(document["outside_views"]), tuple(document.get("categories", ())))
 
 
-def _view_to_dict(view: LabelView) -> dict[str, Any]:
-    c = view.camera
+def intrinsics_to_dict(camera: Camera) -> dict[str, Any]:
+    """Return size, camera matrix and lens of a camera as an entry of a document."""
+    K = camera.K
     return {
-        "camera": c.name,
-        "intrinsics": {
-            "width_px": int(c.width_px),
-            "height_px": int(c.height_px),
-            "fx_px": float(c.K[0, 0]),
-            "fy_px": float(c.K[1, 1]),
-            "cx_px": float(c.K[0, 2]),
-            "cy_px": float(c.K[1, 2]),
-            "distortion_model": c.distortion_model,
-            "distortion": [float(d) for d in c.distortion],
-        },
+        "width_px": int(camera.width_px), "height_px": int(camera.height_px), "fx_px": float(K[0, 0]), "fy_px": float(K[1, 1]),
+        "cx_px": float(K[0, 2]), "cy_px": float(K[1, 2]), "distortion_model": camera.distortion_model,
+        "distortion": [float(d) for d in camera.distortion],
+    }  # fmt: skip
+
+
+def camera_of(name: str, intrinsics: Mapping[str, Any], mount: Mount, mount_T_cam: Array) -> Camera:
+    """Return the camera of such an entry."""
+    i, model = intrinsics, intrinsics.get("distortion_model", "none")
+    K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
+    lens = tuple(float(d) for d in i.get("distortion", ()))
+    return Camera(name, i["width_px"], i["height_px"], K, mount, mount_T_cam, model, lens)
+
+
+def _view_to_dict(view: LabelView) -> dict[str, Any]:
+    return {
+        "camera": view.camera.name,
+        "intrinsics": intrinsics_to_dict(view.camera),
         "t_s": view.t_s.tolist(),
         "translation_m": view.translation_m.tolist(),
         "rotation_wxyz": view.rotation_wxyz.tolist(),
@@ -153,10 +132,7 @@ def _view_to_dict(view: LabelView) -> dict[str, Any]:
 
 
 def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
-    i = entry["intrinsics"]
-    K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
-    model, lens = i.get("distortion_model", "none"), tuple(float(d) for d in i.get("distortion", ()))
-    camera = Camera(entry["camera"], i["width_px"], i["height_px"], K, "map", np.eye(4), model, lens)
+    camera = camera_of(entry["camera"], entry["intrinsics"], "map", np.eye(4))
     t_s = np.array(entry["t_s"], dtype=np.float64)
     position = np.array(entry["translation_m"], dtype=np.float64).reshape(-1, 3)
     q = np.array(entry["rotation_wxyz"], dtype=np.float64).reshape(-1, 4)
@@ -177,115 +153,69 @@ def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Labeled 3D boxes of a log in the map frame, one row a box and stamp.
-
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Absolute stamps.
-    track_id : (L,) str
-    category : (L,) str
-    center_m : (L, 3) float64, m
-        Box centers.
-    size_m : (L, 3) float64, m
-        Length, width, height.
-    yaw_rad : (L,) float64
-    visible : (L,) bool or None
-        As the log states it; None where it states nothing and visibility is computed.
-    cameras : tuple of str or None
-        The cameras in whose images alone objects were labeled; None when they were labeled all around.
-    kind : (L,) str or None
-        The log's own word for the category, such as "Van"; None where the log has none of its own.
-    occlusion : (L,) int64 or None
-        0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it.
-    labeled_ns : (F,) int64 or None
-        Increasing stamps of all that was labeled, also where nothing was there; None where the log does not state it.
-    never_labeled : tuple of str
-        Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI.
-    """
+    """Labeled 3D boxes of a log in the map frame, one row a box and stamp."""
 
     __repr__ = short_repr
 
-    t_ns: NDArray[np.int64]
-    track_id: NDArray[np.str_]
-    category: NDArray[np.str_]
-    center_m: Array
-    size_m: Array
-    yaw_rad: Array
-    visible: NDArray[np.bool_] | None = None
+    t_ns: NDArray[np.int64]  # (L,): absolute stamps
+    track_id: NDArray[np.str_]  # (L,)
+    category: NDArray[np.str_]  # (L,)
+    center_m: Array  # (L, 3), m: box centers
+    size_m: Array  # (L, 3), m: length, width, height
+    yaw_rad: Array  # (L,)
+    visible: NDArray[np.bool_] | None = (
+        None  # (L,): as the log states it; None where it states nothing and visibility is computed
+    )
+    # The cameras in whose images alone objects were labeled; None when they were labeled all around
     cameras: tuple[str, ...] | None = None
+    # (L,): the log's own word for the category, such as "Van"; None where the log has none of its own
     kind: NDArray[np.str_] | None = None
+    # (L,): 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown, as the log states it
     occlusion: NDArray[np.int64] | None = None
+    # (F,): increasing stamps of all that was labeled, also where nothing was there; None where the log does not state it
     labeled_ns: NDArray[np.int64] | None = None
-    never_labeled: tuple[str, ...] = ()
+    never_labeled: tuple[
+        str, ...
+    ] = ()  # categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI
 
 
 @dataclass(frozen=True, eq=False)
 class ImageLabels:
-    """Labeled 2D boxes of one camera.
-
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Absolute stamp of the frame.
-    box_px : (L, 4) float64, px
-        u0, v0, u1, v1.
-    category : (L,) str
-    """
+    """Labeled 2D boxes of one camera."""
 
     __repr__ = short_repr
 
-    t_ns: NDArray[np.int64]
-    box_px: Array
-    category: NDArray[np.str_]
+    t_ns: NDArray[np.int64]  # (L,): absolute stamp of the frame
+    box_px: Array  # (L, 4), px: u0, v0, u1, v1
+    category: NDArray[np.str_]  # (L,)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRegions:
-    """Parts of the images of one camera in which objects were left without labels.
-
-    Attributes
-    ----------
-    t_ns : (L,) int64
-        Absolute stamp of the frame.
-    box_px : (L, 4) float64, px
-        u0, v0, u1, v1.
-    """
+    """Parts of the images of one camera in which objects were left without labels."""
 
     __repr__ = short_repr
 
-    t_ns: NDArray[np.int64]
-    box_px: Array
+    t_ns: NDArray[np.int64]  # (L,): absolute stamp of the frame
+    box_px: Array  # (L, 4), px: u0, v0, u1, v1
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """One LiDAR sweep.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Absolute time of the sweep.
-    xyz_m : (N, 3) float32 or float64, m
-        Finite points in `frame`.
-    frame : {"lidar", "map"}
-        "lidar": the sensor's frame; "map": already motion-compensated.
-    t_ns : (N,) int64 or None
-        Absolute stamps at which the points were measured; None when the log has none.
-    compensated_ns : int or None
-        For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each
-        point is in the sensor's frame at its own time.
-    intensity : (N,) float32 or None
-        How strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
-    """
+    """One LiDAR sweep."""
 
     __repr__ = short_repr
 
-    stamp_ns: int
-    xyz_m: NDArray[np.floating[Any]]
-    frame: Literal["lidar", "map"] = "lidar"
-    t_ns: NDArray[np.int64] | None = None
+    stamp_ns: int  # absolute time of the sweep
+    xyz_m: NDArray[np.floating[Any]]  # (N, 3), m: finite points in `frame`
+    frame: Literal["lidar", "map"] = "lidar"  # "lidar": the sensor's frame; "map": already motion-compensated
+    t_ns: NDArray[np.int64] | None = (
+        None  # (N,): absolute stamps at which the points were measured; None when the log has none
+    )
+    # For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each point is in the
+    # sensor's frame at its own time
     compensated_ns: int | None = None
+    # (N,): how strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
     intensity: NDArray[np.float32] | None = None
 
     def thinned(self, most: int) -> Sweep:
@@ -298,33 +228,17 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Tick:
-    """One synchronized moment of a log.
+    """One synchronized moment of a log."""
 
-    Attributes
-    ----------
-    t_ns : int
-        Absolute stamp.
-    t_s : float, s
-        Since the first tick of the log.
-    images : mapping of str to (H, W, 3) uint8 BGR
-        By camera, without cameras that have no frame near the tick. A frame is decoded when it is asked for, and
-        `RecordError` says which one cannot be read.
-    sweeps : mapping of str to Sweep
-        By LiDAR, likewise.
-    image_ns : mapping of str to int
-        Absolute stamps of the frames.
-    map_T_ego : (4, 4) float64 or None
-        Pose of the ego; None where it is not known.
-    points : (N, 3) float64, m, map frame
-        Of all sweeps, each point where the sensor was at its own time. Made when they are first asked for.
-    """
-
-    t_ns: int
-    t_s: float
+    t_ns: int  # absolute stamp
+    t_s: float  # since the first tick of the log
+    # (H, W, 3) uint8 BGR by camera, without cameras that have no frame near the tick. A frame is decoded when it is asked for, and
+    # `RecordError` says which one cannot be read.
     images: Mapping[str, NDArray[np.uint8]]
-    sweeps: Mapping[str, Sweep]
-    image_ns: Mapping[str, int]
-    map_T_ego: Array | None
+    sweeps: Mapping[str, Sweep]  # by LiDAR, likewise
+    image_ns: Mapping[str, int]  # absolute stamps of the frames
+    map_T_ego: Array | None  # (4, 4): pose of the ego; None where it is not known
+    # (N, 3), m, map frame: of all sweeps, each point where the sensor was at its own time. Made when they are first asked for.
     points: Deferred[Array] = Deferred()
 
     def __repr__(self) -> str:
@@ -334,84 +248,52 @@ class Tick:
 
 @dataclass(frozen=True, eq=False)
 class Lidar:
-    """A LiDAR and where it is mounted.
-
-    Attributes
-    ----------
-    mount : {"ego", "map"}
-        Frame that it is fixed in: on the vehicle or at the roadside.
-    mount_T_lidar : (4, 4) float64
-    """
+    """A LiDAR and where it is mounted."""
 
     __repr__ = short_repr
 
     name: str
-    mount: Mount
-    mount_T_lidar: Array
+    mount: Mount  # frame that it is fixed in: on the vehicle or at the roadside
+    mount_T_lidar: Array  # (4, 4)
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """The records of one sensor in the order of the log.
-
-    Attributes
-    ----------
-    name : str
-        Of the sensor.
-    t_ns : (F,) int64
-        Absolute stamps, increasing; may be given as a function that reads them.
-    read : callable
-        Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that
-        cannot be read. Several threads may call it at once.
-    encoded : callable or None
-        Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it, which hold all that `read`
-        returns; None where it holds none.
-    """
+    """The records of one sensor in the order of the log."""
 
     __repr__ = short_repr
 
-    name: str
-    t_ns: Deferred[NDArray[np.int64]] = Deferred()
+    name: str  # of the sensor
+    t_ns: Deferred[NDArray[np.int64]] = (
+        Deferred()
+    )  # (F,): absolute stamps, increasing; may be given as a function that reads them
+    # Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that cannot be read.
+    # Several threads may call it at once.
     read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
+    # Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it, which hold all that `read` returns; None
+    # where it holds none
     encoded: Callable[[int], bytes] | None = None
 
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Where the map frame lies on Earth: local x, y, z + `offset_m` are coordinates of `projection`.
+    """Where the map frame lies on Earth: local x, y, z + `offset_m` are coordinates of `projection`."""
 
-    Attributes
-    ----------
-    latitude_deg, longitude_deg, altitude_m : float or None
-        Of the map's origin; None when unknown.
-    projection : str or None
-        A PROJ string; None for a map that is only local.
-    offset_m : (3,) tuple of float, m
-        What was taken off large map coordinates so that the rest keeps its digits, in whole kilometers; where the coordinates of
-        the log do not count from the origin of `projection`, the distance between the two origins is added.
-    """
-
-    latitude_deg: float | None = None
+    latitude_deg: float | None = None  # of the map's origin; None when unknown
     longitude_deg: float | None = None
     altitude_m: float | None = None
-    projection: str | None = None
+    projection: str | None = None  # a PROJ string; None for a map that is only local
+    # m: what was taken off large map coordinates so that the rest keeps its digits, in whole kilometers; where the coordinates of
+    # the log do not count from the origin of `projection`, the distance between the two origins is added
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class EgoVehicle:
-    """The ego's box.
+    """The ego's box."""
 
-    Attributes
-    ----------
-    size_m : (3,) tuple of float, m
-        Length, width, height.
-    rear_axle_offset_m : float, m
-        From the ego's origin forward to the center of the box.
-    """
-
-    size_m: tuple[float, float, float] = (4.6, 1.9, 1.6)
-    rear_axle_offset_m: float = 1.4
+    size_m: tuple[float, float, float] = (4.6, 1.9, 1.6)  # length, width, height
+    rear_axle_offset_m: float = 1.4  # from the ego's origin forward to the center of the box
 
 
 @dataclass(frozen=True, eq=False)
@@ -484,19 +366,9 @@ class Log:
     ) -> Sequence[Tick]:
         """Return the synchronized moments of the log; their pictures and sweeps are read when they are asked for.
 
-        Parameters
-        ----------
-        cameras : sequence of str
-            All of the log where it is empty.
-        start_s, stop_s : float, optional
-            Keeps the ticks in [start, stop] seconds after the first one.
-
-        Raises
-        ------
-        ConfigError
-            For an unknown camera, and where no tick is left.
-        LogError
-            For a log without cameras and LiDARs, or with stamps that do not increase.
+        `cameras`: all of the log where it is empty. `start_s`, `stop_s`: keep the ticks in between, s after the first one.
+        Raises `ConfigError` for an unknown camera, and where no tick is left; `LogError` for a log without cameras and LiDARs,
+        or with stamps that do not increase.
 
         Examples
         --------
@@ -509,43 +381,19 @@ class Log:
     def truth(self, cameras: Sequence[str] = ()) -> Any:
         """Return the labeled objects and the ego as a scenario, for `evaluate`, `plot` and a first look.
 
-        Parameters
-        ----------
-        cameras : sequence of str
-            Cameras that were used: what they show counts as visible; all of the log where it is empty.
-
-        Returns
-        -------
-        log2sim.Scenario
-
-        Raises
-        ------
-        LogError
-            For a log without labels.
+        `cameras`: that were used, what they show counts as visible; all of the log where it is empty. Returns a `Scenario`.
+        Raises `LogError` for a log without labels.
         """
         return plugins.call("truth_of", self, cameras=tuple(cameras) or None)
 
     def show(self, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Any = None) -> Any:
         """Draw boxes and LiDAR points on the pictures of one moment.
 
-        Parameters
-        ----------
-        when : float or Tick, optional
-            Seconds after the first tick, or a tick of `ticks`; by default a moment in the middle.
-        camera : str or sequence of str
-            One camera or several; all where it is empty.
-        scenario : Scenario, optional
-            Its agents are drawn in place of the labels of the log.
+        `when`: seconds after the first tick, or a tick of `ticks`; by default a moment in the middle. `camera`: one or several;
+        all where it is empty. `scenario`: its agents are drawn in place of the labels of the log. Returns a
+        `log2sim.visualization.notebook.Picture`, which a notebook shows, `save` writes, and whose `figure` is the figure.
 
-        Returns
-        -------
-        log2sim.visualization.notebook.Picture
-            A notebook shows it; `save` writes it, `figure` is the figure.
-
-        Raises
-        ------
-        ConfigError
-            For an unknown camera, and for a time outside the log.
+        Raises `ConfigError` for an unknown camera, and for a time outside the log.
         """
         return plugins.call("show_log", self, when, camera=camera, scenario=scenario)
 
@@ -565,20 +413,9 @@ class Log:
         return np.asarray(center[:, :3])
 
     def map_T_sensor(self, name: str, t_ns: Any) -> tuple[Array, NDArray[np.bool_]]:
-        """Interpolate the pose of a sensor.
+        """Interpolate the poses (N, 4, 4) of a camera or LiDAR at absolute stamps (N,), and whether they are known (N,).
 
-        Parameters
-        ----------
-        name : str
-            A camera or LiDAR of this log.
-        t_ns : int or (N,) int64
-            Absolute stamps.
-
-        Returns
-        -------
-        map_T_sensor : (N, 4, 4) float64
-        valid : (N,) bool
-            Whether the ego pose is known there; always True for a sensor fixed in the map.
+        They always are for a sensor fixed in the map.
         """
         sensor = self.cameras.get(name) or self.lidars[name]
         mount_T_sensor = sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
@@ -593,21 +430,12 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One camera frame as a detector gets it.
-
-    Attributes
-    ----------
-    t_ns : int
-        Absolute stamp.
-    image : callable
-        Decodes the frame when called: (H, W, 3) uint8 BGR.
-    encoded : callable or None
-        Returns the file that `image` decodes, where the log holds one. Raises `RecordError` for one that cannot be read.
-    """
+    """One camera frame as a detector gets it."""
 
     camera: Camera
-    t_ns: int
-    image: Callable[[], NDArray[np.uint8]]
+    t_ns: int  # absolute stamp
+    image: Callable[[], NDArray[np.uint8]]  # decodes the frame when called: (H, W, 3) uint8 BGR
+    # Returns the file that `image` decodes, where the log holds one. Raises `RecordError` for one that cannot be read.
     encoded: Callable[[], bytes] | None = None
 
 

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.log import IgnoreRegions, MapFrame
-from log2sim.datatypes.map_features import MapFeatures
+from log2sim.datatypes.map_features import MapFeatures, unique_ids
 from log2sim.datatypes.tag import Tag
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.files import plugins
-from log2sim.files.documents import check, read_json, replaced, short_repr, write_json
+from log2sim.files.documents import check, from_entry, read_json, replaced, short_repr, to_entry, write_json
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array
 
@@ -28,79 +28,23 @@ SIGNAL_STATES = ("red", "red_yellow", "yellow", "green", "off", "unknown")
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """A signal head of a traffic light.
-
-    Attributes
-    ----------
-    position_m : (3,) float64, m
-        Middle of its housing, map frame.
-    heading_rad : float or None
-        Direction that its lamps face, None where unknown.
-    t_s : (T,) float64, s
-        Strictly increasing times at which its state changes; the last state lasts to the end of the scenario.
-    state : (T,) str
-        Of `SIGNAL_STATES`, from each time on.
-    sigma_m : float, m
-        Standard deviation of the position along the axis on which it is largest.
-    confidence : float
-        Probability that it is a traffic light, there, in [0, 1].
-    cameras : tuple of str
-        That saw it.
-    """
+    """A signal head of a traffic light."""
 
     __repr__ = short_repr
 
     id: str
-    position_m: Array
-    heading_rad: float | None
-    t_s: Array
-    state: NDArray[np.str_]
-    sigma_m: float = 0.0
-    confidence: float = 1.0
-    cameras: tuple[str, ...] = ()
+    position_m: Array  # (3,), m: middle of its housing, map frame
+    heading_rad: float | None  # direction that its lamps face, None where unknown
+    t_s: Array  # (T,), s: strictly increasing times at which its state changes; the last state lasts to the end of the scenario
+    state: NDArray[np.str_]  # (T,): of `SIGNAL_STATES`, from each time on
+    sigma_m: float = 0.0  # m: standard deviation of the position along the axis on which it is largest
+    confidence: float = 1.0  # probability that it is a traffic light, there, in [0, 1]
+    cameras: tuple[str, ...] = ()  # that saw it
 
     def at(self, t_s: ArrayLike) -> NDArray[np.str_]:
         """Return its states (T,) at times (T,); unknown before its first time."""
         k = np.searchsorted(self.t_s, np.atleast_1d(np.asarray(t_s, dtype=np.float64)), side="right") - 1
         return np.asarray(np.where(k >= 0, self.state[np.maximum(k, 0)], "unknown"))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "id": self.id,
-            "position_m": self.position_m.tolist(),
-            "heading_rad": None if self.heading_rad is None else float(self.heading_rad),
-            "t_s": self.t_s.tolist(),
-            "state": [str(state) for state in self.state],
-            "sigma_m": float(self.sigma_m),
-            "confidence": float(self.confidence),
-            "cameras": list(self.cameras),
-        }
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Signal:
-        """Read an entry that keeps the schema.
-
-        Raises
-        ------
-        ScenarioError
-            When it has not one state for each time, or its times do not increase.
-        """
-        t_s, state = np.array(entry["t_s"], dtype=np.float64), np.array(entry["state"], dtype=str)
-        if len(t_s) != len(state):
-            raise ScenarioError(f"signal '{entry['id']}': {len(t_s)} times, {len(state)} states; expected equal")
-        if np.any(np.diff(t_s) <= 0):
-            raise ScenarioError(f"signal '{entry['id']}': t_s does not increase")
-        return cls(
-            entry["id"],
-            np.array(entry["position_m"], dtype=np.float64),
-            entry["heading_rad"],
-            t_s,
-            state,
-            float(entry["sigma_m"]),
-            float(entry["confidence"]),
-            tuple(entry["cameras"]),
-        )
 
 
 COLUMNS: dict[str, tuple[str, str]] = {
@@ -138,10 +82,7 @@ def columns_of(agents: Sequence[Agent]) -> dict[str, NDArray[Any]]:
 def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
     """Return the columns as a pandas DataFrame; `about` becomes its `attrs`.
 
-    Raises
-    ------
-    MissingExtra
-        When pandas is not installed.
+    Raises `MissingExtra` when pandas is not installed.
     """
     try:
         import pandas as pd
@@ -155,10 +96,7 @@ def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
 def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
     """Return the columns as an xarray Dataset along agents (A,) and the times of all waypoints (T,); `about` becomes its `attrs`.
 
-    Raises
-    ------
-    MissingExtra
-        When xarray is not installed.
+    Raises `MissingExtra` when xarray is not installed.
     """
     try:
         import xarray
@@ -188,12 +126,7 @@ def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
 def write_states(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
     """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata.
 
-    Raises
-    ------
-    MissingExtra
-        When pyarrow is not installed.
-    ConfigError
-        When the file cannot be written.
+    Raises `MissingExtra` when pyarrow is not installed; `ConfigError` when the file cannot be written.
     """
     try:
         import pyarrow as pa
@@ -335,10 +268,7 @@ class Scenario:
     def trusted(self, min_confidence: float) -> Scenario:
         """Return a copy with the agents whose confidence is at least `min_confidence`, in [0, 1]; the ego stays.
 
-        Raises
-        ------
-        ConfigError
-            When `min_confidence` is no number from 0 to 1.
+        Raises `ConfigError` when `min_confidence` is no number from 0 to 1.
         """
         if not 0 <= min_confidence <= 1:
             raise ConfigError(f"confidence: {min_confidence:g}, expected a number from 0 to 1")
@@ -354,11 +284,8 @@ class Scenario:
     def load(cls, path: Path | str) -> Scenario:
         """Read and check a scenario file.
 
-        Raises
-        ------
-        ScenarioError
-            When the file is missing, is not JSON, violates the schema or holds impossible values; it names the agent and
-            the field.
+        Raises `ScenarioError` when the file is missing, is not JSON, violates the schema or holds impossible values; it names
+        the agent and the field.
         """
         document = read_json(path, ScenarioError)
         try:
@@ -369,10 +296,7 @@ class Scenario:
     def shift_to(self, other: Scenario) -> Array:
         """Return the translation (3,), m, that brings positions of this scenario into the map of another.
 
-        Raises
-        ------
-        ScenarioError
-            When their maps have different projections.
+        Raises `ScenarioError` when their maps have different projections.
         """
         theirs, ours = other.map, self.map
         if theirs.projection and ours.projection and theirs.projection != ours.projection:
@@ -385,10 +309,7 @@ class Scenario:
     def aligned_to(self, other: Scenario) -> Scenario:
         """Return a copy in another scenario's time and map, to show or compare both.
 
-        Raises
-        ------
-        ScenarioError
-            When their maps have different projections.
+        Raises `ScenarioError` when their maps have different projections.
         """
         later_s = (self.t0_ns - other.t0_ns) / NS_PER_S
         dx, dy, dz = self.shift_to(other)
@@ -413,10 +334,7 @@ class Scenario:
     def save(self, path: Path | str) -> None:
         """Write the scenario atomically; `load` returns exactly the same numbers.
 
-        Raises
-        ------
-        ScenarioError
-            When it violates the schema.
+        Raises `ScenarioError` when it violates the schema.
         """
         document = self.to_dict()
         check(document, "scenario-1", ScenarioError)
@@ -429,10 +347,7 @@ class Scenario:
         `observed`, `sigma_xy_m`, `sigma_yaw_rad`, `sigma_speed_mps` (NaN where not known), `length_m`, `width_m`,
         `height_m`, `static`, `confidence`, `doubts` (the flags, joined by commas). `attrs` hold name and start of the scenario.
 
-        Raises
-        ------
-        MissingExtra
-            When pandas is not installed.
+        Raises `MissingExtra` when pandas is not installed.
         """
         return dataframe_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
 
@@ -442,22 +357,14 @@ class Scenario:
         Times are those of all waypoints; numbers are NaN and `observed` is False where an agent has no waypoint at a time, as
         static agents with a single one at all others.
 
-        Raises
-        ------
-        MissingExtra
-            When xarray is not installed.
+        Raises `MissingExtra` when xarray is not installed.
         """
         return dataset_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
 
     def to_parquet(self, path: Path | str) -> None:
         """Write the rows of `to_dataframe` as a Parquet file, atomically; its schema states unit and meaning of each column.
 
-        Raises
-        ------
-        MissingExtra
-            When pyarrow is not installed.
-        ConfigError
-            When the file cannot be written.
+        Raises `MissingExtra` when pyarrow is not installed; `ConfigError` when the file cannot be written.
         """
         write_states(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
 
@@ -488,21 +395,18 @@ class Scenario:
         if self.map_features is not None:
             document["map_features"] = self.map_features.to_dict()
         if self.signals:
-            document["signals"] = [signal.to_dict() for signal in self.signals]
+            document["signals"] = [to_entry(signal) for signal in self.signals]
         if self.sensors:
             document["sensors"] = [dict(sensor) for sensor in self.sensors]
         if self.tags is not None:
-            document["tags"] = [tag.to_dict() for tag in self.tags]
+            document["tags"] = [to_entry(tag) for tag in self.tags]
         return document
 
     @classmethod
     def from_dict(cls, document: Any) -> Scenario:
         """Build a scenario from a document.
 
-        Raises
-        ------
-        ScenarioError
-            When it violates the schema or holds impossible values.
+        Raises `ScenarioError` when it violates the schema or holds impossible values.
         """
         version = document.get("scenario_version") if isinstance(document, dict) else None
         if version != VERSION:
@@ -525,16 +429,19 @@ class Scenario:
             provenance=document["provenance"],
             ignore_regions=IgnoreRegions.from_dict(document["unlabeled"]) if "unlabeled" in document else None,
             map_features=MapFeatures.from_dict(document["map_features"]) if "map_features" in document else None,
-            signals=tuple(Signal.from_dict(entry) for entry in document.get("signals", ())),
+            signals=tuple(from_entry(Signal, entry) for entry in document.get("signals", ())),
             sensors=tuple(document.get("sensors", ())),
-            tags=tuple(Tag.from_dict(entry) for entry in document["tags"]) if "tags" in document else None,
+            tags=tuple(Tag(**entry) for entry in document["tags"]) if "tags" in document else None,
         )
-        for what, items in (("agent", scenario.agents), ("signal", scenario.signals)):
-            seen: set[str] = set()
-            for item in items:
-                if item.id in seen:
-                    raise ScenarioError(f"{what} '{item.id}': the id occurs twice; ids must be unique")
-                seen.add(item.id)
+        for signal in scenario.signals:
+            if len(signal.t_s) != len(signal.state):
+                raise ScenarioError(
+                    f"signal '{signal.id}': {len(signal.t_s)} times, {len(signal.state)} states; expected equal"
+                )
+            if np.any(np.diff(signal.t_s) <= 0):
+                raise ScenarioError(f"signal '{signal.id}': t_s does not increase")
+        unique_ids("agent", scenario.agents)
+        unique_ids("signal", scenario.signals)
         return scenario
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 TAGS: Mapping[str, str] = {
     "in_lane": "is in a lane of the map",
@@ -34,45 +33,16 @@ TAGS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Tag:
-    """What an agent does during a time.
+    """What an agent does during a time."""
 
-    Attributes
-    ----------
-    tag : str
-        One of `TAGS`.
-    agent : str
-        Id of who does it.
-    start_s, t_s, end_s : float, s
-        From when to when, and the moment that `quantities` are of.
-    probability : float
-        That it is so, by the standard deviations and the confidence of the agents, in [0, 1].
-    other : str or None
-        Id of the agent that it is done to.
-    lane : str or None
-        The lane that the agent is in then, or changes to.
-    quantities : mapping of str to float
-        What defines it, in SI units, which the names end with.
-    """
-
-    tag: str
-    agent: str
+    tag: str  # one of `TAGS`
+    agent: str  # id of who does it
     start_s: float
-    t_s: float
+    t_s: float  # the moment that `quantities` are of
     end_s: float
-    probability: float
-    other: str | None = None
-    lane: str | None = None
-    quantities: Mapping[str, float] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry in a document of `schemas/scenario-1.json`."""
-        return {
-            "tag": self.tag, "agent": self.agent, "other": self.other, "lane": self.lane,
-            "start_s": self.start_s, "t_s": self.t_s, "end_s": self.end_s, "probability": self.probability,
-            "quantities": dict(self.quantities),
-        }  # fmt: skip
-
-    @classmethod
-    def from_dict(cls, entry: Mapping[str, Any]) -> Tag:
-        """Read an entry that keeps the schema."""
-        return cls(**entry)
+    probability: float  # that it is so, by the standard deviations and the confidence of the agents, in [0, 1]
+    other: str | None = None  # id of the agent that it is done to
+    lane: str | None = None  # the lane that the agent is in then, or changes to
+    quantities: Mapping[str, float] = field(
+        default_factory=dict
+    )  # what defines it, in SI units, which the names end with

@@ -16,7 +16,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from log2sim.errors import ConfigError
 from log2sim.files.inputs import open_regular
 
 VARIABLE = "LOG2SIM_CACHE"
-"""Environment variable that names another folder."""
+"""Of the environment; names another folder."""
 
 
 def cache_folder() -> Path:
@@ -77,14 +76,6 @@ _TEMPORARY = ".writing-"
 _SETTINGS, _LAST_RUN = "settings.json", "last_run.json"
 
 
-@dataclass(frozen=True)
-class Usage:
-    """What a cache holds."""
-
-    entries: Mapping[str, int]  # by group, the part of their names before the key
-    bytes: Mapping[str, int]  # the same of their sizes
-
-
 class DiskCache:
     """A cache folder.
 
@@ -115,7 +106,9 @@ class DiskCache:
         try:
             with open_regular(path) as file:
                 state = os.fstat(file.fileno())
-                if state.st_size > MAX_ENTRY_BYTES or not _is_own(state):
+                # What others put there is not read.
+                is_own = not hasattr(os, "geteuid") or state.st_uid == os.geteuid()
+                if state.st_size > MAX_ENTRY_BYTES or not is_own:
                     return None
                 content = file.read(MAX_ENTRY_BYTES + 1)
         except OSError:
@@ -164,14 +157,14 @@ class DiskCache:
         """Remove all entries; return how many there were."""
         return sum(_remove(path) for path, _ in self._entries())
 
-    def usage(self) -> Usage:
-        """Count the entries and their bytes by group."""
-        entries, size = Counter[str](), Counter[str]()
+    def usage(self) -> dict[str, tuple[int, int]]:
+        """Count the entries and their bytes by group, the part of their names before the key."""
+        found: dict[str, tuple[int, int]] = {}
         for path, state in self._entries():
             group = path.name.rpartition(".")[0]
-            entries[group] += 1
-            size[group] += state.st_size
-        return Usage(dict(entries), dict(size))
+            count, size = found.get(group, (0, 0))
+            found[group] = count + 1, size + state.st_size
+        return found
 
     def _path_of(self, name: str) -> Path:
         if not _NAME.fullmatch(name):
@@ -262,8 +255,3 @@ def _remove(path: Path) -> bool:
     except OSError:
         return False
     return True
-
-
-def _is_own(state: os.stat_result) -> bool:
-    """Return whether a file belongs to the user of this process; what others put there is not read."""
-    return not hasattr(os, "geteuid") or state.st_uid == os.geteuid()

@@ -10,12 +10,12 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import Field, fields
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -23,6 +23,8 @@ from pydantic import BaseModel, ValidationError
 from log2sim.errors import ConfigError, Log2SimError, LogError
 from log2sim.files.inputs import read_file
 from log2sim.files.outputs import claim, expect_new, put, temporary_beside
+
+Entry = TypeVar("Entry")
 
 MAX_SHOWN = 100
 """Letters of a value that `short_repr` shows."""
@@ -34,20 +36,14 @@ def is_plain(text: str) -> bool:
 
 
 def parse_float(text: str) -> float:
-    """Parse a number; it may be infinite or NaN.
-
-    Raises `ValueError` for any other text.
-    """
+    """Parse a number, which may be infinite or NaN; `ValueError` for any other text."""
     if not is_plain(text):
         raise ValueError(f"could not convert string to float: {text[:40]!a}")
     return float(text)
 
 
 def parse_int(text: str) -> int:
-    """Parse a whole number.
-
-    Raises `ValueError` for any other text.
-    """
+    """Parse a whole number; `ValueError` for any other text."""
     if not is_plain(text):
         raise ValueError(f"invalid whole number: {text[:40]!a}")
     return int(text)
@@ -71,6 +67,26 @@ def _short(value: Any) -> str:
         text = repr(value) if all(isinstance(v, (str, int, float, type(None))) for v in value) else ""
         return text if 0 < len(text) <= MAX_SHOWN else f"<{len(value)} entries>"
     return repr(value)
+
+
+_TO_JSON: dict[str, Callable[[Any], Any]] = {
+    "float": float, "tuple[str, ...]": list, "Mapping[str, float]": dict, "Array": np.ndarray.tolist, "NDArray[np.str_]": np.ndarray.tolist,
+}  # fmt: skip
+_FROM_JSON: dict[str, Callable[[Any], Any]] = {
+    "float": float, "tuple[str, ...]": tuple, "Array": partial(np.array, dtype=np.float64), "NDArray[np.str_]": partial(np.array, dtype=str),
+}  # fmt: skip
+"""By what the fields of dataclasses are annotated with."""
+
+
+def to_entry(value: Any) -> dict[str, Any]:
+    """Return a dataclass as the entry of a document."""
+    return {f.name: _TO_JSON.get(str(f.type), lambda v: v)(getattr(value, f.name)) for f in fields(value)}
+
+
+def from_entry(of: Callable[..., Entry], entry: Mapping[str, Any]) -> Entry:
+    """Build a dataclass of an entry that keeps the schema."""
+    named: tuple[Field[Any], ...] = fields(of)  # type: ignore[arg-type]
+    return of(**{f.name: _FROM_JSON.get(str(f.type), lambda v: v)(entry[f.name]) for f in named})
 
 
 class RepeatedKeysError(ValueError):

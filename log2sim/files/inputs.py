@@ -15,8 +15,8 @@ from log2sim.errors import LogError
 
 # Of a file that grew since its size was asked for.
 CHUNK_BYTES = 1024 * 1024
-# Of one name in ext4, XFS, Btrfs, NTFS and APFS.
-MAX_NAME_BYTES = 255
+# Of one name in ext4, XFS, Btrfs, NTFS and APFS; of a path in Linux, less what a folder above may have.
+MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 3072
 _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a named pipe"),
@@ -157,10 +157,9 @@ def inside(root: Path, relative: str, what: str) -> Path:
 
     Raises `LogError` for a path outside the log's folder, also through a symbolic link unless links are followed.
     """
-    if len(os.fsencode(Path(relative).name)) > MAX_NAME_BYTES:
-        raise LogError(
-            f"{what}: the file name '{relative[:20]}...' is longer than the {MAX_NAME_BYTES} bytes of file systems"
-        )
+    for name, most in (*((part, MAX_NAME_BYTES) for part in Path(relative).parts), (relative, MAX_PATH_BYTES)):
+        if len(os.fsencode(name)) > most:
+            raise LogError(f"{what}: the file name '{name[:20]}...' is longer than the {most} bytes of file systems")
     try:
         resolved = (root / relative).resolve()
     except (OSError, RuntimeError, ValueError) as problem:  # a loop of symbolic links, a zero byte

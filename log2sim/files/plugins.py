@@ -65,7 +65,7 @@ def find_defect(kind: str, found: Any) -> str | None:
         return f"is the class {found.__name__}, expected an object of it: name an instance, such as {found.__name__}()"
     missing = [name for name in members if not hasattr(found, name)]
     if missing:
-        return f"has no {', '.join(repr(name) for name in missing)}; expected an object with {', '.join(members)}"
+        return f"has no {', '.join(map(repr, missing))}; expected an object with {', '.join(members)}"
     defects = (find_call_defect(getattr(found, name), call) for name, call in members.items() if call is not None)
     return next((defect for defect in defects if defect is not None), None)
 
@@ -77,9 +77,8 @@ def require_members(found: Any, members: tuple[str, ...], call: Call, source: st
     """
     missing = [name for name in members if not hasattr(found, name)]
     if missing:
-        lacking = ", ".join(repr(name) for name in missing)
-        expected = f"expected an object with {', '.join(members)}"
-        raise PluginError(f"{source}: is a {type(found).__name__} without {lacking}; {expected}")
+        lacking = f"without {', '.join(map(repr, missing))}; expected an object with {', '.join(members)}"
+        raise PluginError(f"{source}: is a {type(found).__name__} {lacking}")
     defect = find_call_defect(found.detect, call)
     if defect is not None:
         raise PluginError(f"{source}: {defect}")

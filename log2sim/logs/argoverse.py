@@ -24,15 +24,14 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.inputs import is_present, read_file, require_links_inside
-from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, rotation_from_quaternion, shift_poses, transform
+from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, shift_poses
 from log2sim.logs.arrow import LIMITS, Kind, TableLimits, read_columns
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import (
     MAX_IMAGE_PX,
-    MAX_POSITION_M,
     MAX_SWEEP_BYTES,
     MAX_SWEEP_POINTS,
-    find_not_unit,
+    checked_poses,
     image_stream,
     list_files,
     list_numbered_files,
@@ -43,35 +42,26 @@ from log2sim.logs.stamps import compute_turn_share, defer_notes, note_left_out, 
 CITY_IN_NAME = re.compile(r"____([A-Z]{3})(_city_|\.|$)")
 
 
-@dataclass(frozen=True)
-class City:
-    """A city frame: UTM coordinates from an origin, heights from an unknown zero."""
-
-    utm_zone: int  # north of the equator
-    east_m: float  # of the origin, in UTM on WGS 84
-    north_m: float
-
-
-# The development kit states the origins as latitude and longitude (av2.geometry.utm); in UTM they are these multiples of 30 m,
-# to 0.07 m in Palo Alto and 0.03 m elsewhere.
-CITIES: Mapping[str, City] = {
-    "ATX": City(14, 621_150.0, 3_349_890.0), "DTW": City(17, 320_670.0, 4_685_370.0),
-    "MIA": City(17, 580_560.0, 2_850_960.0), "PAO": City(10, 576_480.0, 4_141_380.0),
-    "PIT": City(17, 583_710.0, 4_477_260.0), "WDC": City(18, 323_460.0, 4_306_470.0),
+# City frames: zone of UTM (north of the equator), east and north of the origin in it on WGS 84, m; heights count from an unknown
+# zero. The development kit states the origins as latitude and longitude (av2.geometry.utm); in UTM they are these multiples of
+# 30 m, to 0.07 m in Palo Alto and 0.03 m elsewhere.
+CITIES: Mapping[str, tuple[int, float, float]] = {
+    "ATX": (14, 621_150.0, 3_349_890.0), "DTW": (17, 320_670.0, 4_685_370.0), "MIA": (17, 580_560.0, 2_850_960.0),
+    "PAO": (10, 576_480.0, 4_141_380.0), "PIT": (17, 583_710.0, 4_477_260.0), "WDC": (18, 323_460.0, 4_306_470.0),
 }  # fmt: skip
 
 
 def map_frame_of(city: str | None, offset_m: tuple[float, float, float], notes: list[str]) -> MapFrame:
     """Map frame whose origin is `offset_m` from that of a city's frame; only local where the city is not known."""
-    place = CITIES.get(city or "")
-    if place is None:
+    if city is None or city not in CITIES:
         why = "map/ has no file that names it" if city is None else f"'{city}' is none of {', '.join(CITIES)}"
         notes.append(f"the city of the log is not known ({why}): the position of the map on Earth is unknown")
         return MapFrame(offset_m=offset_m)
     from pyproj import Proj
 
-    projection = f"+proj=utm +zone={place.utm_zone} +datum=WGS84 +units=m +no_defs"
-    offset = (place.east_m + offset_m[0], place.north_m + offset_m[1], offset_m[2])
+    zone, east_m, north_m = CITIES[city]
+    projection = f"+proj=utm +zone={zone} +datum=WGS84 +units=m +no_defs"
+    offset = (east_m + offset_m[0], north_m + offset_m[1], offset_m[2])
     longitude, latitude = Proj(projection)(offset[0], offset[1], inverse=True)
     return MapFrame(float(latitude), float(longitude), None, projection, offset)
 
@@ -98,29 +88,12 @@ def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float
     return PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
 
 
-def read_mounts(path: Path) -> dict[str, Array]:
-    """Read `egovehicle_SE3_sensor.feather`: `ego_T_sensor` (4, 4) by sensor."""
-    columns = read_columns(path, {"sensor_name": "text", **TRANSFORM})
-    mounts = transforms_of(columns, path)
-    return {str(name): mount for name, mount in zip(columns["sensor_name"], mounts)}
-
-
 def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
-    """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,).
-
-    Raises `LogError` when one is not finite or absurdly far away, or its quaternion no unit quaternion; names file and
-    row.
-    """
-    q = np.stack([columns[k].astype(np.float64) for k in QUATERNION], axis=1)
-    position = np.stack([columns[k].astype(np.float64) for k in TRANSLATION], axis=1)
-    bad = np.union1d(find_not_unit(q), np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1)))
-    if len(bad):
-        k = int(bad[0])
-        raise LogError(
-            f"{path}, row {k}: quaternion {q[k].tolist()}, translation {position[k].tolist()}, expected finite numbers "
-            f"up to {MAX_POSITION_M:g} and a unit quaternion"
-        )
-    return transform(rotation_from_quaternion(q), position)
+    """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,); `LogError` for an impossible one."""
+    q, position = (
+        np.stack([columns[k].astype(np.float64) for k in names], axis=1) for names in (QUATERNION, TRANSLATION)
+    )
+    return checked_poses(q, position, lambda row: f"{path}, row {row}")
 
 
 # First laser number of each LiDAR. On the sample log the elevations of a laser's points, computed from the position
@@ -218,26 +191,33 @@ def read_labels(
     of the points on cars that drive faster than 5 m/s, moved by the car's speed to the time of the box, 99.6 % lie in the box
     with this time and 89 % with the stamp; of two cars at 10 m/s, whose rear the LiDARs hit, all and 24 to 30 %.
     """
-    columns = _checked(read_columns(path, LABEL_COLUMNS), path)
-    ego_T_box = transforms_of(columns, path)
-    kinds = columns["category"].astype(np.str_)
-    size, ego_T_box, kinds, keep = _join_riders(columns, ego_T_box, kinds)
-    map_T_ego, known = ego.at(columns["timestamp_ns"])
+    columns = read_columns(path, LABEL_COLUMNS)
+    size = np.stack([columns[k].astype(np.float64) for k in SIZE], axis=1)
+    bad = np.flatnonzero(~(size > 0).all(axis=1) | ~np.isfinite(size).all(axis=1))
+    if len(bad):
+        raise LogError(f"{path}, row {bad[0]}: size {size[bad[0]].tolist()}, expected length, width, height above 0 m")
+    for name in ("track_uuid", "category"):
+        missing = [k for k, word in enumerate(columns[name]) if word is None]
+        if missing:
+            raise LogError(f"{path}, row {missing[0]}: no '{name}'")
+    t_ns, track_id, kinds = columns["timestamp_ns"], columns["track_uuid"].astype(np.str_), columns["category"]
+    size, ego_T_box, kinds, keep = _join_riders(t_ns, size, transforms_of(columns, path), kinds.astype(np.str_))
+    map_T_ego, known = ego.at(t_ns)
     if not known.all():
         notes.append(f"{np.sum(~known)} labels left out because the ego's pose is not known at their stamps")
     category = np.array([CATEGORY_OF.get(k, "") for k in kinds], dtype="<U16")
     note_left_out(kinds[keep & (category == "")].tolist(), NO_ROAD_USERS, notes)
-    keep &= known & (category != "")
-    keep &= _first_of_track(columns["timestamp_ns"], columns["track_uuid"].astype(np.str_))
+    first = np.unique(np.rec.fromarrays([t_ns, track_id]), return_index=True)[1]  # of a track that repeats at a stamp
+    keep &= known & (category != "") & np.isin(np.arange(len(t_ns)), first)
     map_T_box = map_T_ego @ ego_T_box
     after_ns = scan_time_ns(ego_T_box[:, :2, 3] - upper_lidar_xy)
-    labeled = np.unique(columns["timestamp_ns"])
-    missing = len(labeled) - int(np.isin(labeled, swept_ns).sum())
-    if missing:
-        notes.append(f"sweeps are missing at {missing} of the {len(labeled)} stamps that were labeled")
+    labeled = np.unique(t_ns)
+    without = len(labeled) - int(np.isin(labeled, swept_ns).sum())
+    if without:
+        notes.append(f"sweeps are missing at {without} of the {len(labeled)} stamps that were labeled")
     return Labels(
-        t_ns=(columns["timestamp_ns"] + after_ns)[keep],
-        track_id=columns["track_uuid"].astype(np.str_)[keep],
+        t_ns=(t_ns + after_ns)[keep],
+        track_id=track_id[keep],
         category=category[keep],
         center_m=map_T_box[keep, :3, 3],
         size_m=size[keep],
@@ -257,36 +237,15 @@ def scan_time_ns(xy_lidar: Array) -> NDArray[np.int64]:
     return np.asarray((upper_ns + (upper_ns + HALF_TURN_NS) % PERIOD_NS) // 2)
 
 
-def _checked(columns: Mapping[str, NDArray[Any]], path: Path) -> Mapping[str, NDArray[Any]]:
-    size = np.stack([columns[k] for k in SIZE], axis=1)
-    bad = np.flatnonzero(~(size > 0).all(axis=1) | ~np.isfinite(size).all(axis=1))
-    if len(bad):
-        raise LogError(f"{path}, row {bad[0]}: size {size[bad[0]].tolist()}, expected length, width, height above 0 m")
-    for name in ("track_uuid", "category"):
-        missing = [k for k, word in enumerate(columns[name]) if word is None]
-        if missing:
-            raise LogError(f"{path}, row {missing[0]}: no '{name}'")
-    return columns
-
-
-def _first_of_track(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Mark (N,) the rows that do not repeat a track at a stamp."""
-    first: NDArray[np.bool_] = np.zeros(len(t_ns), dtype=bool)
-    pairs = np.rec.fromarrays([t_ns, track_id])
-    first[np.unique(pairs, return_index=True)[1]] = True
-    return first
-
-
 def _join_riders(
-    columns: Mapping[str, NDArray[Any]], ego_T_box: Array, kinds: NDArray[np.str_]
+    t_ns: NDArray[np.int64], size: Array, ego_T_box: Array, kinds: NDArray[np.str_]
 ) -> tuple[Array, Array, NDArray[np.str_], NDArray[np.bool_]]:
     """Join each rider with the vehicle below: one road user with the vehicle's track, length and width, up to the rider's head.
 
-    Returns sizes (N, 3), poses (N, 4, 4), kinds (N,) and what is kept (N,); a rider without a vehicle stays as it is.
+    `t_ns` (N,), `size` (N, 3), `ego_T_box` (N, 4, 4), `kinds` (N,): of boxes. Returns sizes (N, 3), poses (N, 4, 4), kinds (N,) and what is kept (N,); a rider without a vehicle stays as it is.
     """
-    size = np.stack([columns[k].astype(np.float64) for k in SIZE], axis=1)
     poses, kinds, keep = ego_T_box.copy(), kinds.copy(), np.ones(len(kinds), dtype=bool)
-    t_ns, original = columns["timestamp_ns"], kinds.copy()
+    original = kinds.copy()
     for rider in np.flatnonzero(np.isin(original, list(RIDDEN_BY))):
         same = np.flatnonzero((t_ns == t_ns[rider]) & (original == RIDDEN_BY[str(original[rider])]))
         away = np.linalg.norm(ego_T_box[same, :2, 3] - ego_T_box[rider, :2, 3], axis=1)
@@ -373,7 +332,8 @@ class _Folder:
     def log(self) -> Log:
         notes: list[str] = []
         ego, offset_m = read_ego_track(self.path / POSES, notes)
-        mounts = read_mounts(self.path / MOUNTS)
+        table = read_columns(self.path / MOUNTS, {"sensor_name": "text", **TRANSFORM})
+        mounts = {str(n): mount for n, mount in zip(table["sensor_name"], transforms_of(table, self.path / MOUNTS))}
         cameras, streams = self._cameras(mounts, notes)
         lidars, sweeps = self._lidars(mounts, notes)
         streams |= sweeps

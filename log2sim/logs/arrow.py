@@ -394,12 +394,7 @@ class ParquetRows:
     """
 
     def __init__(
-        self,
-        path: Path,
-        wanted: Mapping[str, Kind],
-        *,
-        optional: Collection[str] = (),
-        limits: TableLimits = LIMITS,
+        self, path: Path, wanted: Mapping[str, Kind], *, optional: Collection[str] = (), limits: TableLimits = LIMITS
     ) -> None:
         self._path, self._wanted, self._optional, self._limits = path, dict(wanted), optional, limits
         self._lock = Lock()

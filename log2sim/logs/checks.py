@@ -243,21 +243,25 @@ def _explain(one: Span, other: Span) -> str:
     zone_s = round(difference_s / SECONDS_OF_ZONES) * SECONDS_OF_ZONES
     if 0 < zone_s <= MAX_ZONE_S:
         offsets[zone_s] = f"{zone_s / 3600:g} h, a time zone"
-    misfit = {seconds: _misfit_ns(early, late, seconds * NS_PER_S) for seconds in offsets}
+    misfit = {}  # distances of both ends when the later span is moved by an offset
+    for seconds in offsets:
+        first_ns, last_ns = late.first_ns - seconds * NS_PER_S, late.last_ns - seconds * NS_PER_S
+        misfit[seconds] = abs(first_ns - early.first_ns) + abs(last_ns - early.last_ns)
     best = min(misfit, key=lambda seconds: misfit[seconds])
     length_ns = min(early.last_ns - early.first_ns, late.last_ns - late.first_ns)
     return offsets[best] if misfit[best] <= max(length_ns, MAX_APART_NS) else ""
 
 
-def _misfit_ns(early: Span, late: Span, offset_ns: int) -> int:
-    """Distances of both ends when the later span is moved by an offset."""
-    return abs(late.first_ns - offset_ns - early.first_ns) + abs(late.last_ns - offset_ns - early.last_ns)
-
-
 def _other_clocks(log: Log) -> list[str]:
     """Report streams and poses whose times are far from those of most others."""
     groups: list[tuple[list[str], Span]] = []
-    for span in sorted(_spans(log), key=lambda span: span.first_ns):
+    found = [
+        Span.of(f"{'frames' if name in log.cameras else 'sweeps'} of '{name}'", stream.t_ns)
+        for name, stream in log.streams.items()
+        if len(stream.t_ns)
+    ]
+    found += [] if log.ego is None else [Span.of("ego poses", log.ego.t_ns)]
+    for span in sorted(found, key=lambda span: span.first_ns):
         if groups and not groups[-1][1].is_apart(span):
             groups[-1] = ([*groups[-1][0], span.words], groups[-1][1].joined(span))
         else:
@@ -267,16 +271,6 @@ def _other_clocks(log: Log) -> list[str]:
     spans = [Span(_listed(words), span.first_ns, span.last_ns) for words, span in groups]
     most = max(range(len(groups)), key=lambda k: len(groups[k][0]))
     return [describe_gap(span, spans[most]) for k, span in enumerate(spans) if k != most]
-
-
-def _spans(log: Log) -> list[Span]:
-    """Return the spans of the streams that have records, and of the poses of the ego."""
-    spans = [
-        Span.of(f"{'frames' if name in log.cameras else 'sweeps'} of '{name}'", stream.t_ns)
-        for name, stream in log.streams.items()
-        if len(stream.t_ns)
-    ]
-    return spans if log.ego is None else [*spans, Span.of("ego poses", log.ego.t_ns)]
 
 
 def _listed(words: Sequence[str]) -> str:

@@ -49,9 +49,8 @@ def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = No
     """
     for name in cameras:
         if name not in log.cameras:
-            known = list(log.cameras)
-            there = ", ".join(known) or "none"
-            raise ConfigError(f"--cameras: no camera '{name}'{nearest(name, known)}; the log has {there}")
+            hint, there = nearest(name, list(log.cameras)), ", ".join(log.cameras) or "none"
+            raise ConfigError(f"--cameras: no camera '{name}'{hint}; the log has {there}")
     if not cameras and start_s is None and stop_s is None:
         return log
     chosen = {name: camera for name, camera in log.cameras.items() if not cameras or name in cameras}
@@ -196,6 +195,12 @@ def summarize(log: Log) -> dict[str, Any]:
         name: {**summarize_stamps(log.streams[name].t_ns), **_mounting(s.mount, s.mount_T_lidar)}
         for name, s in log.lidars.items()
     }
+    labels = None
+    if log.labels is not None:
+        # Of each track the category of its first label.
+        first = dict(zip(log.labels.track_id.tolist()[::-1], log.labels.category.tolist()[::-1]))
+        tracks = {"tracks": len(first), "tracks_by_category": _counts(first.values())}
+        labels = {"boxes": len(log.labels.t_ns), **tracks}
     return {
         "name": log.name,
         "format": log.format,
@@ -205,9 +210,9 @@ def summarize(log: Log) -> dict[str, Any]:
         "reference_camera": log.reference_camera,
         "cameras": cameras,
         "lidars": lidars,
-        "ego": _ego(log),
+        "ego": None if log.ego is None else _summarize_ego(log, log.ego),
         "map": {**asdict(log.map), "offset_m": list(log.map.offset_m)},
-        "labels": _labels(log),
+        "labels": labels,
         "image_labels": {name: _counts(boxes.category) for name, boxes in log.image_labels.items()},
         "ignored_regions": {name: len(regions.t_ns) for name, regions in log.ignored_regions.items()},
         "details": dict(log.details),
@@ -234,29 +239,20 @@ def _mounting(mount: str, mount_T_sensor: NDArray[np.float64]) -> dict[str, Any]
     return {"mount": mount, "translation_m": [rounded(v, 4) for v in mount_T_sensor[:3, 3]]}
 
 
-def _ego(log: Log) -> dict[str, Any] | None:
-    if log.ego is None:
-        return None
+def _summarize_ego(log: Log, ego: PoseTrack) -> dict[str, Any]:
     # Poses may be nanoseconds apart: path and speed are measured over steps of a tenth of a second.
-    step = (log.ego.t_ns - log.ego.t_ns[0]) // MIN_SPEED_STEP_NS
+    step = (ego.t_ns - ego.t_ns[0]) // MIN_SPEED_STEP_NS
     chosen = np.union1d(np.unique(step, return_index=True)[1], len(step) - 1)
-    position, t_ns = log.ego.map_T_ego[chosen, :3, 3], log.ego.t_ns[chosen]
+    position, t_ns = ego.map_T_ego[chosen, :3, 3], ego.t_ns[chosen]
     steps = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1)
     seconds = np.diff(t_ns) / NS_PER_S
     return {
         # Poses at the stamps of all sensors are no regular series; nothing is missing where there are ten in a second.
-        **summarize_stamps(log.ego.t_ns, MAX_EGO_STEP_NS),
+        **summarize_stamps(ego.t_ns, MAX_EGO_STEP_NS),
         "distance_m": rounded(steps.sum(), 2),
         "top_speed_mps": rounded((steps / seconds)[seconds > 0.5 * MIN_SPEED_STEP_NS / NS_PER_S].max(initial=0.0), 2),
         "size_m": list(log.ego_vehicle.size_m),
     }
-
-
-def _labels(log: Log) -> dict[str, Any] | None:
-    if log.labels is None:
-        return None
-    first = dict(zip(log.labels.track_id.tolist()[::-1], log.labels.category.tolist()[::-1]))
-    return {"boxes": len(log.labels.t_ns), "tracks": len(first), "tracks_by_category": _counts(first.values())}
 
 
 def _counts(words: Iterable[Any]) -> dict[str, int]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -139,25 +140,11 @@ def _kitti_labels(log: Log, path: Path, notes: list[str]) -> tuple[Labels, dict[
     inside = rows.frame < len(stamps)
     if not inside.all():
         notes.append(f"{int((~inside).sum())} labels left out: of frames after the last of '{camera}'")
-    rows = rows.take(inside)
-    boxes, ignored = rows.take(rows.type != kitti.NOT_LABELED), rows.take(rows.type == kitti.NOT_LABELED)
-    t_ns = stamps[boxes.frame]
-    map_T_cam, known = log.map_T_sensor(camera, t_ns)
-    center, size, yaw = kitti.boxes_in_map(map_T_cam, boxes.values[:, 7:14])
-    category = np.array([kitti.CATEGORY_OF[name] for name in boxes.type.tolist()], dtype="<U16")
-    labels = Labels(
-        t_ns[known],
-        boxes.track_id[known],
-        category[known],
-        center[known],
-        size[known],
-        yaw[known],
-        cameras=(camera,),
-        kind=boxes.type[known],
-        occlusion=boxes.values[known, 1].astype(np.int64),
-        never_labeled=kitti.NEVER_LABELED,
+    placed = kitti.labels_of_rows(
+        rows.take(inside), partial(log.map_T_sensor, camera), lambda frame: stamps[frame], "", camera
     )
-    return labels, {camera: ImageRegions(stamps[ignored.frame], ignored.values[:, 3:7])}
+    assert placed.boxes_3d is not None
+    return placed.boxes_3d, dict(placed.ignored)
 
 
 def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -22,17 +23,9 @@ class Reader(Protocol):
     To add a format, write a module with an object that has these members and register it: in `registry.BUILT_IN["log"]`,
     or in another distribution as an entry point of the group "log2sim.log".
 
-    Attributes
-    ----------
-    name : str
-        Name that `--format` takes.
-    looks_for : str
-        What a folder of this format must contain, for messages.
-    suffixes : tuple of str
-        Of files that are logs by themselves, in lower case (".bag"); none for formats that are folders.
+    `name`: that `--format` takes. `looks_for`: what a folder of this format must contain, for messages. `suffixes`: of files that
+    are logs by themselves, in lower case (".bag"); none for formats that are folders.
 
-    Notes
-    -----
     A `Log` returned by `open` fulfills this contract:
 
     - **Laziness.** `open` reads the index, calibration and poses. `Stream.read(i)` reads record i when it is called, from
@@ -100,25 +93,14 @@ def open_log(
 ) -> Log:
     """Open a log; only its index, calibration and poses are read, images and sweeps on request.
 
-    Parameters
-    ----------
-    path : Path or str
-        A sequence, or a folder that holds one or several; the file itself for formats of one file, such as a ROS bag.
-    format : str
-        Name of a reader (`log2sim.files.plugins.names("log")` lists them), or "auto" to find it.
-    sequence : str, optional
-        Which sequence of a root; needed only when it holds several.
-    labels : Path or str, optional
-        File with true boxes that take the place of those of the log; `log2sim.logs.label_files` has the formats.
-    follow_links : bool, optional
-        Whether symbolic links may lead out of the log's folders. By default as in `log2sim.files.inputs.following_links`, else not.
+    `path`: a sequence, or a folder that holds one or several; the file itself for formats of one file, such as a ROS bag.
+    `format`: name of a reader (`log2sim.files.plugins.names("log")` lists them), or "auto" to find it. `sequence`: which one of a
+    root; needed only when it holds several. `labels`: file with true boxes that take the place of those of the log;
+    `log2sim.logs.label_files` has the formats. `follow_links`: whether symbolic links may lead out of the log's folders; by
+    default as in `log2sim.files.inputs.following_links`, else not.
 
-    Raises
-    ------
-    LogError
-        When the path is missing, no reader knows its layout, or its contents are inconsistent.
-    ConfigError
-        When the format is unknown, or the sequence is missing, unknown or ambiguous.
+    Raises `LogError` when the path is missing, no reader knows its layout, or its contents are inconsistent; `ConfigError` when the
+    format is unknown, or the sequence is missing, unknown or ambiguous.
     """
     with following_links(follow_links):
         log = _open(Path(path), format, sequence)
@@ -200,10 +182,9 @@ def _matches(name: str, reader: Reader, root: Path) -> bool:
 
 def _seems_to_match(name: str, reader: Reader, root: Path) -> bool:
     """Return the same where it is only a remark, which no broken plug-in of another package must keep from being made."""
-    try:
+    with suppress(PluginError):
         return _matches(name, reader, root)
-    except PluginError:
-        return False
+    return False
 
 
 def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:

@@ -9,7 +9,7 @@ import threading
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import Log2SimError, LogError, RecordError
 from log2sim.files.inputs import read_file
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, rotation_from_quaternion, transform
 from log2sim.logs.stamps import MAX_TIME_S, checked_offset_ns
 
 # Quaternions are stored with three decimals or more.
@@ -35,6 +35,22 @@ def find_not_unit(q: Array) -> NDArray[np.intp]:
     """Find the rows of quaternions (N, 4) whose norm is not 1 within `QUATERNION_TOLERANCE`, or not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.flatnonzero(~(np.abs(np.linalg.norm(q, axis=1) - 1) <= QUATERNION_TOLERANCE))
+
+
+def checked_poses(q: Array, position: Array, where: Callable[[int], str]) -> Array:
+    """Build poses (N, 4, 4) of quaternions (N, 4), scalar first, and positions (N, 3), m.
+
+    Raises `LogError` for one that is not finite, farther from the origin than any place on Earth, or has no unit quaternion;
+    begins with `where` of its row.
+    """
+    bad = np.union1d(find_not_unit(q), np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1)))
+    if len(bad):
+        k = int(bad[0])
+        raise LogError(
+            f"{where(k)}: position {position[k].tolist()}, quaternion {q[k].tolist()}, expected finite numbers up to {MAX_POSITION_M:g} "
+            "and a unit quaternion"
+        )
+    return transform(rotation_from_quaternion(q), position)
 
 
 MAX_NUMBER = np.iinfo(np.int64).max
@@ -69,6 +85,24 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     if not folder.is_dir():
         return []
     return sorted(p for p in folder.iterdir() if p.name.lower().endswith(suffixes))
+
+
+class FolderReader:
+    """What readers of formats that are folders have in common: they find sequences by name, with what each is opened by."""
+
+    suffixes: tuple[str, ...] = ()
+
+    def find(self, path: Path) -> Mapping[str, Any]:
+        """Find the sequences at a folder."""
+        raise NotImplementedError
+
+    def matches(self, path: Path) -> bool:
+        """Return whether the folder is a sequence or holds some."""
+        return bool(self.find(path))
+
+    def sequences(self, path: Path) -> list[str]:
+        """Return the names of the sequences, sorted."""
+        return sorted(self.find(path))
 
 
 MAX_REASON_CHARACTERS = 300
@@ -174,11 +208,6 @@ MAX_IMAGE_PX = 100_000_000
 MAX_IMAGE_BYTES = 256 * 1024 * 1024
 
 
-def read_image(path: Path, t_ns: int, width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """Read an image file as (H, W, 3) uint8 BGR; raise `RecordError` as `decode_image` does, or when it is missing."""
-    return decode_image(read_bytes(path, t_ns, MAX_IMAGE_BYTES), f"{path} (stamp {t_ns})", (width_px, height_px))
-
-
 def decode_image(
     data: bytes, where: str, size_px: tuple[int, int], *, least_px: int = 0, gray: bool = False
 ) -> NDArray[np.uint8]:
@@ -202,16 +231,20 @@ def decode_image(
             raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
     import cv2
 
-    _check_png_chunks(data, where)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = cv2.imdecode(
+        np.frombuffer(_checked_png(data, where), np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    )
     if image is None:
         raise RecordError(f"{where}: PNG cannot be decoded")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image, dtype=np.uint8)
 
 
-def _check_png_chunks(data: bytes, where: str) -> None:
-    """Check lengths and check sums: OpenCV returns the upper part of a truncated PNG as if it were whole, and libpng prints of its own."""
-    at, kind = 8, b""
+def _checked_png(data: bytes, where: str) -> bytes:
+    """Check lengths and check sums of a PNG, and return it without what is said beside the picture.
+
+    OpenCV returns the upper part of a truncated PNG as if it were whole, and libpng prints what it finds wrong.
+    """
+    at, kind, kept = 8, b"", [data[:8]]
     while kind != b"IEND":
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
         kind = data[at + 4 : at + 8]
@@ -219,7 +252,10 @@ def _check_png_chunks(data: bytes, where: str) -> None:
             raise RecordError(f"{where}: PNG is truncated")
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise RecordError(f"{where}: the check sum of the PNG at byte {end} is wrong")
+        if kind[:1].isupper() or kind == b"tRNS":
+            kept.append(data[at : end + 4])
         at = end + 4
+    return b"".join(kept)
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:
@@ -243,17 +279,13 @@ def image_size(data: bytes, where: str) -> tuple[int, int]:
 
 
 def image_stream(name: str, t_ns: NDArray[np.int64], files: list[Path], size_px: tuple[int, int]) -> Stream:
-    """Stream of image files.
-
-    `name`: of the camera. `t_ns` (F,) int64. `files`: F image files. `size_px` (int, int): width and height that the
-    calibration is for.
-    """
-
-    def read(i: int) -> NDArray[np.uint8]:
-        return read_image(files[i], int(t_ns[i]), *size_px)
+    """Stream of the F image files of a camera at stamps (F,); its calibration is for `size_px`, width and height."""
 
     def encoded(i: int) -> bytes:
         return read_bytes(files[i], int(t_ns[i]), MAX_IMAGE_BYTES)
+
+    def read(i: int) -> NDArray[np.uint8]:
+        return decode_image(encoded(i), f"{files[i]} (stamp {t_ns[i]})", size_px)
 
     return Stream(name, t_ns, read, encoded)
 

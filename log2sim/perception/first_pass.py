@@ -8,29 +8,51 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Boxes3D, Detections, Finding, Log, Measurements, Obstacles, OtherView, Rays, Sweep
+from log2sim.datatypes import (
+    ENDS,
+    Boxes3D,
+    Detections,
+    Finding,
+    Log,
+    Measurements,
+    Obstacles,
+    OtherView,
+    Rays,
+    Sweep,
+    end_of,
+)
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.packing import pack
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
-from log2sim.geometry import Array
-from log2sim.perception.alignment import align_parts
+from log2sim.geometry import Array, inverse
+from log2sim.perception.cooperative import align_parts
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import FrameDetector
-from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.lidar.cloud import Cloud, assemble_views, cloud_origin, compensation_of, obstacles_of
-from log2sim.perception.observe_tick import SeenTick, TickObserver
+from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
+from log2sim.perception.lidar.cloud import (
+    Cloud,
+    assemble_views,
+    cloud_origin,
+    compensation_of,
+    join_parts,
+    obstacles_of,
+)
+from log2sim.perception.lidar.measure import Frame as MeasuredFrame
+from log2sim.perception.lidar.measure import measure, outside_ego, project_cloud
+from log2sim.perception.lidar.projection import View, view_of
 from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
-from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox
+from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox, add_ranges
 from log2sim.plan import FusionLevel, Plan, Stage
 
 
@@ -265,6 +287,26 @@ class Observations:
 
 
 @dataclass(eq=False)
+class SeenTick:
+    """What the first pass takes from one tick."""
+
+    # Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position
+    measurements: Measurements = field(default_factory=Measurements.empty)
+    # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs
+    # them
+    feet: dict[str, Correspondences] = field(default_factory=dict)
+    ground: dict[str, Correspondences] = field(default_factory=dict)
+    obstacles: Obstacles | None = None
+    lights: list[LightBox] = field(default_factory=list)
+    # Number of detections by camera and by name of the detector in sweeps
+    found: dict[str, int] = field(default_factory=dict)
+    frames: int = 0  # how many were searched
+    # `skipped`, `unseen`: cameras whose frame was not searched, and those of which it says nothing
+    skipped: list[str] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
+
+
+@dataclass(eq=False)
 class Part:
     """What the first pass takes from successive ticks, with what it knew of their records."""
 
@@ -297,7 +339,6 @@ class FirstPass:
     def __init__(self, log: Log, schedule: Schedule, plan: Plan, detectors: Detectors, config: Config) -> None:
         self.log, self.schedule, self.plan, self.detectors, self.config = log, schedule, plan, detectors, config
         self.clouds = CloudMaker(log, schedule, plan, config, detectors.sweeps)
-        self.observer = TickObserver(log, schedule, plan, config.measure)
         self.frames = None if detectors.images is None else FrameDetector(log, schedule, detectors.images, plan)
         # Ticks of a part: where frames are skipped between some of them, a multiple of these.
         self.step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
@@ -390,8 +431,11 @@ class FirstPass:
             with clock.stage("detect"):
                 boxes_3d = self.clouds.boxes(tick)
         with clock.stage("measure"):
-            out = self.observer.measure(tick, live, clouds, boxes_3d)
-            out.lights = self.observer.range_lights(tick, lights, clouds)
+            out = self._measure(tick, live, clouds, boxes_3d)
+            for camera, cloud in zip(self.schedule.frames, clouds):
+                mine = [light for light in lights if light.camera == camera]
+                view = self._view(camera, tick) if mine else None
+                out.lights += mine if view is None or cloud is None else add_ranges(mine, view, cloud)
         with clock.stage("cloud"):
             out.obstacles = None if clouds[0] is None else obstacles_of(clouds[0])
         out.found = {} if detector is None or boxes_3d is None else {detector.name: len(boxes_3d)}
@@ -400,6 +444,70 @@ class FirstPass:
         if self.frames is not None:
             out.unseen = [c for c in plan.cameras if self.schedule.frames[c][tick] >= 0 and c not in live]
         return out
+
+    def _measure(
+        self, tick: int, found: dict[str, Detections], clouds: Sequence[Cloud | None], boxes: Boxes3D | None
+    ) -> SeenTick:
+        """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
+        reference, settings = clouds[self.schedule.reference_row], self.config.measure
+        # Where clouds were searched, a camera's objects are sought in what its own end sees.
+        parts = {(id(c), end): c if boxes is None else _seen_from_end(c, end) for c in clouds for end in ENDS}
+        frames: dict[str, list[MeasuredFrame]] = {end: [] for end in ENDS}
+        for camera, cloud in zip(self.schedule.frames, clouds):
+            if camera in found and (view := self._view(camera, tick)) is not None:
+                end = end_of(view.camera)
+                frames[end].append((view, found[camera], parts[id(cloud), end]))
+        groups = [(list(chain(*frames.values())), boxes, reference)]
+        if self.plan.fusion is FusionLevel.TRACKS and boxes is not None and boxes.seen_by is not None:
+            groups = [
+                (frames[end], boxes.take(seen), parts[id(reference), end]) for end, seen in zip(ENDS, boxes.seen_by.T)
+            ]
+        rows = Measurements.join([
+            measure(shown, None if of is None else outside_ego(self.log, of), cloud, mode=settings.mode)
+            for shown, of, cloud in groups
+        ])  # fmt: skip
+        origin, _ = cloud_origin(self.log, int(self.schedule.t_ns[tick]))
+        with np.errstate(invalid="ignore"):  # of rows without a position, which a homography may still place
+            far = np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > settings.max_range_m
+        out = SeenTick(rows.take(~far))
+        if self.plan.keeps(Stage.HOMOGRAPHY):
+            for view, _, cloud in chain(*frames.values()):
+                ego_T_map, name = inverse(base_pose(self.log, view.t_ns)), view.camera.name
+                out.feet[name] = foot_points(view.camera, rows, ego_T_map, tick)
+                if cloud is not None:
+                    out.ground[name] = _ground_points(view, cloud, ego_T_map, tick)
+        return out
+
+    def _view(self, camera: str, tick: int) -> View | None:
+        """Return a camera's frame of a tick; None where its pose is not known."""
+        t_ns = int(self.log.streams[camera].t_ns[self.schedule.frames[camera][tick]])
+        return view_of(self.log, camera, t_ns)
+
+
+MAX_GROUND_POINTS_PER_FRAME = 40
+
+
+def _seen_from_end(cloud: Cloud | None, end: str) -> Cloud | None:
+    """Return the parts of a cloud that an end sees; the whole cloud where it has no parts or the end sees none of them."""
+    if cloud is None or not cloud.parts:
+        return cloud
+    return join_parts([part for part in cloud.parts if part.end == end]) or cloud
+
+
+def base_pose(log: Log, t_ns: int) -> Array:
+    """Pose (4, 4) of what carries the cameras: the ego, or the map itself for a roadside log."""
+    return np.eye(4) if log.ego is None else log.ego.at(t_ns)[0][0]
+
+
+def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Correspondences:
+    """Sample the LiDAR's ground points that the camera sees evenly."""
+    visible, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
+    if len(visible) == 0:
+        return Correspondences.join([])
+    step = np.linspace(0, len(visible) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(visible))).round().astype(np.intp)
+    points = cloud.xyz[cloud.ground_sample[visible[step]]].astype(np.float64) + cloud.origin
+    xy = (points @ ego_T_map[:3, :3].T + ego_T_map[:3, 3])[:, :2]
+    return Correspondences(undistorted_pixels(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
 
 
 def observe(

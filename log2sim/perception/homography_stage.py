@@ -11,7 +11,7 @@ import numpy as np
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse
-from log2sim.perception.first_pass import Observations
+from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
     MAX_CONDITION,
@@ -25,7 +25,6 @@ from log2sim.perception.homography.fit import HomographyFit, refused_fit
 from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
 from log2sim.perception.lidar.measure import BORDER_PX
-from log2sim.perception.observe_tick import base_pose
 from log2sim.plan import HomographyScope, Plan
 
 # A camera lower than this sees the ground under too flat an angle, m.
@@ -205,7 +204,11 @@ def _place_tick(
                 continue
             if beyond + stopped >= MIN_RAYS:
                 columns["score"][k] *= UNCONFIRMED_SCORE
-        _write(columns, int(k), placed, map_T_base, log.ground_z_ego_m)
+        xy, covariance = placed
+        foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], log.ground_z_ego_m]) + map_T_base[:3, 3]
+        columns["center_m"][k] = foot + np.array([0, 0, TYPICAL_SIZE_M[str(m.category[k])][2] / 2])
+        columns["bottom_m"][k], columns["source"][k] = foot[2], "topdown"
+        columns["covariance"][k] = map_T_base[:2, :2] @ covariance @ map_T_base[:2, :2].T
         columns["height_px_m"][k] = spanned_height_m(h, camera, m.box_px[k], base_T_cam)
     return Measurements(**columns)
 
@@ -231,13 +234,3 @@ def count_rays(
     toward = near[(z_there > low * height) & (z_there < high * height)]
     beyond = int((reach[toward] > range_m + width + 2 * sigma_m).sum())
     return beyond, len(toward) - beyond
-
-
-def _write(columns: dict[str, Any], k: int, placed: tuple[Array, Array], map_T_base: Array, ground_z_m: float) -> None:
-    xy, covariance = placed
-    height = TYPICAL_SIZE_M[str(columns["category"][k])][2]
-    foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], ground_z_m]) + map_T_base[:3, 3]
-    columns["center_m"][k] = foot + np.array([0, 0, height / 2])
-    columns["bottom_m"][k] = foot[2]
-    columns["covariance"][k] = map_T_base[:2, :2] @ covariance @ map_T_base[:2, :2].T
-    columns["source"][k] = "topdown"

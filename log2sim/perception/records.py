@@ -54,24 +54,11 @@ MIN_GAP_PERIODS = 3.0
 MIN_STAMPS = 3
 
 
-@dataclass(frozen=True)
-class Span:
-    """Records of one stream that are at fault."""
-
-    start_ns: int  # `start_ns`, `end_ns`: stamps of the first and the last
-    end_ns: int
-    count: int  # `count`, `total`: records at fault, and all from the first to the last of them
-    total: int
-
-
-def spans_of(t_ns: NDArray[np.int64], at_fault: NDArray[np.bool_]) -> list[Span]:
-    """Join records (F,) at fault, rising in time, to spans: those near each other, or all where they are many."""
+def _spans(t_ns: NDArray[np.int64], at_fault: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
+    """Group the rows of records (F,) at fault, rising in time: those near each other, or all where they are many."""
     rows = np.flatnonzero(at_fault)
-    if len(rows) == 0:
-        return []
     cuts = np.flatnonzero(np.diff(t_ns[rows]) > JOINED_S * NS_PER_S) + 1
-    parts = np.split(rows, cuts if len(cuts) < MAX_SPANS else cuts[:0])
-    return [Span(int(t_ns[p[0]]), int(t_ns[p[-1]]), len(p), int(p[-1] - p[0] + 1)) for p in parts]
+    return np.split(rows, cuts if len(cuts) < MAX_SPANS else cuts[:0]) if len(rows) else []
 
 
 def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[int, int]]:
@@ -550,48 +537,31 @@ class RecordWatch:
 
     def faults(self, sensors: Iterable[str], start_ns: int, end_ns: int) -> tuple[Finding, ...]:
         """List what was found, one for each span of each sensor, and what is missing of some sensors between two stamps."""
-        found = [fault for camera in self.cameras.values() for fault in _camera_faults(camera, start_ns)]
-        found += [fault for lidar in self.lidars.values() for fault in _lidar_faults(lidar, start_ns)]
+        found: list[Finding] = []
+
+        def add(kind: str, name: str, t_ns: NDArray[np.int64], rows: NDArray[np.intp], **more: Any) -> None:
+            start_s, end_s = ((t_ns[rows[[0, -1]]] - start_ns) / NS_PER_S).tolist()
+            values = {"count": float(len(rows)), "total": float(rows[-1] - rows[0] + 1)} | more.get("values", {})
+            treatment: Treatment = "kept" if kind == "sparse_sweeps" else "left_out"
+            found.append(Finding(kind, name, treatment, start_s, end_s, values, case=more.get("case", "")))
+
+        for camera in self.cameras.values():
+            t_ns = np.array(sorted(camera.states), dtype=np.int64)
+            states = np.array([camera.states[t] for t in t_ns.tolist()])
+            for kind, state in (("frozen_images", "frozen"), ("black_images", "black")):
+                for rows in _spans(t_ns, states == state):
+                    add(kind, camera.name, t_ns, rows)
+        for lidar in (lidar for lidar in self.lidars.values() if lidar.points):
+            t_ns = np.array(sorted(lidar.points), dtype=np.int64)
+            repeated, points = (np.array([of[t] for t in t_ns.tolist()]) for of in (lidar.repeated, lidar.points))
+            for rows in _spans(t_ns, repeated):
+                add("repeated_sweeps", lidar.name, t_ns, rows)
+            usual = float(np.quantile(points, USUAL_QUANTILE))
+            some = usual >= MIN_USUAL_POINTS
+            for rows in _spans(t_ns, points < MAX_SPARSE_SHARE * usual) if some else [np.arange(len(t_ns))]:
+                values = {"most_points": float(points[rows].max())} | ({"usual_points": usual} if some else {})
+                add("sparse_sweeps", lidar.name, t_ns, rows, values=values, case="some" if some else "all")
         return (*found, *missing_records(self._log, sensors, start_ns, end_ns))
-
-
-def _camera_faults(watch: CameraWatch, t0_ns: int) -> Iterator[Finding]:
-    stamps = np.array(sorted(watch.states), dtype=np.int64)
-    states = np.array([watch.states[t] for t in stamps.tolist()])
-    for kind, state in (("frozen_images", "frozen"), ("black_images", "black")):
-        for span in spans_of(stamps, states == state):
-            yield _finding(kind, watch.name, "left_out", span, t0_ns)
-
-
-def _lidar_faults(watch: LidarWatch, t0_ns: int) -> Iterator[Finding]:
-    stamps = np.array(sorted(watch.points), dtype=np.int64)
-    if len(stamps) == 0:
-        return
-    repeated = np.array([watch.repeated[t] for t in stamps.tolist()])
-    for span in spans_of(stamps, repeated):
-        yield _finding("repeated_sweeps", watch.name, "left_out", span, t0_ns)
-    yield from _sparse_sweeps(watch.name, stamps, np.array([watch.points[t] for t in stamps.tolist()]), t0_ns)
-
-
-def _sparse_sweeps(name: str, t_ns: NDArray[np.int64], points: NDArray[np.int64], t0_ns: int) -> Iterator[Finding]:
-    """Mark the sweeps (F,) with next to no points, judged by what this LiDAR usually gives."""
-    usual = float(np.quantile(points, USUAL_QUANTILE))
-    if usual < MIN_USUAL_POINTS:
-        whole = Span(int(t_ns[0]), int(t_ns[-1]), len(points), len(points))
-        yield replace(
-            _finding("sparse_sweeps", name, "kept", whole, t0_ns, most_points=float(points.max())), case="all"
-        )
-        return
-    for span in spans_of(t_ns, points < MAX_SPARSE_SHARE * usual):
-        inside = (t_ns >= span.start_ns) & (t_ns <= span.end_ns) & (points < MAX_SPARSE_SHARE * usual)
-        values = {"most_points": float(points[inside].max()), "usual_points": usual}
-        yield replace(_finding("sparse_sweeps", name, "kept", span, t0_ns, **values), case="some")
-
-
-def _finding(kind: str, name: str, treatment: Treatment, span: Span, t0_ns: int, **values: float) -> Finding:
-    start_s, end_s = ((t_ns - t0_ns) / NS_PER_S for t_ns in (span.start_ns, span.end_ns))
-    counts = {"count": float(span.count), "total": float(span.total)}
-    return Finding(kind, name, treatment, start_s, end_s, counts | values)
 
 
 # A picture is shrunk where it is wider than asked for by more than this: less is not worth the time.

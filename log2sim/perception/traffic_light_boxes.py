@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.perception.lidar.cloud import Cloud
-from log2sim.perception.lidar.projection import ProjectedPoints, View, project_points
+from log2sim.perception.lidar.projection import View, project_points
 
 # Lamps of a crop of this height are 10 px wide, which is enough to tell their colors; larger crops are scaled down.
 MAX_CROP_PX = 40
@@ -72,16 +72,12 @@ def add_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[Lig
         return []
     high = np.flatnonzero(cloud.height > MIN_HEIGHT_M)
     visible = project_points(view, cloud.origin, cloud.columns.take(high, axis=1))
-    return [_add_range(light, view, cloud, high, visible) for light in lights]
-
-
-def _add_range(light: LightBox, view: View, cloud: Cloud, high: NDArray[np.intp], visible: ProjectedPoints) -> LightBox:
-    """Return a traffic light with its distance by the points of a cloud at `high` (n,), which are projected."""
-    (u0, v0, u1, v1), reach = light.box_px, (light.box_px[2:] - light.box_px[:2]) * MIDDLE / 2
-    inside = (np.abs(visible.u - (u0 + u1) / 2) <= reach[0]) & (np.abs(visible.v - (v0 + v1) / 2) <= reach[1])
-    if inside.sum() < MIN_POINTS:
-        return light
-    points = cloud.xyz[high[visible.index[inside]]] + cloud.origin - view.map_T_cam[:3, 3]
-    away = np.linalg.norm(points, axis=1)
-    front = away[away < away.min() + HOUSING_DEPTH_M]
-    return replace(light, range_m=float(np.median(front))) if len(front) >= MIN_POINTS else light
+    out = []
+    for light in lights:
+        middle, reach = (light.box_px[:2] + light.box_px[2:]) / 2, (light.box_px[2:] - light.box_px[:2]) * MIDDLE / 2
+        inside = (np.abs(visible.u - middle[0]) <= reach[0]) & (np.abs(visible.v - middle[1]) <= reach[1])
+        points = cloud.xyz[high[visible.index[inside]]] + cloud.origin - view.map_T_cam[:3, 3]
+        away = np.linalg.norm(points, axis=1)
+        front = away[away < away.min(initial=np.inf) + HOUSING_DEPTH_M]
+        out.append(replace(light, range_m=float(np.median(front))) if len(front) >= MIN_POINTS else light)
+    return out

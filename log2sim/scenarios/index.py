@@ -70,7 +70,7 @@ def rows_of(scenario: Scenario, file: str) -> list[Row]:
     agents = {a.id: a for a in scenario.agents}
     rows = []
     for tag in tags:
-        row: Row = {**tag.quantities, **tag.to_dict(), "file": file, "scenario": scenario.name}
+        row: Row = {**tag.quantities, **vars(tag), "file": file, "scenario": scenario.name}
         del row["quantities"]
         for role, id in zip(ROLES, (EGO, tag.agent, tag.other)):
             agent = agents.get(id or "")

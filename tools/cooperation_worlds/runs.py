@@ -137,6 +137,8 @@ def registration_figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     good = [r["after"] is not None and r["after"]["offset_m"] <= 0.1 and r["after"]["turn_deg"] <= 0.3 for r in rows]
     out["within_target"] = float(np.mean(good))
     out["left_out"] = float(np.mean([r["after"] is None for r in rows]))
+    told = [any(kind in ("unknown_road_pose", "wrong_road_pose") for kind, _ in r["faults"]) for r in rows]
+    out["silent"] = float(np.mean(~np.array(good) & ~np.array(told)))
     return out
 
 
@@ -193,6 +195,7 @@ def registration_table(figures: dict[str, Any]) -> str:
     table = markdown(["median / 90 %", "position m", "angle deg", "clock s"], rows)
     return (
         table + f"\n\nwithin 0.1 m and 0.3 deg: {cell(figures['within_target'])}; left out: {cell(figures['left_out'])}"
+        f"; silent: {cell(figures['silent'])}"
     )
 
 

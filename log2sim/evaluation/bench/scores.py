@@ -15,11 +15,10 @@ from log2sim.evaluation.bench.settings import ErrorSums, error_of
 from log2sim.evaluation.metrics.comparison import StateTable, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
-from log2sim.perception.first_pass import Observations
+from log2sim.perception.first_pass import Observations, base_pose
 from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
 from log2sim.perception.homography.estimate import MAX_RANGE_M
 from log2sim.perception.homography_stage import CameraHomography, place_by_homography
-from log2sim.perception.observe_tick import base_pose
 from log2sim.perception.sync import Schedule
 
 CUTOFF_M = 2.0  # cutoff distance of GOSPA, m; the metrics match objects up to it

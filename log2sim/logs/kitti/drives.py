@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, MapFrame, Stream
+from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError
 from log2sim.files.inputs import is_present, require_links_inside
 from log2sim.geometry import Array, Camera, PoseTrack, transform
@@ -21,7 +21,7 @@ from log2sim.logs.excerpt import digest_of
 from log2sim.logs.kitti import labels as drive
 from log2sim.logs.kitti.labels import CAMERA as LABELED_CAMERA
 from log2sim.logs.kitti.labels import DriveLabels, read_labels
-from log2sim.logs.records import first_image_size, image_stream, list_numbered_files
+from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_numbered_files
 from log2sim.logs.stamps import strictly_increasing
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
@@ -34,30 +34,22 @@ _NOT_A_TIME = np.iinfo(np.int64).min
 _TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?")
 
 
-class KittiRawReader:
+class KittiRawReader(FolderReader):
     """Reader of KITTI raw drives; the root is a drive, its date folder or the parent of date folders."""
 
     name = "kitti"
     looks_for = (
         "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
     )
-    suffixes = ()
-
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a sequence of this layout."""
-        return bool(self._drives(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
-        return sorted(self._drives(path))
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
-        drive = self._drives(path)[sequence]
+        drive = self.find(path)[sequence]
         require_links_inside(drive, drive.parent, path, files=[drive.parent / name for name in CALIBRATION])
         return _Drive(drive).log()
 
-    def _drives(self, path: Path) -> dict[str, Path]:
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the drives at a folder by name."""
         # A drive given as "." has its name only once it is resolved.
         path = path.resolve()
         places = [path, *path.glob(PATTERN), *path.glob(f"*/{PATTERN}")]
@@ -72,20 +64,29 @@ class _Drive:
     path: Path
 
     def log(self) -> Log:
-        rig = self._rig()
+        cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
+        c = drive.read_calibration(cam)
+        numbers = [k for k in range(4) if (self.path / f"image_{k:02d}").is_dir()]
+        rect = drive.rotation_entry(c, cam, "R_rect_00")
+        projections = {k: drive.projection_entry(c, cam, f"P_rect_{k:02d}") for k in numbers}
+        rig = drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
         notes: list[str] = []
         streams: dict[str, Stream] = {}
         cameras: dict[str, Camera] = {}
-        for number in rig.projections:
-            file = self.path.parent / CALIBRATION[0]
-            width, height = drive.calibration_entry(drive.read_calibration(file), file, (2,), f"S_rect_{number:02d}")
+        for number in numbers:
+            width, height = drive.calibration_entry(c, cam, (2,), f"S_rect_{number:02d}")
             camera = rig.camera(number, round(width), round(height))
             t_ns, files, _ = self._records(camera.name, (".png", ".jpg", ".jpeg"), notes)
             cameras[camera.name] = camera
             streams[camera.name] = image_stream(camera.name, t_ns, files, (camera.width_px, camera.height_px))
         if (self.path / "velodyne_points").is_dir():
             streams["velodyne"] = self._sweeps(notes)
-        ego_t_ns, poses, map_frame = self._poses(notes)
+        ego_t_ns, oxts, _ = self._records("oxts", (".txt",), notes)
+        records = [drive.parse_oxts(drive.read_text(file), str(file)) for file in oxts]
+        for file, record in zip(oxts, records):
+            if len(record) != 1:
+                raise LogError(f"{file}: {len(record)} lines, expected one oxts record")
+        poses, map_frame = drive.poses_from_oxts(np.concatenate(records))
         if not streams:
             raise LogError(f"{self.path}: neither images (image_00 to image_03) nor velodyne_points in it")
         track = PoseTrack(ego_t_ns, poses)
@@ -109,14 +110,6 @@ class _Drive:
             calibrations={n: str(self.path.parent / CALIBRATION[0 if n in cameras else 1]) for n in streams},
         )
 
-    def _rig(self) -> drive.Rig:
-        cam, velo, imu = (self.path.parent / name for name in CALIBRATION)
-        c = drive.read_calibration(cam)
-        numbers = [k for k in range(4) if (self.path / f"image_{k:02d}").is_dir()]
-        rect = drive.rotation_entry(c, cam, "R_rect_00")
-        projections = {k: drive.projection_entry(c, cam, f"P_rect_{k:02d}") for k in numbers}
-        return drive.rig_of(_rigid(imu), _rigid(velo), rect, projections)
-
     def _sweeps(self, notes: list[str]) -> Stream:
         folder = self.path / "velodyne_points"
         t_ns, files, numbers = self._records(folder.name, (".bin",), notes)
@@ -124,31 +117,19 @@ class _Drive:
         for name, stamps in (("start", begin), ("end", end)):
             if len(stamps) <= numbers.max():
                 raise LogError(f"{folder}/timestamps_{name}.txt: {len(stamps)} lines, record {numbers.max()} has none")
-        wrong = np.flatnonzero((begin[numbers] > t_ns) | (end[numbers] < t_ns))
-        if len(wrong):
-            notes.append(
-                f"{folder.name}: {len(wrong)} of {len(numbers)} sweeps face forward at a stamp before their start or after their end, "
-                f"first number {numbers[wrong[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
-            )
         begin, end = begin[numbers], end[numbers]
+        wrong = np.flatnonzero((begin > t_ns) | (end < t_ns))
         early = np.flatnonzero(end[:-1] - begin[1:] > MAX_OVERLAP * (end - begin)[:-1]) + 1
-        if len(early):
-            notes.append(
-                f"{folder.name}: {len(early)} of {len(numbers)} sweeps begin while the one before still turns, first number "
-                f"{numbers[early[0]]:010d}; check timestamps_start.txt and timestamps_end.txt"
-            )
+        for rows, what in (
+            (wrong, "face forward at a stamp before their start or after their end"),
+            (early, "begin while the one before still turns"),
+        ):
+            if len(rows):
+                notes.append(
+                    f"{folder.name}: {len(rows)} of {len(numbers)} sweeps {what}, first number {numbers[rows[0]]:010d}; check "
+                    "timestamps_start.txt and timestamps_end.txt"
+                )
         return drive.sweep_stream(t_ns, begin, end, files)
-
-    def _poses(self, notes: list[str]) -> tuple[NDArray[np.int64], Array, MapFrame]:
-        t_ns, files, _ = self._records("oxts", (".txt",), notes)
-        rows = []
-        for file in files:
-            record = drive.parse_oxts(drive.read_text(file), str(file))
-            if len(record) != 1:
-                raise LogError(f"{file}: {len(record)} lines, expected one oxts record")
-            rows.append(record[0])
-        poses, map_frame = drive.poses_from_oxts(np.array(rows))
-        return t_ns, poses, map_frame
 
     def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
         path, times = self.path / LABELS, self.path / LABELED_CAMERA / "timestamps.txt"
@@ -216,21 +197,16 @@ CAMERA_NUMBERS = (2, 3)
 NO_STAMPS = "this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"
 
 
-class KittiTrackingReader:
+class KittiTrackingReader(FolderReader):
     """Reader of the tracking layout; the root is the folder "training" or its parent."""
 
     name = "kitti-tracking"
     looks_for = "a folder training/ (or that folder) with calib/NNNN.txt and image_02/NNNN/"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a sequence of this layout."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the calibrations of sequences at a folder by name."""
         base = _base(path)
-        return sorted(p.stem for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir())
+        return {p.stem: p for p in (base / "calib").glob("*.txt") if (base / "image_02" / p.stem).is_dir()}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
@@ -251,8 +227,21 @@ class _Sequence:
     name: str
 
     def log(self) -> Log:
-        rig = self._rig()
-        cameras, streams = self._cameras(rig)
+        path = self.base / "calib" / f"{self.name}.txt"
+        c = drive.read_calibration(path)
+        numbers = [k for k in CAMERA_NUMBERS if (self.base / f"image_{k:02d}" / self.name).is_dir()]
+        projections = {k: drive.projection_entry(c, path, f"P{k}") for k in numbers}
+        rect = drive.rotation_entry(c, path, "R0_rect", "R_rect")
+        keys = (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam"))
+        velo_T_imu, cam_T_velo = (drive.rigid_entry(c, path, *names) for names in keys)
+        rig = drive.rig_of(velo_T_imu, cam_T_velo, rect, projections)
+        cameras, streams = dict[str, Camera](), dict[str, Stream]()
+        for number in numbers:
+            files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
+            size_px = first_image_size(list(files.values()))
+            camera = rig.camera(number, *size_px)
+            cameras[camera.name] = camera
+            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
         if (self.base / "velodyne" / self.name).is_dir():
             sweeps = self._files("velodyne", (".bin",))
             t_ns = _nominal_stamps(sweeps)
@@ -273,9 +262,10 @@ class _Sequence:
                 notes.append(
                     f"{name}: {len(missing)} of {len(rows)} records are missing, first number {missing[0]:06d}"
                 )
-        labels = self._labels(rig, track, notes)
-        records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
-        calibration = drive.read_text(self.base / "calib" / f"{self.name}.txt")
+        label_file, labels = self.base / "label_02" / f"{self.name}.txt", DriveLabels()
+        if is_present(label_file):
+            labels = read_labels(label_file, rig, track, lambda frame: frame * PERIOD_NS, notes)
+        files_of_records = sorted(p for folder in streams for p in (self.base / folder / self.name).iterdir())
         return Log(
             name=f"kitti-tracking-{self.name}",
             format=TRACKING_READER.name,
@@ -289,30 +279,10 @@ class _Sequence:
             image_labels=labels.boxes_2d,
             ignored_regions=labels.ignored,
             reference_camera="image_02",
-            digest=digest_of([calibration, oxts, labels.text], records),
+            digest=digest_of([drive.read_text(path), oxts, labels.text], files_of_records),
             notes=tuple(notes),
-            calibrations=dict.fromkeys(streams, str(self.base / "calib" / f"{self.name}.txt")),
+            calibrations=dict.fromkeys(streams, str(path)),
         )
-
-    def _rig(self) -> drive.Rig:
-        path = self.base / "calib" / f"{self.name}.txt"
-        c = drive.read_calibration(path)
-        numbers = [k for k in CAMERA_NUMBERS if (self.base / f"image_{k:02d}" / self.name).is_dir()]
-        projections = {k: drive.projection_entry(c, path, f"P{k}") for k in numbers}
-        rect = drive.rotation_entry(c, path, "R0_rect", "R_rect")
-        keys = (("Tr_imu_to_velo", "Tr_imu_velo"), ("Tr_velo_to_cam", "Tr_velo_cam"))
-        velo_T_imu, cam_T_velo = (drive.rigid_entry(c, path, *names) for names in keys)
-        return drive.rig_of(velo_T_imu, cam_T_velo, rect, projections)
-
-    def _cameras(self, rig: drive.Rig) -> tuple[dict[str, Camera], dict[str, Stream]]:
-        cameras, streams = {}, {}
-        for number in rig.projections:
-            files = self._files(f"image_{number:02d}", (".png", ".jpg", ".jpeg"))
-            size_px = first_image_size(list(files.values()))
-            camera = rig.camera(number, *size_px)
-            cameras[camera.name] = camera
-            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
-        return cameras, streams
 
     def _files(self, folder: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
         files = list_numbered_files(self.base / folder / self.name, suffixes)
@@ -321,12 +291,6 @@ class _Sequence:
                 f"{self.base / folder / self.name}: no records ({', '.join(suffixes)}); a stream needs at least one"
             )
         return files
-
-    def _labels(self, rig: drive.Rig, track: PoseTrack, notes: list[str]) -> DriveLabels:
-        path = self.base / "label_02" / f"{self.name}.txt"
-        if not is_present(path):
-            return DriveLabels()
-        return read_labels(path, rig, track, lambda frame: frame * PERIOD_NS, notes)
 
 
 def _nominal_stamps(files: dict[int, Path]) -> NDArray[np.int64]:

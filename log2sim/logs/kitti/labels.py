@@ -222,6 +222,8 @@ RESULT_FIELDS = 18
 MAX_FRAME = 1_000_000
 CAMERA = "image_02"
 
+PosesAt = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
+
 
 @dataclass(frozen=True, eq=False)
 class DriveLabels:
@@ -248,11 +250,7 @@ class LabelRows:
 
 
 def read_labels(
-    path: Path,
-    rig: Rig,
-    track: PoseTrack,
-    stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
-    notes: list[str],
+    path: Path, rig: Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]], notes: list[str]
 ) -> DriveLabels:
     """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,), `notes` takes what was left out.
 
@@ -263,29 +261,39 @@ def read_labels(
     damaged: list[str] = []
     rows = parse_labels(text, path, damaged)
     note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
-    return labels_of_rows(rows, rig.ego_T_rect, track, stamp_of, text)
+    return labels_of_rows(rows, poses_of_rect(track, rig.ego_T_rect), stamp_of, text)
+
+
+def poses_of_rect(track: PoseTrack, ego_T_rect: Array) -> PosesAt:
+    """Return the function that places the rectified camera 0, which has the pose (4, 4) in the frame of the ego."""
+
+    def at(t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        map_T_ego, known = track.at(t_ns)
+        return map_T_ego @ ego_T_rect, known
+
+    return at
 
 
 def labels_of_rows(
     rows: LabelRows,
-    ego_T_rect: Array,
-    track: PoseTrack,
+    poses_at: PosesAt,
     stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]],
     text: str,
+    camera: str = CAMERA,
 ) -> DriveLabels:
     """Place the rows of label files in the map; those of unlabeled regions become regions of the image.
 
-    `ego_T_rect` (4, 4) float64: pose of the rectified camera 0. `track`: poses of the ego. `stamp_of`: gives the stamps
-    (L,) of frame numbers (L,). `text`: the files, for the log's digest.
+    `poses_at`: gives the poses (L, 4, 4) of the frame that boxes are in, and whether they are known, at stamps (L,).
+    `stamp_of`: gives the stamps (L,) of frame numbers (L,). `text`: the files, for the log's digest. `camera`: in whose images
+    objects were labeled.
     """
     is_ignored = rows.type == NOT_LABELED
     ignored = rows.take(is_ignored)
     rows = rows.take(~is_ignored)
     t_ns = stamp_of(rows.frame)
     category = np.array([CATEGORY_OF[name] for name in rows.type.tolist()], dtype="<U16")
-    map_T_ego, known = track.at(t_ns)
-    center, size, yaw = boxes_in_map(map_T_ego @ ego_T_rect, rows.values[:, 7:14])
-    k = known
+    map_T_rect, k = poses_at(t_ns)
+    center, size, yaw = boxes_in_map(map_T_rect, rows.values[:, 7:14])
     return DriveLabels(
         Labels(
             t_ns[k],
@@ -294,13 +302,13 @@ def labels_of_rows(
             center[k],
             size[k],
             yaw[k],
-            cameras=(CAMERA,),
+            cameras=(camera,),
             kind=rows.type[k],
             occlusion=rows.values[k, 1].astype(np.int64),
             never_labeled=NEVER_LABELED,
         ),
-        {CAMERA: ImageLabels(t_ns, rows.values[:, 3:7], category)},
-        {CAMERA: ImageRegions(stamp_of(ignored.frame), ignored.values[:, 3:7])},
+        {camera: ImageLabels(t_ns, rows.values[:, 3:7], category)},
+        {camera: ImageRegions(stamp_of(ignored.frame), ignored.values[:, 3:7])},
         text,
     )
 

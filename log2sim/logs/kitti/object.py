@@ -21,7 +21,7 @@ from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.kitti import labels as drive
 from log2sim.logs.kitti.labels import CAMERA, DriveLabels, LabelRows, labels_of_rows, parse_labels
-from log2sim.logs.records import first_image_size, image_stream, list_numbered_files, read_sweep, sweep_of
+from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_numbered_files, read_sweep, sweep_of
 from log2sim.logs.stamps import note_damaged_rows
 
 SPLITS = ("training", "testing")
@@ -36,28 +36,20 @@ LIDAR_HEIGHT_M = 1.73
 """Of KITTI's car (Geiger et al., IJRR 2013, fig. 1), for frames whose calibration does not state it."""
 
 
-class KittiObjectReader:
+class KittiObjectReader(FolderReader):
     """Reader of the object detection layout; the root is a split or the parent of splits."""
 
     name = "kitti-object"
     looks_for = "a folder training/ (or that folder) with velodyne/NNNNNN.bin and calib/NNNNNN.txt"
-    suffixes = ()
-
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a split of this layout."""
-        return bool(self._splits(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the splits, sorted."""
-        return sorted(self._splits(path))
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a split."""
-        split = self._splits(path)[sequence]
+        split = self.find(path)[sequence]
         require_links_inside(split, path)
         return _Split(split).log()
 
-    def _splits(self, path: Path) -> dict[str, Path]:
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the splits at a folder by name."""
         path = path.resolve()
         places = [path, *(path / name for name in SPLITS)]
         return {p.name: p for p in places if (p / "calib").is_dir() and any((p / "velodyne").glob("*.bin"))}
@@ -211,7 +203,9 @@ class _Split:
             *(np.concatenate([getattr(p, k) for p in parts]) for k in ("frame", "track_id", "type", "values"))
         )
         note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
-        found = labels_of_rows(rows, first.ego_T_rect, ego, lambda frame: frame * PERIOD_NS, "\n".join(texts))
+        found = labels_of_rows(
+            rows, drive.poses_of_rect(ego, first.ego_T_rect), lambda frame: frame * PERIOD_NS, "\n".join(texts)
+        )
         assert found.boxes_3d is not None
         return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=np.array(labeled, dtype=np.int64)))
 

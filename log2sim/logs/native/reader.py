@@ -8,7 +8,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from log2sim.datatypes import (
     Stream,
     Sweep,
 )
+from log2sim.datatypes.log import camera_of
 from log2sim.errors import LogError
 from log2sim.files.documents import JSON_LIMIT_BYTES, check, is_plain, read_json
 from log2sim.files.inputs import inside, open_regular, read_file, require_link_inside
@@ -39,8 +40,8 @@ from log2sim.geometry import (
     shift_poses,
     transform,
 )
-from log2sim.logs.records import QUATERNION_TOLERANCE, find_not_unit, image_stream, read_sweep
-from log2sim.logs.stamps import note_damaged_rows, strictly_increasing
+from log2sim.logs.records import QUATERNION_TOLERANCE, FolderReader, checked_poses, image_stream, read_sweep
+from log2sim.logs.stamps import map_frame_of, note_damaged_rows, poses_from_geodetic, strictly_increasing
 
 MAX_TABLE_BYTES = 256 * 1024 * 1024
 # No coordinate on Earth, in any projection, is near this, and no square of it overflows.
@@ -202,29 +203,12 @@ def boxes_3d(table: CsvTable) -> Labels:
     )
 
 
-def boxes_2d(table: CsvTable, cameras: set[str]) -> dict[str, ImageLabels]:
-    """Labels by camera of a table with `BOX_2D_COLUMNS`."""
-    _check_categories(table)
-    box, rows = _boxes(table), _rows_by_camera(table, cameras)
-    return {n: ImageLabels(table["t_ns"][r], box[r], table["category"][r]) for n, r in rows.items()}
-
-
-def regions_2d(table: CsvTable, cameras: set[str]) -> dict[str, ImageRegions]:
-    """Ignored regions by camera of a table with `REGION_COLUMNS`."""
-    box, rows = _boxes(table), _rows_by_camera(table, cameras)
-    return {n: ImageRegions(table["t_ns"][r], box[r]) for n, r in rows.items()}
-
-
-def _boxes(table: CsvTable) -> Array:
+def boxes_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, tuple[NDArray[np.bool_], Array]]:
+    """Rows (N,) and boxes (L, 4), u0, v0, u1, v1 in px, of each camera that a table with `REGION_COLUMNS` has some of."""
     box = table.stack(*BOX_2D_FIELDS)
     empty = np.flatnonzero((box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1]))
     if len(empty):
         raise LogError(f"{table.where(empty[0], 'u1_px,v1_px')}: the box is empty, expected u0 < u1 and v0 < v1")
-    return box
-
-
-def _rows_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, NDArray[np.bool_]]:
-    """Rows (N,) by camera, of cameras that have some."""
     unknown = np.flatnonzero(~np.isin(table["camera"], sorted(cameras)))
     if len(unknown):
         name = table["camera"][unknown[0]]
@@ -232,7 +216,7 @@ def _rows_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, NDArray[np.
             f"{table.where(unknown[0], 'camera')}: no camera '{name}'; there are: {', '.join(sorted(cameras))}"
         )
     rows = {name: table["camera"] == name for name in sorted(cameras)}
-    return {n: r for n, r in rows.items() if r.any()}
+    return {n: (r, box[r]) for n, r in rows.items() if r.any()}
 
 
 def _check_categories(table: CsvTable) -> None:
@@ -250,46 +234,12 @@ def offset_of(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: La
     if track is not None:
         first = track.map_T_ego[0, :3, 3]
     else:
-        positions = [_mount_T(s)[:3, 3] for s in sensors if s.mount == "map"]
+        mounts = [s.mount_T_cam if isinstance(s, Camera) else s.mount_T_lidar for s in sensors if s.mount == "map"]
+        positions = [mount_T_sensor[:3, 3] for mount_T_sensor in mounts]
         if not positions and labels is not None and len(labels.t_ns):
             positions = [labels.center_m[0]]
         first = positions[0] if positions else np.zeros(3)
     return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
-
-
-def _mount_T(sensor: Camera | Lidar) -> Array:
-    return sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
-
-
-def shifted_camera(camera: Camera, offset: Array) -> Camera:
-    """Shift a camera that is fixed in the map."""
-    return camera if camera.mount == "ego" else replace(camera, mount_T_cam=shift_poses(camera.mount_T_cam, offset))
-
-
-def shifted_lidar(lidar: Lidar, offset: Array) -> Lidar:
-    """Shift a LiDAR that is fixed in the map."""
-    return lidar if lidar.mount == "ego" else Lidar(lidar.name, lidar.mount, shift_poses(lidar.mount_T_lidar, offset))
-
-
-@dataclass(frozen=True, eq=False)
-class SweepFiles:
-    """Sweeps of one LiDAR."""
-
-    files: list[Path]
-    t_ns: NDArray[np.int64]  # (F,): absolute stamps
-    frame: Literal["lidar", "map"]  # {"lidar", "map"}: of the points
-    offset: Array  # (3,), m: what is taken off coordinates of the map
-    # (F,) int64 or None: stamps of compensation, as `log2sim.datatypes.Sweep` has them
-    compensated_ns: NDArray[np.int64] | None
-
-    def read(self, i: int) -> Sweep:
-        """Read sweep `i`; points in the map frame are shifted by the map's offset."""
-        sweep = read_sweep(self.files[i], int(self.t_ns[i]), self.frame)
-        if self.compensated_ns is not None:
-            return replace(sweep, compensated_ns=int(self.compensated_ns[i]))
-        if self.frame == "map" and self.offset.any():
-            return replace(sweep, xyz_m=sweep.xyz_m.astype(np.float64) - self.offset)
-        return sweep
 
 
 MANIFEST = "log.json"
@@ -301,22 +251,17 @@ GNSS_FIELDS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_rad", "pitch
 GNSS_COLUMNS = {"t_ns": "int", **dict.fromkeys(GNSS_FIELDS, "float")}
 
 
-class NativeReader:
+class NativeReader(FolderReader):
     """Reader of log2sim's own log folders."""
 
     name = "log2sim"
     looks_for = f"a folder with {MANIFEST}"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds a sequence of this layout."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the folders of logs at a folder by name."""
         if _is_manifest(path / MANIFEST):
-            return [path.resolve().name]
-        return sorted(p.parent.name for p in path.glob(f"*/{MANIFEST}") if _is_manifest(p))
+            return {path.resolve().name: path}
+        return {p.parent.name: p.parent for p in path.glob(f"*/{MANIFEST}") if _is_manifest(p)}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence."""
@@ -363,8 +308,21 @@ class _Folder:
         labels = self._labels()
         boxes, regions = self._label_table("boxes_2d", BOX_2D_COLUMNS), self._label_table("ignored_2d", REGION_COLUMNS)
         offset = offset_of(track, sensors, labels)
-        cameras = {s.name: shifted_camera(s, offset) for s in sensors if isinstance(s, Camera)}
-        lidars = {s.name: shifted_lidar(s, offset) for s in sensors if isinstance(s, Lidar)}
+        cameras, lidars = dict[str, Camera](), dict[str, Lidar]()
+        for sensor in sensors:
+            shift = offset if sensor.mount == "map" else np.zeros(3)
+            if isinstance(sensor, Camera):
+                cameras[sensor.name] = replace(sensor, mount_T_cam=shift_poses(sensor.mount_T_cam, shift))
+            else:
+                lidars[sensor.name] = replace(sensor, mount_T_lidar=shift_poses(sensor.mount_T_lidar, shift))
+        image_labels, ignored = dict[str, ImageLabels](), dict[str, ImageRegions]()
+        if boxes is not None:
+            _check_categories(boxes)
+            for name, (rows, box) in boxes_by_camera(boxes, set(cameras)).items():
+                image_labels[name] = ImageLabels(boxes["t_ns"][rows], box, boxes["category"][rows])
+        if regions is not None:
+            for name, (rows, box) in boxes_by_camera(regions, set(cameras)).items():
+                ignored[name] = ImageRegions(regions["t_ns"][rows], box)
         ego = m.get("ego", {})
         # Without an ego the height of the road is one of the map.
         roadside = track is None and all(sensor.mount == "map" for sensor in sensors)
@@ -382,8 +340,8 @@ class _Folder:
             ),
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
             labels=None if labels is None else replace(labels, center_m=labels.center_m - offset),
-            image_labels={} if boxes is None else boxes_2d(boxes, set(cameras)),
-            ignored_regions={} if regions is None else regions_2d(regions, set(cameras)),
+            image_labels=image_labels,
+            ignored_regions=ignored,
             ground_z_ego_m=float(ego.get("ground_z_m", 0.0)) - (float(offset[2]) if roadside else 0.0),
             reference_camera=m.get("reference_camera"),
             digest=self.hash.hexdigest(),
@@ -392,17 +350,15 @@ class _Folder:
         )
 
     def table(
-        self,
-        relative: str,
-        field: str,
-        columns: Mapping[str, str],
-        optional: Mapping[str, str] | None = None,
+        self, relative: str, field: str, columns: Mapping[str, str], optional: Mapping[str, str] | None = None,
         damaged: list[str] | None = None,
-    ) -> CsvTable:
+    ) -> CsvTable:  # fmt: skip
         """Read a table that the manifest names under `field`; rows that are cut go to `damaged`, else they are an error."""
         path = inside(self.root, relative, f"{self.file}, field '{field}'")
         table = read_csv_table(path, columns, optional, damaged=damaged)
         self.hash.update(table.sha256.encode())
+        if damaged is None and not len(table):
+            raise LogError(f"{table.path}: no records below the header; a stream needs at least one")
         return table
 
     def _ego(self) -> tuple[MapFrame, PoseTrack | None]:
@@ -413,18 +369,10 @@ class _Folder:
             return map_frame, None
         if "poses" in ego:
             table = self.table(ego["poses"], "ego.poses", POSE_COLUMNS)
-            self._not_empty(table)
-            q = table.stack("qw", "qx", "qy", "qz")
-            bad = find_not_unit(q)
-            if len(bad):
-                norm = float(np.linalg.norm(q[bad[0]]))
-                raise LogError(f"{table.where(bad[0], 'qw,qx,qy,qz')}: norm {norm:.6g}, expected a unit quaternion")
-            poses = transform(rotation_from_quaternion(q), table.stack("x_m", "y_m", "z_m"))
+            q, position = table.stack("qw", "qx", "qy", "qz"), table.stack("x_m", "y_m", "z_m")
+            poses = checked_poses(q, position, lambda row: table.where(row, "qw,qx,qy,qz"))
         else:
             table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
-            self._not_empty(table)
-            from log2sim.logs.stamps import map_frame_of, poses_from_geodetic
-
             for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
                 bad = np.flatnonzero(np.abs(table[field]) > limit)
                 if len(bad):
@@ -440,10 +388,6 @@ class _Folder:
         keep = strictly_increasing(table["t_ns"], "ego", self.notes)
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
 
-    def _not_empty(self, table: CsvTable) -> None:
-        if not len(table):
-            raise LogError(f"{table.path}: no records below the header; a stream needs at least one")
-
     def _sensor(self, k: int, entry: Mapping[str, Any]) -> Camera | Lidar:
         where = f"{self.file}, sensors[{k}] '{entry['name']}'"
         norm = float(np.linalg.norm(entry["rotation_wxyz"]))
@@ -453,16 +397,13 @@ class _Folder:
         if entry["kind"] == "lidar":
             return Lidar(entry["name"], entry["mount"], mount_T_sensor)
         i = entry["intrinsics"]
-        model, distortion = i.get("distortion_model", "none"), tuple(float(v) for v in i.get("distortion", ()))
-        if len(distortion) not in DISTORTION_LENGTHS[model]:
+        model, count = i.get("distortion_model", "none"), len(i.get("distortion", ()))
+        if count not in DISTORTION_LENGTHS[model]:
             expected = " or ".join(map(str, DISTORTION_LENGTHS[model]))
-            raise LogError(f"{where}: intrinsics.distortion has {len(distortion)} values, '{model}' takes {expected}")
-        K = np.array([[i["fx_px"], 0.0, i["cx_px"]], [0.0, i["fy_px"], i["cy_px"]], [0.0, 0.0, 1.0]])
+            raise LogError(f"{where}: intrinsics.distortion has {count} values, '{model}' takes {expected}")
         lines = i.get("rolling_shutter")
         shutter = None if lines is None else RollingShutter(lines["direction"], float(lines["readout_s"]))
-        return Camera(
-            entry["name"], i["width_px"], i["height_px"], K, entry["mount"], mount_T_sensor, model, distortion, shutter
-        )
+        return replace(camera_of(entry["name"], i, entry["mount"], mount_T_sensor), rolling_shutter=shutter)
 
     def _check_sensors(self, sensors: list[Camera | Lidar]) -> None:
         names: set[str] = set()
@@ -487,7 +428,6 @@ class _Folder:
         frame = entry.get("points_frame", "lidar")
         compensable = COMPENSATED if entry["kind"] == "lidar" and frame == "lidar" else None
         table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS, compensable)
-        self._not_empty(table)
         keep = strictly_increasing(table["t_ns"], entry["name"], self.notes)
         files = [inside(self.root, str(table["file"][row]), table.where(row, "file")) for row in keep]
         t_ns = table["t_ns"][keep]
@@ -497,8 +437,17 @@ class _Folder:
             size_px = entry["intrinsics"]["width_px"], entry["intrinsics"]["height_px"]
             return image_stream(entry["name"], t_ns, files, size_px)
         compensated = table.columns.get("compensated_ns")
-        sweeps = SweepFiles(files, t_ns, frame, offset, None if compensated is None else compensated[keep])
-        return Stream(entry["name"], t_ns, sweeps.read)
+        compensated_ns = None if compensated is None else compensated[keep]
+
+        def read(i: int) -> Sweep:
+            sweep = read_sweep(files[i], int(t_ns[i]), frame)
+            if compensated_ns is not None:
+                return replace(sweep, compensated_ns=int(compensated_ns[i]))
+            if frame == "map" and offset.any():
+                return replace(sweep, xyz_m=sweep.xyz_m.astype(np.float64) - offset)
+            return sweep
+
+        return Stream(entry["name"], t_ns, read)
 
     def _labels(self) -> Labels | None:
         entry = self.manifest.get("labels", {})

@@ -8,20 +8,19 @@ read; neither is radar.
 from __future__ import annotations
 
 import json
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
-from log2sim.files.documents import read_json
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, read_sweep
-from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of, text_of
-from log2sim.logs.records import MAX_IMAGE_PX, first_image_size, image_stream, list_folders
+from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of
+from log2sim.logs.records import MAX_IMAGE_PX, FolderReader, first_image_size, image_stream, list_folders
 from log2sim.logs.stamps import defer_notes
 
 REFERENCE_CAMERA = "CAM_FRONT"
@@ -41,27 +40,37 @@ EARTH_RADIUS_M = 6378137.0
 MAX_FLAT_M = 0.001
 
 
-class NuScenesReader:
+class NuScenesReader(FolderReader):
     """Reader of nuScenes; the root holds folders of tables (v1.0-mini), or is one."""
 
     name = "nuscenes"
     looks_for = (
         "a folder of nuScenes tables with scene.json and sample_data.json (v1.0-mini), or the folder that holds it"
     )
-    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds tables, or is a folder of tables."""
         return bool(_versions(path))
 
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the scenes, sorted; with the version in front where there are several."""
-        return sorted(_scenes(path))
+    def find(self, path: Path) -> dict[str, tuple[Tables, str]]:
+        """Find tables and name of the scenes at a folder, with the version in front of the name where there are several.
+
+        A list of scenes that cannot be read counts as one, so that opening it raises why.
+        """
+        versions, scenes = _versions(path), {}
+        for folder in versions:
+            tables = Tables(folder)
+            try:
+                names = [record["name"] for record in tables.read(SCENES, "name")]
+            except LogError:
+                names = [folder.name]
+            scenes.update({f"{folder.name}/{n}" if len(versions) > 1 else n: (tables, n) for n in names})
+        return scenes
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a scene; the tables are read but for the annotations, no image and no sweep."""
-        tables, name = _scenes(path)[sequence]
-        record = next(record for record in _scene_records(tables) if record["name"] == name)
+        tables, name = self.find(path)[sequence]
+        record = next(record for record in tables.read(SCENES, "name") if record["name"] == name)
         return _SceneReader(Scene(tables, record)).log()
 
 
@@ -75,30 +84,6 @@ def _versions(path: Path) -> list[Path]:
 
 def _is_version(path: Path) -> bool:
     return (path / f"{SCENES}.json").is_file() and (path / f"{DATA}.json").is_file()
-
-
-def _scenes(path: Path) -> dict[str, tuple[Tables, str]]:
-    """Tables and name of the scenes by sequence; a list of scenes that cannot be read counts as one, so that opening it raises why."""
-    versions = _versions(path)
-    scenes = {}
-    for folder in versions:
-        tables = Tables(folder)
-        try:
-            names = [record["name"] for record in _scene_records(tables)]
-        except LogError:
-            names = [folder.name]
-        scenes.update({f"{folder.name}/{name}" if len(versions) > 1 else name: (tables, name) for name in names})
-    return scenes
-
-
-def _scene_records(tables: Tables) -> list[Record]:
-    path = tables.path(SCENES)
-    records = read_json(path)
-    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise LogError(f"{path}: expected a list of records")
-    for record in records:
-        text_of(record, "name", path)
-    return records
 
 
 class _SceneReader:
@@ -135,8 +120,12 @@ class _SceneReader:
 
         @cache
         def labels() -> Labels | None:
-            return read_labels(scene, self._labeled_lidar(), offset_m, self.notes)
+            channels = {name: c for name, c in scene.channels.items() if c.modality == "lidar"}
+            lidar = channels.get(LABELED_LIDAR) or next(iter(channels.values()), None)
+            return read_labels(scene, lidar, offset_m, self.notes)
 
+        index = [scene.record, scene.samples, scene.data, [c.calibration for c in scene.channels.values()]]
+        poses = [scene.ego.t_ns.tobytes().hex(), scene.ego.map_T_ego.tobytes().hex()]
         return Log(
             name=f"nuscenes-{scene.record['name']}",
             format=READER.name,
@@ -148,16 +137,16 @@ class _SceneReader:
             map=self._map_frame(offset_m),
             labels=labels,
             reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
-            digest=self._digest(),
+            digest=digest_of([json.dumps(index, sort_keys=True), *poses], self.files),
             notes=defer_notes(self.notes, labels),
             calibrations=dict.fromkeys(streams, str(self.tables.path("calibrated_sensor"))),
-            details=self._details(),
+            details={
+                "tables": self.tables.folder.resolve().name,
+                "scene": {key: str(scene.record.get(key, "")) for key in ("name", "description")},
+                "location": scene.location,
+                "key_frames": len(scene.samples),
+            },
         )
-
-    def _labeled_lidar(self) -> Channel | None:
-        """Return the LiDAR in whose sweeps objects were labeled."""
-        lidars = {name: c for name, c in self.scene.channels.items() if c.modality == "lidar"}
-        return lidars.get(LABELED_LIDAR) or next(iter(lidars.values()), None)
 
     def _sensors(self, track: PoseTrack) -> tuple[dict[str, Camera], dict[str, Lidar], dict[str, Stream]]:
         cameras: dict[str, Camera] = {}
@@ -183,7 +172,7 @@ class _SceneReader:
                 streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
             else:
                 lidars[name] = Lidar(name, "ego", channel.ego_T_sensor)
-                streams[name] = self._sweeps(channel, track, t_ns, files)
+                streams[name] = Stream(name, t_ns, partial(_read_sweep, channel, track, t_ns, files))
         if not streams:
             raise LogError(
                 f"{self.root}: none of the {missing} images and sweeps of scene '{self.scene.record['name']}' "
@@ -205,13 +194,6 @@ class _SceneReader:
         width, height = (width, height) if stated else first_image_size(files)
         return Camera(channel.name, int(width or 0), int(height or 0), K, "ego", channel.ego_T_sensor)
 
-    def _sweeps(self, channel: Channel, track: PoseTrack, t_ns: NDArray[np.int64], files: list[Path]) -> Stream:
-        def poses(stamps: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-            map_T_ego, known = track.at(stamps)
-            return map_T_ego @ channel.ego_T_sensor, known
-
-        return Stream(channel.name, t_ns, lambda i: read_sweep(files[i], int(t_ns[i]), poses))
-
     def _map_frame(self, offset_m: Array) -> MapFrame:
         place = MAP_ORIGIN_DEG.get(self.scene.location)
         offset = (float(offset_m[0]), float(offset_m[1]), float(offset_m[2]))
@@ -223,17 +205,10 @@ class _SceneReader:
         projection = f"{sphere} +lat_0={latitude!r} +lon_0={longitude!r}"
         return MapFrame(latitude, longitude, None, projection, offset)
 
-    def _details(self) -> dict[str, object]:
-        keys = ("name", "description")
-        return {
-            "tables": self.tables.folder.resolve().name,
-            "scene": {key: str(self.scene.record.get(key, "")) for key in keys},
-            "location": self.scene.location,
-            "key_frames": len(self.scene.samples),
-        }
 
-    def _digest(self) -> str:
-        scene = self.scene
-        index = [scene.record, scene.samples, scene.data, [c.calibration for c in scene.channels.values()]]
-        poses = [scene.ego.t_ns.tobytes().hex(), scene.ego.map_T_ego.tobytes().hex()]
-        return digest_of([json.dumps(index, sort_keys=True), *poses], self.files)
+def _read_sweep(channel: Channel, track: PoseTrack, t_ns: NDArray[np.int64], files: list[Path], i: int) -> Sweep:
+    def poses(stamps: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
+        map_T_ego, known = track.at(stamps)
+        return map_T_ego @ channel.ego_T_sensor, known
+
+    return read_sweep(files[i], int(t_ns[i]), poses)

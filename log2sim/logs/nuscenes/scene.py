@@ -347,9 +347,15 @@ def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], n
     path = scene.tables.path(ANNOTATIONS)
     kinds = _kinds(scene, annotations, path)
     attributes = {token: str(r.get("name")) for token, r in scene.tables.all_of("attribute").items()}
+    ridden = []
+    for a in annotations:
+        tokens = a.get("attribute_tokens", [])
+        if not isinstance(tokens, list):
+            raise LogError(f"{path}, token {str(a.get('token'))[:40]!a}: 'attribute_tokens' is no list")
+        ridden.append({attributes.get(str(token), "") for token in tokens})
     category = [
-        _category(kind, {attributes.get(str(token), "") for token in _tokens(a, path)})
-        for kind, a in zip(kinds, annotations)
+        "cyclist" if word == "bicycle" and WITH_RIDER in words else word
+        for word, words in zip((CATEGORY_OF.get(kind, "") for kind in kinds), ridden)
     ]
     size = numbers_of(annotations, "size", (3,), path)[:, [1, 0, 2]]  # tables: width, length, height
     rows = _Rows(
@@ -389,18 +395,6 @@ def _kinds(scene: Scene, annotations: list[Record], path: Path) -> list[str]:
             )
         words[token] = text_of(categories[wanted], "name", scene.tables.path("category"))
     return [words[token] for token in tokens]
-
-
-def _category(kind: str, attributes: set[str]) -> str:
-    word = CATEGORY_OF.get(kind, "")
-    return "cyclist" if word == "bicycle" and WITH_RIDER in attributes else word
-
-
-def _tokens(annotation: Record, path: Path) -> list[Any]:
-    tokens = annotation.get("attribute_tokens", [])
-    if not isinstance(tokens, list):
-        raise LogError(f"{path}, token {str(annotation.get('token'))[:40]!a}: 'attribute_tokens' is no list")
-    return tokens
 
 
 def _is_visible(annotation: Record) -> bool:

@@ -47,13 +47,19 @@ class Tables:
         require_link_inside(path, self.folder.parent)
         return path
 
-    def all_of(self, table: str) -> dict[str, Record]:
-        """Read a small table as its records by token."""
+    def read(self, table: str, key: str) -> list[Record]:
+        """Read a small table; `LogError` for a record whose `key` is no text."""
         path = self.path(table)
         records = read_json(path)
         if not isinstance(records, list) or not all(isinstance(r, dict) for r in records):
             raise LogError(f"{path}: expected a list of records")
-        return {text_of(record, "token", path): record for record in records}
+        for record in records:
+            text_of(record, key, path)
+        return records
+
+    def all_of(self, table: str) -> dict[str, Record]:
+        """Read a small table as its records by token."""
+        return {record["token"]: record for record in self.read(table, "token")}
 
     def by_token(self, table: str, tokens: Collection[str]) -> dict[str, Record]:
         """Scan a table for the records of some tokens; `LogError` when it has not all of them."""
@@ -147,16 +153,12 @@ def _record_around(data: bytes, at: int, where: str) -> Record:
         except (ValueError, RecursionError):
             continue
         if len(text[:length].encode()) > at - start:
-            return _checked(dict(record), repeated, where)
+            try:
+                require_unique(repeated)
+            except RepeatedKeysError as problem:
+                raise LogError(f"{where}: {problem}") from None
+            return dict(record)
     raise LogError(f"{where}: not valid JSON; expected a flat record of at most {MAX_RECORD_BYTES} bytes")
-
-
-def _checked(record: Record, repeated: list[str], where: str) -> Record:
-    try:
-        require_unique(repeated)
-    except RepeatedKeysError as problem:
-        raise LogError(f"{where}: {problem}") from None
-    return record
 
 
 def text_of(record: Record, key: str, path: Path) -> str:

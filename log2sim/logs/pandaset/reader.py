@@ -24,24 +24,14 @@ from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, 
 from log2sim.errors import LogError, RecordError
 from log2sim.files.documents import JSON_LIMIT_BYTES, read_json
 from log2sim.files.inputs import is_present, read_text, require_links_inside
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    PoseTrack,
-    apply,
-    inverse,
-    nearest_rotation,
-    rotation_from_quaternion,
-    transform,
-    wrap_angle,
-)
+from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, nearest_rotation, transform, wrap_angle
 from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
 from log2sim.logs.records import (
     MAX_POSITION_M,
-    find_not_unit,
+    FolderReader,
+    checked_poses,
     first_image_size,
     image_stream,
     list_folders,
@@ -270,9 +260,11 @@ def _checked(table: Columns, path: Path) -> Columns:
 
 def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: list[str]) -> tuple[NDArray[Any], ...]:
     """Stamps, track ids, categories, centers, sizes and yaws of one sweep's cuboids; `left_out` takes the kinds of others."""
-    category = np.array(
-        [_category(str(k), str(r)) for k, r in zip(c["label"], c["attributes.rider_status"])], dtype="<U16"
-    )
+    words = [
+        RIDER.get(str(rider), UNKNOWN_RIDER) if kind == "Bicycle" else CATEGORY_OF.get(str(kind), "")
+        for kind, rider in zip(c["label"], c["attributes.rider_status"])
+    ]
+    category = np.array(words, dtype="<U16")
     left_out += [str(kind) for kind in c["label"][category == ""]]
     uuid, sibling = c["uuid"].astype(np.str_), c["cuboids.sibling_id"].astype(np.str_)
     of_gt = c["cuboids.sensor_id"] == GT_SENSOR
@@ -292,12 +284,6 @@ def _sizes(c: Columns) -> Array:
     return np.stack([c["dimensions.y"], c["dimensions.x"], c["dimensions.z"]], axis=1).astype(np.float64)
 
 
-def _category(label: str, rider: str) -> str:
-    if label == "Bicycle":
-        return RIDER.get(rider, UNKNOWN_RIDER)
-    return CATEGORY_OF.get(label, "")
-
-
 TABLE = ".pkl.gz"
 ROAD_BELOW_POSE_M = 0.325
 # From the ego frame (x forward, y left, origin on the road) to the frame of the data set's poses.
@@ -314,22 +300,17 @@ MIN_GNSS_TRACK_M = 20.0
 MAX_GNSS_ANGLE_RAD = np.radians(1.0)
 
 
-class PandaSetReader:
+class PandaSetReader(FolderReader):
     """Reader of PandaSet sequences; the root is a sequence or a folder of sequences."""
 
     name = "pandaset"
     looks_for = "a folder with lidar/poses.json and camera/, or a folder of such folders"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder is a sequence or holds some."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the sequences, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the sequences at a folder by name."""
         if _is_sequence(path):
-            return [path.resolve().name]
-        return [p.name for p in list_folders(path) if _is_sequence(p)]
+            return {path.resolve().name: path}
+        return {p.name: p for p in list_folders(path) if _is_sequence(p)}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence; no sweep and no cuboid is read."""
@@ -371,6 +352,7 @@ class _Sequence:
         def labels() -> Labels | None:
             return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
 
+        index = read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)
         return Log(
             name=f"pandaset-{self.path.resolve().name}",
             format=READER.name,
@@ -382,15 +364,10 @@ class _Sequence:
             map=self._map_frame(map_T_pose, notes),
             labels=labels,
             reference_camera="front_camera" if "front_camera" in cameras else None,
-            digest=digest_of(
-                [read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)], self._records()
-            ),
+            digest=digest_of([index], sorted(self.path.glob(f"*/*{TABLE}")) + sorted(self.path.glob("*/*/*.*"))),
             calibrations={n: f"{self.path}/camera/{n}/intrinsics.json" for n in cameras},
             notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
         )
-
-    def _records(self) -> list[Path]:
-        return sorted(self.path.glob(f"*/*{TABLE}")) + sorted(self.path.glob("*/*/*.*"))
 
     def _files(self, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
         """Find the records of a sensor by their number and note missing ones: they are gaps."""
@@ -488,26 +465,13 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
         raise LogError(
             f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
         ) from None
-    wrong = np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1))
-    if len(wrong):
-        raise LogError(
-            f"{folder}/poses.json: record {wrong[0]}: position {position[wrong[0]].tolist()}, expected finite numbers up to "
-            f"{MAX_POSITION_M:g} m"
-        )
-    bad = find_not_unit(q)
-    if len(bad):
-        raise LogError(
-            f"{folder}/poses.json: record {bad[0]}: heading {q[bad[0]].tolist()}, expected a unit quaternion"
-        )
-    return _stamps_ns(stamps, folder / "timestamps.json"), transform(rotation_from_quaternion(q), position)
-
-
-def _stamps_ns(stamps: list[Any], path: Path) -> NDArray[np.int64]:
-    """Return stamps (N,) int64 ns of what a file states, in s."""
+    sensor_poses = checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
     for k, stamp in enumerate(stamps):
         if not isinstance(stamp, (int, float)) or isinstance(stamp, bool) or not abs(stamp) < MAX_TIME_S:
-            raise LogError(f"{path}: record {k}: {str(stamp)[:40]!a}, expected a stamp in seconds below {MAX_TIME_S:g}")
-    return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64)
+            raise LogError(
+                f"{folder}/timestamps.json: record {k}: {str(stamp)[:40]!a}, expected a stamp in seconds below {MAX_TIME_S:g}"
+            )
+    return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64), sensor_poses
 
 
 def _intrinsics(path: Path) -> Array:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from log2sim.errors import MissingExtra
 from log2sim.files.inputs import open_regular
+from log2sim.logs.records import PARSER_ERRORS
 
 MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 MAX_NAME_CHARACTERS = 256
@@ -156,6 +157,38 @@ class ChunkedFile:
         self._damaged: dict[int, str] = {}
         self._partial: _PartialChunk | None = None
 
+    def index(self) -> None:
+        """Find all messages by the index of the file, or by all its chunks where the index is missing or damaged."""
+        self.notes, problem = list[str](), ""
+        try:
+            self._begin()
+            complete = self._read_index()
+        except PARSER_ERRORS as error:
+            complete, problem = False, one_line(error)
+        if not complete:
+            self._begin()
+            self._scan()
+        if problem:
+            self.notes.append(
+                f"{self.path.name}: its index is missing or damaged ({problem}); {self._list.count} messages were found by reading it "
+                "whole"
+            )
+        self.entries = self._list.entries()
+
+    def _begin(self) -> None:
+        """Forget what was found."""
+        self.channels: list[Channel] = []
+        self._numbers: dict[int, int] = {}  # of the channels, by their number in the file
+        self._list, self.chunks = EntryList(), []
+
+    def _read_index(self) -> bool:
+        """Read the index; return whether it leads to all messages."""
+        raise NotImplementedError
+
+    def _scan(self) -> None:
+        """Find all messages by walking the file, up to where it is cut."""
+        raise NotImplementedError
+
     def at(self, position: int, count: int) -> bytes:
         """Read `count` bytes; `ValueError` where the file ends before."""
         if count < 0 or position < 0 or position + count > self.size:
@@ -229,7 +262,12 @@ class ChunkedFile:
 
     def _unpack(self, chunk: Chunk) -> bytes:
         self._require_sizes(chunk)
-        data = decompress(self.at(chunk.position, chunk.stored_bytes), chunk.compression, chunk.size_bytes)
+        data = self.at(chunk.position, chunk.stored_bytes)
+        if chunk.compression not in ("", "none"):
+            data = unpack_part(decompressor_of(chunk.compression), data, chunk.size_bytes + 1)
+        if len(data) != chunk.size_bytes:
+            found = f"more than {chunk.size_bytes}" if len(data) > chunk.size_bytes else f"{len(data)}"
+            raise ValueError(f"unpacks to {found} bytes, expected {chunk.size_bytes}")
         if chunk.crc and zlib.crc32(data) != chunk.crc:
             raise ValueError(f"the CRC of the chunk at byte {chunk.position} is wrong")
         return data
@@ -259,34 +297,14 @@ class _PartialChunk:
     data: bytearray = field(default_factory=bytearray)
 
 
-def decompress(data: bytes, method: str, size_bytes: int) -> bytes:
-    """Decompress data that unpack to `size_bytes`, without allocating more.
-
-    Raises `ValueError`, `OSError`, `RuntimeError` or `EOFError` for damaged data, and for data that unpack to
-    another size; `MissingExtra` where the library of the method is not installed.
-    """
-    checked = min(size_bytes, MAX_CHUNK_BYTES)
-    unpacked = data if method in ("", "none") else decompress_head(data, method, checked + 1)
-    if len(unpacked) != size_bytes:
-        found = f"more than {checked}" if len(unpacked) > checked else f"{len(unpacked)}"
-        raise ValueError(f"unpacks to {found} bytes, expected {size_bytes}")
-    return unpacked
-
-
 def decompress_message(data: bytes, method: str, limit_bytes: int | None) -> bytes:
     """Decompress a message that was compressed by itself, or its first `limit_bytes`."""
     if not method:
         return data
-    if limit_bytes is not None:
-        return decompress_head(data, method, limit_bytes)
-    unpacked = decompress_head(data, method, checked_size(MAX_CHUNK_BYTES // 2) + 1)
+    most = MAX_MESSAGE_BYTES + 1 if limit_bytes is None else limit_bytes
+    unpacked = unpack_part(decompressor_of(method), data, most)
     checked_size(len(unpacked))
     return unpacked
-
-
-def decompress_head(data: bytes, method: str, limit_bytes: int) -> bytes:
-    """Decompress at most the first `limit_bytes` of data; `ValueError` where they are damaged."""
-    return unpack_part(decompressor_of(method), data, limit_bytes)
 
 
 def unpack_part(decompressor: Any, data: bytes, limit_bytes: int) -> bytes:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Lidar, Stream, Sweep
+from log2sim.datatypes import EgoVehicle, Lidar, Stream
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_quaternion, transform
 from log2sim.logs.records import MAX_POSITION_M
@@ -273,34 +273,32 @@ def place_ego(base: str | None, settings: EgoSettings, tree: FrameTree, camera_f
     return EgoFrame(base, base_T_ego, ground_m, vehicle, tuple(notes))
 
 
-def measure_ground_m(sweep: Sweep, ego_T_lidar: Array) -> float:
-    """Measure the height of the road in the ego frame: the most frequent one of points around and below the sensor.
-
-    Raises `RecordError` when there are too few points there.
-    """
-    points = apply(ego_T_lidar, sweep.xyz_m)
-    radius = np.hypot(points[:, 0] - ego_T_lidar[0, 3], points[:, 1] - ego_T_lidar[1, 3])
-    around = (radius > ROAD_RADIUS_M[0]) & (radius < ROAD_RADIUS_M[1])
-    height = ego_T_lidar[2, 3] - points[:, 2]
-    z = points[around & (height > MIN_SENSOR_HEIGHT_M) & (height < MAX_SENSOR_HEIGHT_M), 2]
-    if len(z) < MIN_ROAD_POINTS:
-        raise RecordError(f"{len(z)} points around and below the sensor, too few to find the road")
-    counts = np.bincount(np.floor((z - z.min()) / ROAD_BIN_M).astype(np.int64))
-    mode_m = z.min() + (counts.argmax() + 0.5) * ROAD_BIN_M
-    return float(np.median(z[np.abs(z - mode_m) < 2 * ROAD_BIN_M]))
-
-
 def measure_road(
     frame: EgoFrame, lidars: Mapping[str, Lidar], streams: Mapping[str, Stream]
 ) -> tuple[float, tuple[str, ...]]:
-    """Measure the height of the road in the ego frame in a sweep, with remarks; 0 where no LiDAR shows it."""
+    """Measure the height of the road in the ego frame, with remarks; 0 where no LiDAR shows it.
+
+    It is the most frequent one of the points around and below a sensor in its first sweep.
+    """
     notes = []
     for name, lidar in lidars.items():
         try:
-            ground_m = measure_ground_m(streams[name].read(0), lidar.mount_T_lidar)
+            sweep = streams[name].read(0)
         except RecordError as problem:
             notes.append(f"{name}: {problem}")
             continue
+        ego_T_lidar = lidar.mount_T_lidar
+        points = apply(ego_T_lidar, sweep.xyz_m)
+        radius = np.hypot(points[:, 0] - ego_T_lidar[0, 3], points[:, 1] - ego_T_lidar[1, 3])
+        around = (radius > ROAD_RADIUS_M[0]) & (radius < ROAD_RADIUS_M[1])
+        height = ego_T_lidar[2, 3] - points[:, 2]
+        z = points[around & (height > MIN_SENSOR_HEIGHT_M) & (height < MAX_SENSOR_HEIGHT_M), 2]
+        if len(z) < MIN_ROAD_POINTS:
+            notes.append(f"{name}: {len(z)} points around and below the sensor, too few to find the road")
+            continue
+        counts = np.bincount(np.floor((z - z.min()) / ROAD_BIN_M).astype(np.int64))
+        mode_m = z.min() + (counts.argmax() + 0.5) * ROAD_BIN_M
+        ground_m = float(np.median(z[np.abs(z - mode_m) < 2 * ROAD_BIN_M]))
         side = "below" if ground_m <= 0 else "above"
         notes.append(
             f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "

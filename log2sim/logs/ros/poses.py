@@ -199,11 +199,17 @@ class PoseSources:
         rows, stamps, rotation = rows[valid], stamps[valid], rotation[valid]
         if len(rows) < MIN_POSES:
             raise NoPoses(f"{len(rows)} fixes with an orientation of {imu}")
-        base_T_antenna, note = self._lever_arm(name)
+        antenna = self.bag.frame_id(self.bag.topics[name])
+        base_T_antenna = self.tree.mount(self.base, antenna)
+        if base_T_antenna is None:
+            problems.append(f"{name}: no transform from '{antenna}' to '{self.base}'; the antenna is taken to be there")
+            base_T_antenna = np.eye(4)
         map_frame = map_frame_of(self._local_map(), *(float(v) for v in rows[0]))
-        poses = poses_from_geodetic(map_frame, rows, _roll_pitch_yaw(rotation), where=f"{name}, map.projection")
+        pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
+        angles = np.stack([np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]), pitch, yaw_of(rotation)], axis=1)
+        poses = poses_from_geodetic(map_frame, rows, angles, where=f"{name}, map.projection")
         poses[:, :3, 3] -= (poses[:, :3, :3] @ base_T_antenna[:3, 3:])[..., 0]
-        notes = (*problems, *note, *_course_notes(poses, imu))
+        notes = (*problems, *_course_notes(poses, imu))
         return FoundPoses(stamps, poses, map_frame, "gnss", name, notes)
 
     def _orientations(self, fix: str) -> tuple[str, NDArray[np.int64], Array]:
@@ -228,24 +234,9 @@ class PoseSources:
             reasons.append(f"{name} gives no orientation")
         raise NoPoses("; ".join(reasons) or "there is no Imu that gives the orientation")
 
-    def _lever_arm(self, fix: str) -> tuple[Array, tuple[str, ...]]:
-        frame = self.bag.frame_id(self.bag.topics[fix])
-        base_T_antenna = self.tree.mount(self.base, frame)
-        if base_T_antenna is None:
-            return np.eye(4), (
-                f"{fix}: no transform from '{frame}' to '{self.base}'; the antenna is taken to be there",
-            )
-        return base_T_antenna, ()
-
 
 class _Zero:
     x = y = z = 0.0
-
-
-def _roll_pitch_yaw(map_T_base: Array) -> Array:
-    r = map_T_base
-    pitch = -np.arcsin(np.clip(r[:, 2, 0], -1.0, 1.0))
-    return np.stack([np.arctan2(r[:, 2, 1], r[:, 2, 2]), pitch, np.arctan2(r[:, 1, 0], r[:, 0, 0])], axis=1)
 
 
 def _course_notes(poses: Array, imu: str) -> tuple[str, ...]:

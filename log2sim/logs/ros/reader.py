@@ -13,9 +13,10 @@ from log2sim.datatypes import Lidar, Log, MapFrame, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.files.inputs import require_link_inside
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack, RollingShutter, inverse
+from log2sim.logs.records import FolderReader
 from log2sim.logs.ros import frames as ego
 from log2sim.logs.ros import sensors as calibration
-from log2sim.logs.ros.bag import NAME_BYTES, SUFFIXES, Bag, Topic, find_recordings
+from log2sim.logs.ros.bag import NAME_BYTES, SUFFIXES, Bag, Recording, Topic, find_recordings
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import FrameTree
 from log2sim.logs.ros.messages import (
@@ -35,24 +36,20 @@ from log2sim.logs.ros.sensors import camera_stream, lidar_stream
 MAX_LISTED = 8
 
 
-class RosReader:
+class RosReader(FolderReader):
     """Reader of ROS 1 bags, rosbag2 folders and databases, and MCAP files."""
 
     name = "ros"
     looks_for = "a ROS bag: a .bag, .db3 or .mcap file, a rosbag2 folder with metadata.yaml, or a folder of bags"
     suffixes = SUFFIXES
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the path is a recording or holds some, by names alone."""
-        return bool(find_recordings(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the recordings, sorted."""
-        return sorted(find_recordings(path))
+    def find(self, path: Path) -> dict[str, Recording]:
+        """Find the recordings at a path by name."""
+        return find_recordings(path)
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a recording: its index, the stamps of its messages, its transforms and poses."""
-        recording = find_recordings(path)[sequence]
+        recording = self.find(path)[sequence]
         if path.is_dir():
             for bag in recording.files:
                 require_link_inside(bag, path)

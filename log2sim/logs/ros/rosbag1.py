@@ -10,16 +10,7 @@ import numpy as np
 
 from log2sim.errors import LogError
 from log2sim.logs.records import PARSER_ERRORS
-from log2sim.logs.ros.containers import (
-    Channel,
-    Chunk,
-    ChunkedFile,
-    EntryList,
-    checked_size,
-    normalized_type,
-    one_line,
-    printable,
-)
+from log2sim.logs.ros.containers import Channel, Chunk, ChunkedFile, checked_size, normalized_type, one_line, printable
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES = 1024 * 1024
@@ -56,22 +47,9 @@ class Rosbag1(ChunkedFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.notes: list[str] = []
-        self.channels: list[Channel] = []
-        self._numbers: dict[int, int] = {}
-        self._list = EntryList()
         if self.size < len(MAGIC) or self.at(0, len(MAGIC)) != MAGIC:
             raise LogError(f"{path}: does not begin with '#ROSBAG V2.0'; expected a ROS 1 bag of that version")
-        try:
-            self._read_index()
-        except PARSER_ERRORS as problem:
-            self.channels, self._numbers, self._list, self.chunks = [], {}, EntryList(), []
-            self._scan()
-            self.notes.append(
-                f"{path.name}: its index is missing or damaged ({one_line(problem)}); {self._list.count} messages were found by "
-                "reading it whole"
-            )
-        self.entries = self._list.entries()
+        self.index()
 
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
         """Read message `k`, or its first `limit_bytes`."""
@@ -94,7 +72,7 @@ class Rosbag1(ChunkedFile):
     def _record(self, position: int) -> Record:
         return parse_record(self.at(position, min(FIRST_BYTES, self.size - position)), 0, position, self)
 
-    def _read_index(self) -> None:
+    def _read_index(self) -> bool:
         header = self._record(len(MAGIC))
         position = header.number(b"index_pos", "<Q")
         if not position:
@@ -109,6 +87,7 @@ class Rosbag1(ChunkedFile):
                 raise ValueError(f"record of kind {record.op} in the index, expected {CHUNK_INFO}")
             self._index_chunk(record.number(b"chunk_pos", "<Q"), record.number(b"count"))
             position = record.end
+        return True
 
     def _index_chunk(self, position: int, connections: int) -> None:
         """Read the index of one chunk; a damaged one is left out with a note."""
@@ -149,7 +128,6 @@ class Rosbag1(ChunkedFile):
         self.channels.append(Channel(printable(topic), normalized_type(kind), "ros1", definition))
 
     def _scan(self) -> None:
-        """Find all messages by walking the file, up to where it is cut."""
         position = len(MAGIC)
         while position < self.size:
             try:

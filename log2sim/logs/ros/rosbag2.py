@@ -25,7 +25,6 @@ from log2sim.logs.ros.containers import (
     Chunk,
     ChunkedFile,
     Entries,
-    EntryList,
     checked_size,
     decompress_message,
     normalized_type,
@@ -48,22 +47,8 @@ class Mcap(ChunkedFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.notes: list[str] = []
-        self.channels: list[Channel] = []
-        self._numbers: dict[int, int] = {}
         self._schemas: dict[int, tuple[str, str, str]] = {}
-        self._list = EntryList()
-        if self.size < len(MAGIC) or self.at(0, len(MAGIC)) != MAGIC:
-            raise LogError(f"{path}: does not begin with the magic bytes of MCAP")
-        try:
-            indexed = self._read_summary()
-        except PARSER_ERRORS as problem:
-            indexed = False
-            self.notes.append(f"{path.name}: its index is missing or damaged ({one_line(problem)}); it was read whole")
-        if not indexed:
-            self.channels, self._numbers, self._list, self.chunks = [], {}, EntryList(), []
-            self._scan()
-        self.entries = self._list.entries()
+        self.index()
 
     def message(self, k: int, limit_bytes: int | None = None) -> bytes:
         """Read message `k`, or its first `limit_bytes`."""
@@ -82,8 +67,7 @@ class Mcap(ChunkedFile):
             raise ValueError(f"{len(data)} of {wanted} bytes; the chunk is truncated")
         return data
 
-    def _read_summary(self) -> bool:
-        """Read the summary; False when it does not lead to all messages."""
+    def _read_index(self) -> bool:
         footer = self.at(self.size - FOOTER_BYTES, FOOTER_BYTES)
         if footer[-len(MAGIC) :] != MAGIC or footer[0] != FOOTER:
             raise ValueError("the recording was not closed")
@@ -169,7 +153,6 @@ class Mcap(ChunkedFile):
         return int(start + size)
 
     def _scan(self) -> None:
-        """Find all messages by walking the records, up to where the file is cut."""
         position = len(MAGIC)
         while position + RECORD_HEAD.size <= self.size:
             op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))

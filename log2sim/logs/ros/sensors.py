@@ -60,7 +60,10 @@ def camera_from_info(
             rotation = np.eye(3)
         mount_T_cam = mount_T_cam @ inverse(transform(rotation, np.zeros(3)))
         if stereo:
-            mount_T_cam = mount_T_cam @ inverse(transform(np.eye(3), _offset(P)))
+            # P = K [I | t] with the position t of the second camera of the pair in the frame of both.
+            left = np.triu(P[:, :3])
+            left[2, 2] = 1.0
+            mount_T_cam = mount_T_cam @ inverse(transform(np.eye(3), np.linalg.solve(left, P[:, 3])))
         K = P[:, :3]
     elif not rectified:
         model, distortion = _lens(info)
@@ -70,13 +73,6 @@ def camera_from_info(
     if not (width > 0 and height > 0):
         raise CalibrationProblem(f"its size is {width}x{height} px")
     return Camera(name, width, height, K, mount, mount_T_cam, model, distortion)
-
-
-def _offset(P: Array) -> Array:
-    """Position (3,) of the second camera of a stereo pair in the frame of both: P = K [I | t]."""
-    K = np.triu(P[:, :3])
-    K[2, 2] = 1.0
-    return np.asarray(np.linalg.solve(K, P[:, 3]))
 
 
 def _lens(info: Any) -> tuple[str, tuple[float, ...]]:

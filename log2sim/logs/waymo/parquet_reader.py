@@ -23,6 +23,7 @@ from log2sim.files.inputs import is_present, require_links_inside
 from log2sim.geometry import Array
 from log2sim.logs.arrow import Kind, ParquetRows, Row, read_columns
 from log2sim.logs.excerpt import digest_of
+from log2sim.logs.records import FolderReader
 from log2sim.logs.stamps import MAX_TIME_S
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.range_images import checked, shaped
@@ -157,15 +158,9 @@ def _table(columns: Columns, track: str, kind: str, numbers: list[str], frame_of
     dimensions = len(numbers) // 2
     heading = box[:, -1] if len(numbers) % 2 else np.zeros(len(box))
     track_id = np.array([str(word) for word in columns[track]], dtype=np.str_)
-    table = BoxTable(
-        frame,
-        track_id,
-        columns[kind],
-        box[:, :dimensions],
-        box[:, dimensions : 2 * dimensions],
-        heading,
-        len(box) - len(known),
-    )
+    size = box[:, dimensions : 2 * dimensions]
+    lost = len(box) - len(known)
+    table = BoxTable(frame, track_id, columns[kind], box[:, :dimensions], size, heading, lost)
     return table.take(known)
 
 
@@ -233,37 +228,22 @@ class SensorRows:
         return out
 
 
-def where(component: SensorRows, frame: int, sensor: int) -> str:
-    """Name a record in errors."""
-    return f"{component.path}, row {component.rows.get((frame, sensor), 'none')}"
-
-
-def cell(row: Row | None, name: str) -> Any:
-    """Return a value of a row; None where there is none."""
-    return None if row is None else row.get(name)
-
-
 POSES = "vehicle_pose"
 STATISTICS = ("time_of_day", "location", "weather")
 
 
-class WaymoParquetReader:
+class WaymoParquetReader(FolderReader):
     """Reader of segments of version 2; the root holds a folder for each component."""
 
     name = "waymo-parquet"
     looks_for = "a folder with vehicle_pose/SEGMENT.parquet and further components of the Waymo Open Dataset, version 2"
-    suffixes = ()
 
-    def matches(self, path: Path) -> bool:
-        """Return whether the folder holds vehicle poses of segments."""
-        return bool(self.sequences(path))
-
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the segments, sorted."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the poses of segments at a folder by name."""
         try:
-            return sorted(file.stem for file in (path / POSES).glob("*.parquet") if file.is_file())
+            return {file.stem: file for file in (path / POSES).glob("*.parquet") if file.is_file()}
         except OSError:
-            return []
+            return {}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a segment; no picture, range image or label is read."""
@@ -339,7 +319,7 @@ class _SegmentFolder:
         return rows
 
     def _image(self, frame: int, camera: int) -> bytes:
-        return bytes(cell(self.images.read(frame, camera), f"{IMAGE}.image") or b"")
+        return bytes((self.images.read(frame, camera) or {}).get(f"{IMAGE}.image") or b"")
 
     def _ranges(self, frame: int, laser: int) -> RangeImages:
         row, of_pixels = self.sweeps.read(frame, laser), self.pixel_poses.read(frame, laser)
@@ -347,7 +327,8 @@ class _SegmentFolder:
             returns = [image for name in LIDAR_RETURNS if (image := _image_of(row, name)) is not None]
             return checked(returns, _image_of(of_pixels, PIXEL_POSES))
         except WireError as error:
-            raise RecordError(f"{where(self.sweeps, frame, laser)}: {error}") from None
+            row_number = self.sweeps.rows.get((frame, laser), "none")
+            raise RecordError(f"{self.sweeps.path}, row {row_number}: {error}") from None
 
     def _statistics(self) -> dict[str, str]:
         path = self._path_of("stats")
@@ -368,7 +349,7 @@ _PARTS: dict[str, Kind] = {"values": "floats", "shape": "ints"}
 
 def _image_of(row: Row | None, name: str) -> NDArray[np.float32] | None:
     """Range image (H, W, C) of a row; None where it has none."""
-    values, shape = cell(row, f"{name}.values"), cell(row, f"{name}.shape")
+    values, shape = ((row or {}).get(f"{name}.{part}") for part in ("values", "shape"))
     if values is None or shape is None or not len(np.atleast_1d(values)):
         return None
     return shaped(np.asarray(values), [int(n) for n in np.atleast_1d(shape)])

@@ -9,8 +9,8 @@ images and labels are skipped. The format is that of dataset.proto and label.pro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ from log2sim.logs.waymo.segment import (
     CAMERAS,
     LASERS,
     TOP,
+    BoxRow,
     BoxTable,
     CameraCalibration,
     FrameRow,
@@ -219,10 +220,10 @@ class SegmentLog:
         table = self._in_order(self.segment.boxes())
         return labels_of(table, self.times, self.map_T_vehicle, self.segment.lasers.get(TOP), self.notes)
 
-    def _image_labels(self, cameras: dict[str, Camera], image_ns: dict[int, Stamps]) -> LabelsOnRequest:
+    def _image_labels(self, cameras: dict[str, Camera], image_ns: dict[int, Stamps]) -> Mapping[str, ImageLabels]:
         boxes = self.segment.image_boxes
         if boxes is None:
-            return LabelsOnRequest((), _no_labels)
+            return {}
         number_of = {name: number for number, name in CAMERAS.items()}
 
         def read(name: str) -> ImageLabels:
@@ -278,22 +279,14 @@ class SegmentLog:
 
 def camera_of(name: str, calibration: CameraCalibration, frames: list[FrameRow], number: int) -> Camera:
     """Make a camera with OpenCV's axes; the readout is the median of its images in `frames`."""
-    f_u, f_v, c_u, c_v, k1, k2, p1, p2, k3 = (float(v) for v in calibration.intrinsic)
+    f_u, f_v, c_u, c_v, *lens = (float(v) for v in calibration.intrinsic)
     spans = [frame.images[number].readout_s() for frame in frames]
     known = [s for s in spans if s is not None]
     direction: Any = DIRECTIONS.get(calibration.direction)
     shutter = RollingShutter(direction, float(np.median(known))) if direction is not None and known else None
-    return Camera(
-        name,
-        calibration.width_px,
-        calibration.height_px,
-        np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]]),
-        "ego",
-        calibration.vehicle_T_camera @ CAMERA_T_OPENCV,
-        "brown",
-        (k1, k2, p1, p2, k3),
-        shutter,
-    )
+    K = np.array([[f_u, 0.0, c_u], [0.0, f_v, c_v], [0.0, 0.0, 1.0]])
+    ego_T_cam = calibration.vehicle_T_camera @ CAMERA_T_OPENCV
+    return Camera(name, calibration.width_px, calibration.height_px, K, "ego", ego_T_cam, "brown", tuple(lens), shutter)
 
 
 def ego_vehicle_of(lasers: Mapping[int, LaserCalibration]) -> EgoVehicle:
@@ -307,15 +300,7 @@ def ego_vehicle_of(lasers: Mapping[int, LaserCalibration]) -> EgoVehicle:
     return EgoVehicle((front_m - rear_m, *PACIFICA.size_m[1:]), (front_m + rear_m) / 2)
 
 
-def _no_labels(camera: str) -> ImageLabels:
-    raise KeyError(camera)
-
-
 SUFFIX = ".tfrecord"
-
-# Frame, id, type and numbers of a box.
-LabelRow = tuple[int, str, int, list[float]]
-Calibration = tuple[dict[int, CameraCalibration], dict[int, LaserCalibration], dict[str, str]]
 
 
 class WaymoReader:
@@ -360,157 +345,114 @@ def _may_be_segment(file: Path, root: Path) -> bool:
     return starts_like_tfrecord(file)
 
 
-@dataclass(eq=False)
-class _Frames:
-    """Usable frames of a file: number of the record and index of each, why others are not, and what all share."""
-
-    record: list[int] = field(default_factory=list)
-    index: list[FrameIndex] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    context: bytes = b""
-    name: str = ""
-    calibration: Calibration = field(default_factory=lambda: ({}, {}, {}))
-
-
 class _SegmentFile:
     def __init__(self, path: Path) -> None:
         self.path, self.file = path, RecordFile(path)
+        # Usable frames: number of the record and index of each.
+        self.record, self.index = list[int](), list[FrameIndex]()
+        self.boxes_by_camera: dict[int, list[BoxRow]] | None = None
 
     def log(self) -> Log:
-        self.frames = frames = self._read_frames()
-        notes = [*self.file.notes]
-        if frames.left_out:
-            notes.append(f"{len(frames.left_out)} of {len(self.file.spans)} records left out; {frames.left_out[0]}")
-        if not frames.index:
-            raise LogError(f"{self.path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
-        index, (cameras, lasers, stats) = frames.index, frames.calibration
-        self.projected = any(f.projected_labels for f in index)
-        self.boxes_by_camera: dict[int, list[LabelRow]] | None = None
-        zones = sum(f.no_label_zones > 0 for f in index)
-        if zones:
-            notes.append(f"{zones} of {len(index)} frames have zones in which objects are not labeled")
-        segment = Segment(
-            name=frames.name,
-            path=self.path,
-            cameras=cameras,
-            lasers=lasers,
-            frames=[_row(f) for f in index],
-            image=self._image,
-            ranges=self._ranges,
-            boxes=self._boxes if any(f.labels for f in index) else None,
-            image_boxes=self._image_boxes if any(f.projected_labels or f.camera_labels for f in index) else None,
-            image_boxes_are_projected=self.projected,
-            where=self._where,
-            details={**stats, "frames": len(index)},
-            notes=notes,
-        )
-        records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(frames.record, index)]
-        return SegmentLog(segment).log(READER.name, digest_of([frames.name, frames.context.hex(), *records], []))
-
-    def _read_frames(self) -> _Frames:
-        """Read the index of every frame of the segment to which the first one belongs."""
-        out = _Frames()
+        """Read the index of every frame of the segment to which the first one belongs, and make a log of them."""
+        name, context, left_out = "", b"", list[str]()
+        cameras, lasers, stats = read_calibration(context)
         for k in range(len(self.file.spans)):
             try:
                 with self.file.window(k) as window:
                     index = read_index(window)
-                    name = segment_name(window, index.context)
-                    if not out.index:
-                        out.context, out.name = take_index(window, index.context), name
-                        out.calibration = read_calibration(out.context)
+                    own = segment_name(window, index.context)
+                    if not self.index:
+                        name, context = own, take_index(window, index.context)
+                        cameras, lasers, stats = read_calibration(context)
             except (WireError, OSError) as error:
-                out.left_out.append(f"record {k}: not a readable frame: {error}")
+                left_out.append(f"record {k}: not a readable frame: {error}")
                 continue
-            problem = _problem(index, name, out.name)
-            if problem:
-                out.left_out.append(f"record {k}: {problem}")
-                continue
-            out.record.append(k)
-            out.index.append(index)
-        return out
+            if index.stamp_us is None or not 0 < index.stamp_us < MAX_TIME_S * 10**6:
+                left_out.append(f"record {k}: timestamp_micros is {index.stamp_us}, expected microseconds since 1970")
+            elif index.pose is None:
+                left_out.append(f"record {k}: no rigid pose")
+            elif own != name:
+                left_out.append(
+                    f"record {k}: of segment '{own}', the file's first frame is of '{name}'; expected one segment a file"
+                )
+            else:
+                self.record.append(k)
+                self.index.append(index)
+        notes, index_of = [*self.file.notes], self.index
+        if left_out:
+            notes.append(f"{len(left_out)} of {len(self.file.spans)} records left out; {left_out[0]}")
+        if not index_of:
+            raise LogError(f"{self.path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
+        self.projected = any(f.projected_labels for f in index_of)
+        zones = sum(f.no_label_zones > 0 for f in index_of)
+        if zones:
+            notes.append(f"{zones} of {len(index_of)} frames have zones in which objects are not labeled")
+        frames = []
+        for f in index_of:
+            assert f.stamp_us is not None
+            assert f.pose is not None
+            images = {number: times for number, (times, _) in f.images.items() if number in CAMERAS}
+            frames.append(FrameRow(f.stamp_us * 1000, f.pose, images, tuple(f.lasers)))
+        segment = Segment(
+            name=name,
+            path=self.path,
+            cameras=cameras,
+            lasers=lasers,
+            frames=frames,
+            image=self._image,
+            ranges=self._ranges,
+            boxes=self._boxes if any(f.labels for f in index_of) else None,
+            image_boxes=self._image_boxes if any(f.projected_labels or f.camera_labels for f in index_of) else None,
+            image_boxes_are_projected=self.projected,
+            where=self._where,
+            details={**stats, "frames": len(index_of)},
+            notes=notes,
+        )
+        records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(self.record, index_of)]
+        return SegmentLog(segment).log(READER.name, digest_of([name, context.hex(), *records], []))
 
     def _where(self, frame: int) -> str:
-        return f"{self.path}: record {self.frames.record[frame]}"
+        return f"{self.path}: record {self.record[frame]}"
 
-    def _data(self, frame: int) -> bytes:
-        stamp = self.frames.index[frame].stamp_us
-        return self.file.read(self.frames.record[frame], f"record {self.frames.record[frame]}, stamp {stamp} us")
+    def _data(self, frame: int, span: Span) -> bytes:
+        k, stamp_us = self.record[frame], self.index[frame].stamp_us
+        return self.file.read(k, f"record {k}, stamp {stamp_us} us")[slice(*span)]
 
     def _image(self, frame: int, camera: int) -> bytes:
-        _, (begin, end) = self.frames.index[frame].images[camera]
-        return self._data(frame)[begin:end]
+        return self._data(frame, self.index[frame].images[camera][1])
 
     def _ranges(self, frame: int, laser: int) -> RangeImages:
-        begin, end = self.frames.index[frame].lasers[laser]
-        data = self._data(frame)[begin:end]
+        data = self._data(frame, self.index[frame].lasers[laser])
         try:
             return read_range_images(data)
         except WireError as error:
             raise RecordError(f"{self._where(frame)}, LiDAR {laser}: {error}") from None
 
     def _boxes(self) -> BoxTable:
-        rows, lost = list[LabelRow](), 0
-        for frame, data in self._messages(lambda index: index.labels):
-            try:
-                if data is None:
-                    raise WireError("too large")
-                box = read_box(data, 3)
-            except WireError:
-                lost += 1
-                continue
-            rows += [] if box is None else [(frame, *box)]
-        return BoxTable.of(rows, 3, lost)
+        found, lost = self._read_all(lambda index: index.labels, lambda data: read_box(data, 3))
+        return BoxTable.of([(frame, *box) for frame, box in found if box is not None], 3, lost)
 
     def _image_boxes(self, camera: int) -> BoxTable:
         if self.boxes_by_camera is None:
-            self.boxes_by_camera, self.lost_boxes = self._boxes_of_cameras()
+            spans = (lambda f: f.projected_labels) if self.projected else (lambda f: f.camera_labels)
+            found, self.lost_boxes = self._read_all(spans, read_camera_labels)
+            self.boxes_by_camera = {}
+            for frame, (number, boxes) in found:
+                self.boxes_by_camera.setdefault(number, []).extend((frame, *box) for box in boxes)
         # To which camera a message belonged that cannot be read is not known: all of them report the first one.
         lost, self.lost_boxes = self.lost_boxes, 0
         return BoxTable.of(self.boxes_by_camera.get(camera, []), 2, lost)
 
-    def _boxes_of_cameras(self) -> tuple[dict[int, list[LabelRow]], int]:
-        """Read the labels of all images, by camera, and count the messages that cannot be read."""
-        out: dict[int, list[LabelRow]] = {}
-        lost = 0
-        spans = (lambda index: index.projected_labels) if self.projected else (lambda index: index.camera_labels)
-        for frame, data in self._messages(spans):
-            try:
-                if data is None:
-                    raise WireError("too large")
-                number, boxes = read_camera_labels(data)
-            except WireError:
-                lost += 1
-                continue
-            out.setdefault(number, []).extend((frame, *box) for box in boxes)
-        return out, lost
-
-    def _messages(self, spans: Callable[[FrameIndex], list[Span]]) -> Iterator[tuple[int, bytes | None]]:
-        """Yield frame and bytes of messages of all frames; None for those that are too large."""
-        for k, (record, index) in enumerate(zip(self.frames.record, self.frames.index)):
-            with self.file.window(record) as window:
+    def _read_all(
+        self, spans: Callable[[FrameIndex], list[Span]], parse: Callable[[bytes], Any]
+    ) -> tuple[list[tuple[int, Any]], int]:
+        """Parse messages of all frames: frame and content of each, and how many cannot be read."""
+        out, lost = list[tuple[int, Any]](), 0
+        for frame, (k, index) in enumerate(zip(self.record, self.index)):
+            with self.file.window(k) as window:
                 for span in spans(index):
                     try:
-                        data = take_index(window, span)
+                        out.append((frame, parse(take_index(window, span))))
                     except WireError:
-                        yield k, None
-                        continue
-                    yield k, data
-
-
-def _row(index: FrameIndex) -> FrameRow:
-    # `_problem` keeps others out.
-    assert index.stamp_us is not None
-    assert index.pose is not None
-    images = {number: times for number, (times, _) in index.images.items() if number in CAMERAS}
-    return FrameRow(index.stamp_us * 1000, index.pose, images, tuple(index.lasers))
-
-
-def _problem(index: FrameIndex, name: str, expected: str) -> str:
-    """Why a frame cannot be used; empty when it can."""
-    if index.stamp_us is None or not 0 < index.stamp_us < MAX_TIME_S * 10**6:
-        return f"timestamp_micros is {index.stamp_us}, expected microseconds since 1970"
-    if index.pose is None:
-        return "no rigid pose"
-    if name != expected:
-        return f"of segment '{name}', the file's first frame is of '{expected}'; expected one segment a file"
-    return ""
+                        lost += 1
+        return out, lost

@@ -6,7 +6,7 @@ Letters in shapes: F frames, I images, B boxes, H rows and W columns of a range 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,10 @@ class RangeImages:
     poses: NDArray[np.float32] | None
 
 
+BoxRow = tuple[int, str, int, list[float]]
+"""Frame, id, type, and the numbers of a box: center, size, heading."""
+
+
 @dataclass(frozen=True, eq=False)
 class BoxTable:
     """Labeled boxes, in 3D in the vehicle's frame or upright in an image."""
@@ -121,8 +125,8 @@ class BoxTable:
     lost: int = 0  # further boxes, which cannot be read or are of no frame
 
     @classmethod
-    def of(cls, rows: list[tuple[int, str, int, Any]], dimensions: int, lost: int) -> BoxTable:
-        """Build the table of rows of frame, id, type and box, (2 dimensions + 1,) numbers: center, size, heading."""
+    def of(cls, rows: list[BoxRow], dimensions: int, lost: int) -> BoxTable:
+        """Build the table of rows."""
         box = np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 2 * dimensions + 1)
         return cls(
             np.array([row[0] for row in rows], dtype=np.int64),
@@ -136,15 +140,7 @@ class BoxTable:
 
     def take(self, rows: NDArray[Any]) -> BoxTable:
         """Return some of the rows."""
-        return BoxTable(
-            self.frame[rows],
-            self.track_id[rows],
-            self.kind[rows],
-            self.center[rows],
-            self.size[rows],
-            self.heading_rad[rows],
-            self.lost,
-        )
+        return replace(self, **{name: column[rows] for name, column in vars(self).items() if name != "lost"})
 
 
 @dataclass(frozen=True, eq=False)
