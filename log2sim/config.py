@@ -214,7 +214,8 @@ class TrackConfig(Section):
     )
     quarantine_confidence: float = setting(
         0.25,
-        "Agents of a lower confidence stay in the file, but are left out of replays and exports. Of agents at 0.25 three of four are wrong.",
+        "Agents of a lower confidence stay in the file, but are left out of replays and exports. Of agents at 0.25 three of four are "
+        "wrong. Without a LiDAR most are placed wrong, which is no reason to lose them: half of it counts.",
         ge=0.0,
         le=1.0,
     )

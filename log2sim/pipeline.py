@@ -137,7 +137,8 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in judged]
         if config.track.static_for_all:
             agents = extend_static(agents, ego, observations.obstacles, timeline)
-        agents = [replace(a, quarantined=a.confidence < config.track.quarantine_confidence) for a in agents]
+        least = config.track.quarantine_confidence / (1 if log.lidars else 2)
+        agents = [replace(a, quarantined=a.confidence < least) for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
 

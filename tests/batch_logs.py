@@ -16,8 +16,6 @@ import signal
 import time
 from pathlib import Path
 
-from plain_settings import AGENTS_ONLY
-
 from log2sim.logs.native.reader import READER as NATIVE
 
 

@@ -15,7 +15,7 @@ import log2sim.pipeline
 from log2sim.config import Config
 from log2sim.datatypes import ImageLabels, Lidar, Log, Measurements, Stream, Sweep
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.homography import estimate
+from log2sim.perception.homography import estimate, pitch_roll
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.pipeline import reconstruct
@@ -127,7 +127,7 @@ def test_a_pitching_vehicle_places_far_cars_as_well_as_one_that_does_not_pitch(m
     assert movement["per_tick"]
     assert movement["pitch_sigma_deg"] == pytest.approx(0.1, rel=0.2)
     with monkeypatch.context() as patch:
-        patch.setattr(estimate, "MIN_SIGNIFICANCE_SIGMA", np.inf)
+        patch.setattr(pitch_roll, "MIN_SIGNIFICANCE_SIGMA", np.inf)
         fixed = outcome(log, patch)
     assert (stabilized.scatter_m < 1.15 * still.scatter_m).all()
     assert (fixed.scatter_m > 3 * still.scatter_m).all()
