@@ -92,15 +92,17 @@ def start(site: Path, interruptible: None) -> Iterator[Start]:
 def test_workers_that_die_lose_no_log_but_the_one_that_kills_them(
     tiny_folder: Path, tmp_path: Path, start: Start
 ) -> None:
-    root, out = lay_out_logs(tmp_path / "root", tiny_folder, *"ab"), tmp_path / "out"
-    tell(root / "y-killed-once", "die-once", tiny_folder)
-    tell(root / "z-killer", "die", tiny_folder)
+    root, out = tmp_path / "root", tmp_path / "out"
+    for name, word in {"a": "wait", "b": "wait", "y-killed-once": "die-once", "z-killer": "die"}.items():
+        tell(root / name, word, tiny_folder)
     process = start(root, out)
-    wait_until(lambda: any(out.glob("logs/[ab]/row.json")), process)
+    wait_until(lambda: all((root / name / "opened").exists() for name in "ab"), process)
     workers = workers_of(process)
     assert len(workers) == 2
     assert listening_addresses([process.pid, *workers]) == {"127.0.0.1"}
     os.kill(workers[0], signal.SIGKILL)
+    for name in "ab":
+        (root / name / "go").touch()
     _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 7, errors
     assert "Traceback" not in errors
