@@ -308,4 +308,9 @@ def main(arguments: list[str] | None = None) -> None:
         say(f"{path.stem}: {len(agents)} candidates")
     report(agents)
     seeds = ", ".join(sorted({path.stem.split("-")[0] for path in paths}))
-    print(module_text(f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --logs {len(paths)} --seed {seeds}", agents))
+    print(
+        module_text(
+            f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --logs {len(paths)} --seed {seeds}",
+            agents,
+        )
+    )
