@@ -128,12 +128,13 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         tracks = track_ends(by_end, schedule.t_ns, config.track)
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
-        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
+        smooth = config.smooth.enabled
+        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=smooth, jobs=run.jobs)
         candidates = decide_headings(candidates, ego_path(log, schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with clock.stage("judge", run.progress):
         searched = schedule.drop_frames(observations.unseen)
-        judged = judge(candidates, ego, Recording(log, searched, observations.obstacles, timeline))
+        judged = judge(candidates, ego, Recording(log, searched, observations.obstacles, timeline), jobs=run.jobs)
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in judged]
         if config.track.static_for_all:
             agents = extend_static(agents, ego, observations.obstacles, timeline)
@@ -145,6 +146,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
     everyone = agents if ego is None else [ego, *agents]
     scenario = draft_scenario(run, observations, homographies, everyone)
     described = describe(
-        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, clock=clock, progress=run.progress
+        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, jobs=run.jobs, clock=clock,
+        progress=run.progress,
     )  # fmt: skip
     return conclude(run, observations, by_end, homographies, described)
