@@ -80,16 +80,20 @@ def start(
 ) -> Run:
     """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
+    asked, jobs = (
+        jobs,
+        jobs or (default_jobs() if given.images is given.sweeps else 1),
+    )  # both None: of log2sim or plug-ins
     clock, progress = StageClock(), progress or (lambda *_: None)
     with clock.stage("poses"):
         log, poses = localize(log, given.config, progress=progress)
     config = choose_detector(log, given.config)
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
-        log, faults = check_calibration(log, config, sensors, progress=progress)
+        log, faults = check_calibration(log, config, sensors, jobs=jobs, progress=progress)
         sensors = sensors.without([fault.subject for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
-        poses = refine_for_map(log, poses, faults)
+        poses = refine_for_map(log, poses, faults, jobs)
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.subject for fault in road.faults if fault.treatment == "left_out"])
@@ -100,7 +104,7 @@ def start(
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
     faults = (*list_faults(log, poses.stretches, *schedule.t_ns[[0, -1]].tolist()), *faults, *road.faults)
-    jobs = jobs or (default_jobs() if detectors.own else 1)
+    jobs = jobs if asked or detectors.own else 1
     return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
 
 
