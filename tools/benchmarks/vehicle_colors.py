@@ -3,7 +3,7 @@
     python tools/bench.py vehicle_colors FOLDER [--detector NAME_OR_FILE.onnx]
 
 Labels that are not among the names of `log2sim.datatypes.COLOR_NAMES` are merged with the next one: silver and gray are one,
-pink is red. Nothing is learned from the photos.
+pink is red. Without a box the vehicle is taken to fill the photo but for its context. Nothing is learned from the photos.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import COLOR_NAMES, Frame, Log
 from log2sim.files.inputs import read_bytes
 from log2sim.geometry import Camera
-from log2sim.road.color_picture import PictureColor, color_of_picture
+from log2sim.road.color_network import CONTEXT, crop, shipped_network
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 MERGED = {"silver": "gray", "grey": "gray", "pink": "red", "magenta": "red", "purple": "blue", "cyan": "blue", "beige": "brown",
@@ -45,8 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     second, begin = 0, time.perf_counter()
     for label, path in photos(options.folder):
         image = cv2.imdecode(np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8), cv2.IMREAD_COLOR)
-        found = None if image is None else color_of_picture(image, box_of(image, detector))
-        order = ["none", "none"] if found is None else ranked(found)
+        order = ["none", "none"] if image is None else ranked(probabilities(image, box_of(image, detector)))
         confusion[label, order[0]] += 1
         second += label in order[:2]
     count = sum(confusion.values())
@@ -70,11 +69,19 @@ def photos(folder: Path) -> Iterator[tuple[str, Path]]:
             yield from ((label, path) for path in sorted(inner.iterdir()) if path.suffix.lower() in SUFFIXES)
 
 
-def ranked(found: PictureColor) -> list[str]:
+def probabilities(image: NDArray[np.uint8], box: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """Return how probable each of `COLOR_NAMES` is for the vehicle in a photo."""
+    if box is None:
+        size = np.array(image.shape[1::-1], float)
+        box = np.concatenate([size * (1 - 1 / CONTEXT) / 2, size * (1 + 1 / CONTEXT) / 2])
+    return shipped_network().probabilities([crop(image, box)])
+
+
+def ranked(probability: NDArray[np.float64]) -> list[str]:
     """Return the merged names by their probability."""
     total: Counter[str] = Counter()
-    for name, probability in zip(COLOR_NAMES, found.probability):
-        total[MERGED.get(name, name)] += float(probability)
+    for name, share in zip(COLOR_NAMES, probability):
+        total[MERGED.get(name, name)] += float(share)
     return [name for name, _ in total.most_common()]
 
 
