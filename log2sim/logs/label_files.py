@@ -23,7 +23,7 @@ from log2sim.logs.checks import find_possible
 from log2sim.logs.kitti import labels as kitti
 from log2sim.logs.native.reader import BOX_3D_COLUMNS, BOX_3D_OPTIONAL, boxes_3d, read_csv_table
 from log2sim.logs.nuscenes import scene as nuscenes
-from log2sim.logs.stamps import count_words, note_damaged_rows
+from log2sim.logs.stamps import count_words
 
 EXPECTED = (
     "lines of KITTI's tracking labels, JSON of nuScenes (sample_annotation or results) or OpenLABEL, or a CSV table with the "
@@ -132,11 +132,8 @@ def _kitti_labels(log: Log, path: Path, notes: list[str]) -> tuple[Labels, dict[
     camera, stamps = _reference(log, path)
     if camera not in log.cameras:
         raise LogError(f"{path}: KITTI's boxes are in the frame of a camera, and {log.name} has none")
-    damaged: list[str] = []
-    rows = kitti.parse_labels(
-        read_file(path, JSON_LIMIT_BYTES, LogError).decode("utf-8", errors="replace"), path, damaged
-    )
-    note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
+    text = read_file(path, JSON_LIMIT_BYTES, LogError).decode("utf-8", errors="replace")
+    rows = kitti.parse_labels_noting(text, path, notes)
     inside = rows.frame < len(stamps)
     if not inside.all():
         notes.append(f"{int((~inside).sum())} labels left out: of frames after the last of '{camera}'")
