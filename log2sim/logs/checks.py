@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Log
-from log2sim.geometry import NS_PER_S, Camera, fold_radius, nearest_index, undistort
+from log2sim.geometry import NS_PER_S, Camera, Mount, fold_radius, nearest_index, undistort
+from log2sim.geometry.transforms import Array
 from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of, take_labels
 from log2sim.logs.records import MAX_POSITION_M
 
@@ -79,8 +80,6 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
         where = f"{place}, camera '{name}'"
         yield from _pinhole(camera, where)
         yield from _distortion(camera, where)
-        yield from _pinhole(camera, where)
-        yield from _distortion(camera, where)
         mount, mount_T_sensor = camera.mount, camera.mount_T_cam
     elif name in log.lidars:
         where, mount = f"{place}, LiDAR '{name}'", log.lidars[name].mount
@@ -138,6 +137,8 @@ def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
             f"{100 * share:.0f} % of the pixels have no ray; check the order and signs of the coefficients",
             share > MAX_USABLE_FOLDED_SHARE,
         )
+
+
 
 
 # Streams of a second that has no record of another may still belong together: a log may hold one frame and one sweep.
