@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Log
-from log2sim.geometry import NS_PER_S, Camera, Mount, fold_radius, nearest_index, undistort
-from log2sim.geometry.transforms import Array
+from log2sim.geometry import NS_PER_S, Camera, fold_radius, nearest_index, undistort
 from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of, take_labels
 from log2sim.logs.records import MAX_POSITION_M
 
@@ -137,8 +136,6 @@ def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
             f"{100 * share:.0f} % of the pixels have no ray; check the order and signs of the coefficients",
             share > MAX_USABLE_FOLDED_SHARE,
         )
-
-
 
 
 # Streams of a second that has no record of another may still belong together: a log may hold one frame and one sweep.
