@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -80,16 +81,16 @@ def start(
 ) -> Run:
     """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
-    clock, progress = StageClock(), progress or (lambda *_: None)
+    clock, progress, usable = StageClock(), progress or (lambda *_: None), jobs or default_jobs()
     with clock.stage("poses"):
         log, poses = localize(log, given.config, progress=progress)
     config = choose_detector(log, given.config)
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
-        log, faults = check_calibration(log, config, sensors, progress=progress)
+        log, faults = check_calibration(log, config, sensors, jobs=usable, progress=progress)
         sensors = sensors.without([fault.subject for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
-        poses = refine_for_map(log, poses, faults)
+        poses = refine_for_map(log, poses, faults, usable)
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.subject for fault in road.faults if fault.treatment == "left_out"])
@@ -100,17 +101,16 @@ def start(
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
     faults = (*list_faults(log, poses.stretches, *schedule.t_ns[[0, -1]].tolist()), *faults, *road.faults)
-    jobs = jobs or (default_jobs() if detectors.own else 1)
+    jobs = usable if jobs or detectors.own else 1
     return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
 
 
 def observe_log(run: Run) -> Observations:
     """Detect and measure, tick by tick."""
-    stage = "detect and measure"
-    run.progress(stage, 0, len(run.schedule))
+    progress = partial(run.progress, "detect and measure")
+    progress(0, len(run.schedule))
     return observe(
-        run.log, run.schedule, run.plan, detectors=run.detectors, config=run.config, clock=run.clock,
-        progress=lambda done, total: run.progress(stage, done, total), jobs=run.jobs,
+        run.log, run.schedule, run.plan, detectors=run.detectors, config=run.config, clock=run.clock, progress=progress, jobs=run.jobs
     )  # fmt: skip
 
 
@@ -119,8 +119,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
     log, config, plan, schedule, clock = run.log, run.config, run.plan, run.schedule, run.clock
     timeline = Timeline(schedule.t_ns, int(schedule.t_ns[0]))
     with clock.stage("topdown"):
-        rng = np.random.default_rng(config.seed)
-        homographies = fit_homographies(log, observations, plan, config.topdown, rng=rng)
+        homographies = fit_homographies(log, observations, plan, config.topdown, rng=np.random.default_rng(config.seed))
         placed = place_by_homography(log, observations, homographies)
     with clock.stage("fuse"):
         by_end = fuse_by_end(placed, plan)
@@ -128,23 +127,24 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         tracks = track_ends(by_end, schedule.t_ns, config.track)
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
-        candidates = estimate_agents(tracks, observations.obstacles, timeline, smooth=config.smooth.enabled)
+        obstacles = observations.obstacles
+        candidates = estimate_agents(tracks, obstacles, timeline, smooth=config.smooth.enabled, jobs=run.jobs)
         candidates = decide_headings(candidates, ego_path(log, schedule), timeline)
         ego = ego_agent(log, timeline, run.poses.origin)
     with clock.stage("judge", run.progress):
         searched = schedule.drop_frames(observations.unseen)
-        judged = judge(candidates, ego, Recording(log, searched, observations.obstacles, timeline))
+        judged = judge(candidates, ego, Recording(log, searched, obstacles, timeline), jobs=run.jobs)
         agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in judged]
         if config.track.static_for_all:
-            agents = extend_static(agents, ego, observations.obstacles, timeline)
+            agents = extend_static(agents, ego, obstacles, timeline)
         least = config.track.quarantine_confidence / (1 if log.lidars else 2)
         agents = [replace(a, quarantined=a.confidence < least) for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         agents = simplify(agents) if ego is not None else agents
 
-    everyone = agents if ego is None else [ego, *agents]
-    scenario = draft_scenario(run, observations, homographies, everyone)
+    scenario = draft_scenario(run, observations, homographies, agents if ego is None else [ego, *agents])
     described = describe(
-        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, clock=clock, progress=run.progress
+        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, jobs=run.jobs, clock=clock,
+        progress=run.progress,
     )  # fmt: skip
     return conclude(run, observations, by_end, homographies, described)

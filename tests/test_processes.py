@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from worlds import tiny_log
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, PluginError, RecordError
-from log2sim.files.processes import map_in_processes
+from log2sim.files.processes import in_background, map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.perception import first_pass
 from log2sim.perception.first_pass import Observations, observe
@@ -86,10 +87,12 @@ def test_records_that_repeat_are_told_alike_by_any_number_of_processes(
 
 
 @pytest.mark.matrix
-@pytest.mark.parametrize("detector", ["lidar:vehicle", "labels+lidar:vehicle"])
-def test_scenarios_of_any_number_of_processes_are_the_same(detector: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("detector", "settings"), [("lidar:vehicle", AGENTS_ALONE), ("labels+lidar:vehicle", {})])
+def test_scenarios_of_any_number_of_processes_are_the_same(
+    detector: str, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(first_pass, "PART_TICKS", 2)
-    config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector}, **AGENTS_ALONE)
+    config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector}, **settings)
     made = [reconstruct(tiny_log()[0], config, jobs=jobs) for jobs in (1, 3)]
     assert len({json.dumps(result.scenario.to_dict(), sort_keys=True) for result in made}) == 1
     assert len({str(result.report["detections"]) for result in made}) == 1
@@ -145,6 +148,22 @@ def test_errors_come_back_as_what_they_are_and_no_process_is_left() -> None:
 def test_a_process_that_dies_is_an_error_and_no_endless_wait() -> None:
     with pytest.raises(Log2SimError, match="a process of this run ended"):
         list(map_in_processes(lambda k: os.kill(os.getpid(), signal.SIGKILL), range(4), 2))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_is_done_in_the_background_comes_back_with_its_error_and_leaves_no_process(jobs: int) -> None:
+    with in_background(lambda: os.getpid(), jobs) as result:
+        process = result()
+    assert (process == os.getpid()) == (jobs == 1)
+    with pytest.raises(PluginError, match="broken"), in_background(lambda: broken("broken"), jobs) as result:
+        result()
+    with pytest.raises(KeyError), in_background(lambda: time.sleep(60), jobs):
+        raise KeyError  # left before it is done
+    assert multiprocessing.active_children() == []
+
+
+def broken(reason: str) -> None:
+    raise PluginError(reason)
 
 
 @pytest.mark.usefixtures("interruptible")

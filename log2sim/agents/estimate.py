@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,13 @@ from log2sim.datatypes import (
     STANDSTILL_MPS,
     Agent,
     Log,
+    Measurements,
     Obstacles,
     Span,
     Track,
     Waypoints,
 )
+from log2sim.files.processes import map_in_processes, split_evenly
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, undistort, yaw_of
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.records import RecordSource
@@ -41,14 +44,30 @@ def estimate_agents(
     timeline: Timeline,
     *,
     smooth: bool,
+    jobs: int = 1,
 ) -> list[AgentCandidate]:
     """Make a candidate of every object that the tracks show, moving ones first.
 
-    `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed.
+    `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed. `jobs`: processes that
+    share the tracks; the result is the same for any number.
     """
-    parts = [part for track in tracks for part in explain_track(track)]
-    candidates = [moving_candidate(p.track, obstacles, timeline, smooth=smooth) for p in parts if not p.static]
-    return candidates + static_candidates([p for p in parts if p.static], obstacles, timeline)
+
+    def estimate(numbers: Sequence[int]) -> list[tuple[int, AgentCandidate]]:
+        """Make the candidates of some tracks, with the number of each one's track; its measurements stay in this process."""
+        parts = [(k, part) for k in numbers for part in explain_track(tracks[k])]
+        moving = [(k, moving_candidate(p.track, obstacles, timeline, smooth=smooth)) for k, p in parts if not p.static]
+        standing = static_candidates([p for _, p in parts if p.static], obstacles, timeline)
+        found = [*moving, *zip((k for k, p in parts if p.static), standing)]
+        return [(k, replace(c, track=replace(c.track, measurements=Measurements.empty()))) for k, c in found]
+
+    shares = split_evenly(range(len(tracks)), jobs)
+    found = list(chain.from_iterable(map_in_processes(estimate, shares, jobs)))
+    candidates = []
+    for k, candidate in sorted(found, key=lambda of: (of[1].agent.static, of[0])):
+        rows = np.searchsorted(tracks[k].tick, candidate.track.tick)
+        track = replace(candidate.track, measurements=tracks[k].measurements.take(rows))
+        candidates.append(replace(candidate, track=track))
+    return candidates
 
 
 # Standard deviations of ego positions and yaws from GNSS/INS with RTK or LiDAR odometry.

@@ -26,6 +26,7 @@ from log2sim.datatypes import (
     Track,
 )
 from log2sim.datatypes.log_odds import log_odds_of
+from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
 from log2sim.perception.boxes import LIMIT_SIGMAS
 from log2sim.perception.lidar.measure import logit
@@ -90,13 +91,15 @@ SIGNS = {
 Table = dict[str, Array]
 
 
-def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
-    """Gather the evidence for and against each of C candidates."""
+def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int = 1) -> Table:
+    """Gather the evidence for and against each of C candidates, which so many processes share."""
     if not candidates:
         return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
     rows = [_own_columns(c, recording.timeline) for c in candidates]
-    most = max(MAX_CELLS // max(len(recording.clouds), 1), 1)
-    parts = [_sensed_columns(candidates[k : k + most], recording) for k in range(0, len(rows), most)]
+    most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(rows) // jobs)) or 1
+    shares = [candidates[k : k + most] for k in range(0, len(rows), most)]
+    columns = map_in_processes(lambda k: _sensed_columns(shares[k], recording), range(len(shares)), jobs)
+    parts = list(columns)
     table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     table["no_image"] *= table["no_image"].min() == 0

@@ -25,7 +25,9 @@ DOUBT_NATS = 1.0
 MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
 
 
-def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording) -> list[AgentCandidate]:
+def judge(
+    candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording, *, jobs: int = 1
+) -> list[AgentCandidate]:
     """Keep the candidates that are there and can be true together, each named, with its confidence and what speaks against it.
 
     Parameters
@@ -34,9 +36,11 @@ def judge(candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Re
         Of all tracks.
     ego : Agent, optional
         At its place there is no other agent.
+    jobs : int
+        Processes that share the candidates; the result is the same for any number.
     """
     t_s, lidar = recording.t_s, bool(recording.log.lidars)
-    table = gather(candidates, recording)
+    table = gather(candidates, recording, jobs)
     there, right = probabilities(table, lidar=lidar)
     kept = [
         _rated(c.doubted(doubts), float(right[k]), recording.timeline)

@@ -10,7 +10,8 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -67,10 +68,39 @@ def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: i
                 assert isinstance(ready, Connection)
                 done[running.pop(ready)] = _receive(ready, workers[ready])
     finally:
-        for connection, process in workers.items():
-            process.kill()
-            process.join()
-            connection.close()
+        _end(workers)
+
+
+def split_evenly(items: Sequence[Task], jobs: int) -> list[Sequence[Task]]:
+    """Split a sequence into as many parts as there are processes, which take turns with its items, or fewer; none is empty."""
+    return [items[k::jobs] for k in range(min(jobs, len(items)))]
+
+
+@contextmanager
+def in_background(work: Callable[[], Out], jobs: int) -> Iterator[Callable[[], Out]]:
+    """Do `work` in a process of its own while the block runs; what is given waits for it and returns what it returned.
+
+    With one of `jobs` it is done in this process when it is asked for. Raises as `map_in_processes`; no process is left
+    after the block.
+    """
+    if jobs == 1:
+        yield work
+        return
+    workers: dict[Connection, multiprocessing.process.BaseProcess] = {}
+    try:
+        _start(lambda _: work(), 1, workers)
+        ((connection, process),) = workers.items()
+        connection.send(None)
+        yield lambda: _receive(connection, process)
+    finally:
+        _end(workers)
+
+
+def _end(workers: Mapping[Connection, Any]) -> None:
+    for connection, process in workers.items():
+        process.kill()
+        process.join()
+        connection.close()
 
 
 def _start(work: Callable[[Any], Any], jobs: int, workers: dict[Connection, Any]) -> None:

@@ -16,7 +16,8 @@ class StageClock:
 
     Not for use from several threads: what a worker does in the background is not a stage's time but its waiting is.
 
-    `seconds`: by stage, on the wall. `cpu_seconds`: by stage, of the processor; what workers spend meanwhile counts.
+    `seconds`: by stage, on the wall. `cpu_seconds`: by stage, of the processor; what threads spend meanwhile counts, and
+    processes that end meanwhile.
     `peak_mib`: largest resident memory of the process up to the end of each stage, MiB.
     """
 
@@ -34,7 +35,7 @@ class StageClock:
             progress(name, 0, 0)
         if self._running:
             self._add()
-        self._running.append((name, time.perf_counter(), time.process_time()))
+        self._running.append((name, time.perf_counter(), cpu_seconds()))
         try:
             yield
         finally:
@@ -42,7 +43,7 @@ class StageClock:
             self._running.pop()
             self.peak_mib[name] = peak_memory_mib()
             if self._running:
-                self._running[-1] = (self._running[-1][0], time.perf_counter(), time.process_time())
+                self._running[-1] = (self._running[-1][0], time.perf_counter(), cpu_seconds())
 
     def add(self, other: StageClock, jobs: int) -> None:
         """Add what another clock counted in one of several processes, which run side by side: their share on the wall."""
@@ -55,7 +56,7 @@ class StageClock:
         """Add what the innermost stage took since it was entered or went on."""
         name, since, cpu_since = self._running[-1]
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - since
-        self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + time.process_time() - cpu_since
+        self.cpu_seconds[name] = self.cpu_seconds.get(name, 0.0) + cpu_seconds() - cpu_since
 
     def table(self, ticks: int) -> list[dict[str, Any]]:
         """Rows of the report: stage, seconds, ticks per second, peak memory of the process up to its end."""
@@ -72,6 +73,12 @@ class StageClock:
     def total(self) -> float:
         """Seconds since this clock was made."""
         return time.perf_counter() - self._start
+
+
+def cpu_seconds() -> float:
+    """Seconds of the processor that this process and those that it started, as far as they ended, have spent."""
+    times = os.times()
+    return time.process_time() + times.children_user + times.children_system
 
 
 def peak_memory_mib() -> float:

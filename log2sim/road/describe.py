@@ -12,14 +12,15 @@ from dataclasses import replace
 from typing import Any
 
 from log2sim.config import MapConfig
-from log2sim.datatypes import Log, MapFeatures, Scenario
+from log2sim.datatypes import Log, MapFeatures, Scenario, Signal
 from log2sim.errors import LogError
+from log2sim.files.processes import in_background
 from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack
 from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.frames import PictureConsumer, give_pictures
+from log2sim.perception.frames import give_pictures
 from log2sim.perception.records import RecordSource
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
@@ -37,12 +38,14 @@ def describe(
     *,
     settings: MapConfig,
     for_map: PoseTrack | None,
+    jobs: int,
     clock: StageClock,
     progress: Callable[[str, int, int], None],
 ) -> tuple[Scenario, list[Decision], dict[str, Any]]:
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario; with what the stages did, and figures of the report.
 
-    `observations`: what the first pass found of the records. `for_map`: poses by which the ground is drawn, None for those of the log.
+    `observations`: what the first pass found of the records. `for_map`: poses by which the ground is drawn, None for those of the
+    log. `jobs`: with more than one, vehicles and lights are looked at in a process of their own while the ground is drawn.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if for_map is None else replace_poses(log, for_map)
@@ -53,28 +56,25 @@ def describe(
             builder = GroundMapBuilder(drawn, scenario, settings, records)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
-    colors = ColorSampler(log, scenario) if plan.keeps(Stage.COLORS) else None
-    consumers: list[PictureConsumer] = [consumer for consumer in (builder, colors) if consumer is not None]
-    with clock.stage("pictures", progress):
-        give_pictures(records, consumers, lambda done, total: progress("pictures", done, total))
-    with clock.stage("lanes", progress):
+    with (
+        clock.stage("appearance"),
+        in_background(lambda: _appearance(scenario, log, plan, observations, records), jobs) as appearance,
+    ):
         if builder is not None:
-            ground = builder.build()
-            markings, borders, notes = find_markings(ground)
-            features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
-            features = features.moved(lambda points_m: place_as_given(points_m, drawn, log))
+            with clock.stage("pictures", progress):
+                give_pictures(records, [builder], lambda done, total: progress("pictures", done, total))
+            with clock.stage("lanes", progress):
+                ground = builder.build()
+                markings, borders, notes = find_markings(ground)
+                features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
+                features = features.moved(lambda points_m: place_as_given(points_m, drawn, log))
         if features is not None:
-            lanes, notes = infer_lanes(features.markings, features.borders, scenario)
-            features = replace(features, lanes=lanes, notes=(*features.notes, *notes))
-    with clock.stage("colors"):
-        found = {} if colors is None else colors.colors()
-        agents = tuple(replace(agent, color=found.get(agent.id, agent.color)) for agent in scenario.agents)
-    with clock.stage("signals"):
-        signals, seen_lights = (
-            find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
-        )
+            with clock.stage("lanes", progress):
+                lanes, notes = infer_lanes(features.markings, features.borders, scenario)
+                features = replace(features, lanes=lanes, notes=(*features.notes, *notes))
+        colors, uncolored, signals, seen_lights = appearance()
+    agents = tuple(replace(agent, color=colors.get(agent.id, agent.color)) for agent in scenario.agents)
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
-    uncolored = () if colors is None else colors.notes()
     colored = sum(agent.color is not None for agent in described.others)
     said = {
         Stage.LANES: "" if features is None else f"{len(features.markings)} markings, {len(features.lanes)} lanes",
@@ -89,6 +89,19 @@ def describe(
         "signals": len(signals),
     }
     return described, decisions, figures
+
+
+def _appearance(
+    scenario: Scenario, log: Log, plan: Plan, observations: Observations, records: RecordSource
+) -> tuple[dict[str, dict[str, Any]], tuple[str, ...], tuple[Signal, ...], str]:
+    """Return the colors of vehicles by id and which have none, and the traffic lights and how many were seen."""
+    colors, uncolored = dict[str, dict[str, Any]](), tuple[str, ...]()
+    if plan.keeps(Stage.COLORS):
+        sampler = ColorSampler(log, scenario)
+        give_pictures(records, [sampler])
+        colors, uncolored = sampler.colors(), sampler.notes()
+    signals = find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
+    return colors, uncolored, *signals
 
 
 def count_features(features: MapFeatures) -> dict[str, Any]:
