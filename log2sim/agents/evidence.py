@@ -268,7 +268,7 @@ MAX_CELLS = 400_000
 # Rays toward a place before it is said that the LiDAR looks there, and at a tick before they say anything.
 MIN_LOOKING_RAYS, MIN_TICK_RAYS = 30, 8
 # One ray of thirty ends in anything by chance.
-MAX_GONE_NATS = float(np.log(30.0))
+MAX_THROUGH_NATS = float(np.log(30.0))
 # Rays of fewer ticks may all have gone through a window or past a corner.
 MIN_SEEN_TICKS = 3
 
@@ -286,11 +286,11 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
-    gone = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_GONE_NATS)
+    went_on = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_THROUGH_NATS)
     solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
     return {
-        "through": np.where(solid, gone, 0.0),
-        "through_gaps": np.where(solid, 0.0, gone),
+        "through": np.where(solid, went_on, 0.0),
+        "through_gaps": np.where(solid, 0.0, went_on),
         "continued": continued(boxes, recording.clouds) * solid,
         "remains": remaining(boxes, recording.clouds) * [not agent.static for agent in agents],
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
@@ -320,7 +320,8 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
             own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[:, across].all(axis=1)
             if own.sum() < MIN_SIDE_POINTS:
                 continue
-            low, high = np.quantile(local[own][:, across], (0.1, 0.9), axis=0)
+            ordered = np.sort(local[own][:, across], axis=0)
+            low, high = ordered[len(ordered) // 10], ordered[-1 - len(ordered) // 10]  # but for stray points
             level = ((local[:, across] > low - SIDE_ERROR_M) & (local[:, across] < high + SIDE_ERROR_M)).all(axis=1)
             inside[k, side] += (own & level).sum()
             beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
