@@ -99,15 +99,21 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int
     """Gather the evidence for and against each of C candidates, which so many processes share."""
     if not candidates:
         return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
-    rows = [_own_columns(c, recording.timeline) for c in candidates]
-    most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(rows) // jobs)) or 1
-    shares = [candidates[k : k + most] for k in range(0, len(rows), most)]
-    columns = map_in_processes(lambda k: _sensed_columns(shares[k], recording), range(len(shares)), jobs)
-    parts = list(columns)
-    table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(candidates) // jobs)) or 1
+    shares = [candidates[k : k + most] for k in range(0, len(candidates), most)]
+
+    def columns_of(share: int) -> Table:
+        rows = [_own_columns(c, recording.timeline) for c in shares[share]]
+        own = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        return own | _sensed_columns(shares[share], recording)
+
+    parts = list(map_in_processes(columns_of, range(len(shares)), jobs))
+    table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     table["no_image"] *= table["no_image"].min() == 0
-    return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
+    return table | {
+        "missing": missing_nats(table["shown_ticks"], table["image_ticks"]),
+        "bias": np.ones(len(candidates)),
+    }
 
 
 # Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
