@@ -24,30 +24,17 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """Agents (A,) at the moment from which they are simulated, as their own last second tells.
-
-    Attributes
-    ----------
-    place_m : (A,) complex128
-    course_rad, yaw_rad : (A,) float64
-        Direction of travel and of the box.
-    speed_mps, accel_mps2, turn_radps : (A,) float64
-        Along the course.
-    moves : (A,) bool
-        False for those that are static.
-    jitter : (3, A) float64
-        What the log jitters by along, across, in m, and in heading, in rad: one standard deviation.
-    """
+    """Agents (A,) at the moment from which they are simulated, as their own last second tells."""
 
     agents: tuple[Agent, ...]
-    place_m: Complex
-    course_rad: Array
+    place_m: Complex  # (A,), complex
+    course_rad: Array  # (A,): direction of travel and of the box; likewise `yaw_rad`
     yaw_rad: Array
-    speed_mps: Array
+    speed_mps: Array  # (A,): along the course; likewise `accel_mps2`, `turn_radps`
     accel_mps2: Array
     turn_radps: Array
-    moves: Mask
-    jitter: Array
+    moves: Mask  # (A,): False for those that are static
+    jitter: Array  # (3, A): what the log jitters by along, across, in m, and in heading, in rad: one standard deviation
 
     @property
     def size_m(self) -> Array:
