@@ -58,8 +58,11 @@ def test_painted_cars_get_the_names_of_their_paints(light: str) -> None:
 
 def test_the_cast_of_a_camera_does_not_change_names() -> None:
     log, truth = street()
-    tinted = sampled(log, truth, lambda image: (image * [0.86, 1.0, 0.96]).astype(np.uint8)).colors()
-    assert {name: color["name"] for name, color in tinted.items()} == {k: name_of(rgb) for k, rgb in PAINTS.items()}
+    tinted = sampled(log, truth, lambda image: np.clip(image * [0.92, 1.06, 1.02], 0, 255).astype(np.uint8)).colors()
+    names = {name: color["name"] for name, color in tinted.items()}
+    # White and silver differ by brightness alone.
+    assert names.pop("b") in ("white", "silver")
+    assert names == {k: name_of(rgb) for k, rgb in PAINTS.items() if k != "b"}
 
 
 @pytest.mark.parametrize("aside_m", [0.0, 1.0, 2.9, 9.0])

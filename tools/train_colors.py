@@ -67,11 +67,11 @@ class Names(nn.Module):
             layer(24, 24, 1),
             layer(24, 40, 3, 2),
             layer(40, 40, 1),
-            layer(40, 56, 3, 2),
-            layer(56, 56, 3),
+            layer(40, 52, 3, 2),
+            layer(52, 52, 3),
         )
-        self.where = nn.Conv2d(56, 1, 1)
-        self.mixed = nn.Conv2d(3 * 56, 64, 1)
+        self.where = nn.Conv2d(52, 1, 1)
+        self.mixed = nn.Conv2d(3 * 52, 64, 1)
         self.head = nn.Conv2d(64, len(COLOR_NAMES) + 3, 1)
 
     def forward(self, picture: Tensor) -> Tensor:

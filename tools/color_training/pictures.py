@@ -37,7 +37,7 @@ LIGHTS = ("sun", "sun", "overcast", "shade", "dusk", "night", "studio")
 # Errors of automatic white balance, about 5 degrees of angular error (Barnard et al. 2002), of exposure half a photographic stop, as
 # standard deviations of the logarithm.
 WHITE_BALANCE_SIGMA, EXPOSURE_SIGMA = 0.08, 0.35
-ROWS, COLUMNS = 24, 48  # of the light from all directions
+ROWS, COLUMNS = 48, 96  # of the light from all directions
 
 
 # Linear sRGB to CIE XYZ relative to D65 white (IEC 61966-2-1).
@@ -231,7 +231,7 @@ def draw_world(rng: np.random.Generator, name: str | None = None, light: str | N
     if light in ("night", "studio"):
         for _ in range(rng.integers(1, 7)):
             row, column = rng.integers(ROWS // 2, ROWS), rng.integers(0, COLUMNS)
-            tall, wide = (rng.integers(1, 3), rng.integers(1, 3)) if light == "night" else rng.integers(2, 14, 2)
+            tall, wide = rng.integers(1, 5, 2) if light == "night" else rng.integers(4, 28, 2)
             kelvin = rng.uniform(1900, 5000) if light == "night" else rng.uniform(3000, 6500)
             sky[row : row + tall, column : column + wide] = rng.uniform(2, 10) * tint(kelvin)
     up_light = max(float(sky[above].mean()), 1e-3)
