@@ -81,16 +81,16 @@ def start(
 ) -> Run:
     """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
-    clock, progress, usable = StageClock(), progress or (lambda *_: None), jobs or default_jobs()
+    clock, progress = StageClock(), progress or (lambda *_: None)
     with clock.stage("poses"):
         log, poses = localize(log, given.config, progress=progress)
     config = choose_detector(log, given.config)
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
-        log, faults = check_calibration(log, config, sensors, jobs=usable, progress=progress)
+        log, faults = check_calibration(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.subject for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
-        poses = refine_for_map(log, poses, faults, usable)
+        poses = refine_for_map(log, poses, faults)
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.subject for fault in road.faults if fault.treatment == "left_out"])
@@ -101,7 +101,7 @@ def start(
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
     faults = (*list_faults(log, poses.stretches, *schedule.t_ns[[0, -1]].tolist()), *faults, *road.faults)
-    jobs = usable if jobs or detectors.own else 1
+    jobs = jobs or (default_jobs() if detectors.own else 1)
     return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
@@ -131,6 +132,7 @@ def _serve(work: Callable[[Any], Any], connection: Connection, not_mine: list[Co
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.environ[LIMIT_VARIABLE] = "1"
+    gc.freeze()  # a collection would write to, and so copy, all the memory that is shared with the sender
     for other in not_mine:  # or nobody would notice that the sender is gone
         other.close()
     try:

@@ -190,17 +190,17 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
     return log, replace(choice, stretches=checked.stretches) if checked.stretches else choice
 
 
-def refine_for_map(log: Log, choice: PoseChoice, faults: Sequence[Finding] = (), jobs: int = 1) -> PoseChoice:
+def refine_for_map(log: Log, choice: PoseChoice, faults: Sequence[Finding] = ()) -> PoseChoice:
     """Return a choice with the poses by which sweeps lie on each other, where those of the log can be refined.
 
     The ground is drawn by them. Agents keep the given poses: by refined ones their positions were nearer to the labels on a KITTI
     drive, but their sizes and speeds worse, and most simulated drives were worse throughout. `faults`: of a LiDAR's clock and
-    mount, by which its sweeps show a wrong motion; then nothing is refined. `jobs`: processes that share the sweeps.
+    mount, by which its sweeps show a wrong motion; then nothing is refined.
     """
     wrong = any(fault.treatment == "kept" and fault.kind in LIDAR_FAULTS for fault in faults)
     if choice.source != "given" or not choice.checked or wrong:
         return choice
-    return replace(choice, for_map=refine_poses(log, choice.during_ns, jobs))
+    return replace(choice, for_map=refine_poses(log, choice.during_ns))
 
 
 def _choose(request: _Request) -> tuple[Log, PoseChoice]:

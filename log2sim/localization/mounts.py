@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log, Treatment
-from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, Camera, inverse, rotation_from_rpy, transform, undistort
 from log2sim.localization.camera_motion import follow_points
 from log2sim.localization.choice import during_ns
@@ -265,21 +264,20 @@ def check_cameras(
     sensors: Sensors,
     *,
     of_lidars: tuple[Finding, ...] = (),
-    jobs: int = 1,
     progress: Progress,
 ) -> tuple[Log, tuple[Finding, ...]]:
     """Return the log, corrected where the settings ask for it, and what is wrong with the cameras that the run uses.
 
     Against a LiDAR that `of_lidars` finds wrong and the run does not correct they are not checked. No yaw is estimated of a camera
     with which no LiDAR is mounted, that shows no edges, or of which several angles fit alike; and no image is read where boxes come
-    from the log. Where all cameras are turned alike, it is the LiDAR that is. `jobs`: processes that share the cameras.
+    from the log. Where all cameras are turned alike, it is the LiDAR that is.
     """
     if config.detect.in_images in ("", LABELS):
         return log, ()
     lidar = densest_lidar(sensors.restrict(log)) or ""
     doubtful = {f.subject for f in of_lidars if f.treatment == "kept" and f.kind in ("time_offset", "lidar_rotation")}
     lidar = "" if lidar in doubtful else lidar
-    check = _look(log, lidar, config, sensors, jobs, progress)
+    check = _look(log, lidar, config, sensors, progress)
     fix = config.calibration.fix_mounts
     treatment: Treatment = "corrected" if fix else "kept"
     mistakes = find_mistakes(check, during_ns(log, config))
@@ -328,7 +326,7 @@ def turns_together(yaws: Mapping[str, YawEstimate | None]) -> bool:
     return bool(np.all(np.abs(angles - mean) < MIN_SIGMAS * sigmas))
 
 
-def _look(log: Log, lidar: str, config: Config, sensors: Sensors, jobs: int, progress: Progress) -> MountCheck:
+def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Progress) -> MountCheck:
     """Look at frames of the cameras beside a LiDAR and at its sweeps, over the log."""
     unknown = dict.fromkeys(sensors.cameras)
     names = [name for name in sensors.cameras if lidar and is_near(log, name, lidar)]
@@ -337,10 +335,7 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, jobs: int, pro
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
-    estimates = map_in_processes(
-        lambda name: _estimate_by_few_or_all(log.cameras[name], seen), names, min(jobs, len(names))
-    )
-    looks = dict(zip(names, estimates, strict=True))
+    looks = {name: _estimate_by_few_or_all(log.cameras[name], seen) for name in names}
     progress("check cameras", len(moments.sweeps), len(moments.sweeps))
     views = {name: views for name, (views, _) in looks.items()}
     return MountCheck(log, lidar, views, unknown | {name: yaw for name, (_, yaw) in looks.items()})
@@ -376,11 +371,11 @@ def _values(yaw: YawEstimate) -> dict[str, float]:
 
 
 def check_calibration(
-    log: Log, config: Config, sensors: Sensors, *, jobs: int = 1, progress: Progress
+    log: Log, config: Config, sensors: Sensors, *, progress: Progress
 ) -> tuple[Log, tuple[Finding, ...]]:
     """Estimate offsets of clocks and rotations of mounts: the log with the corrections that the settings ask for, and the faults."""
     if not config.calibration.check:
         return log, ()
     log, of_lidars = check_lidars(log, config, sensors, progress=progress)
-    log, of_cameras = check_cameras(log, config, sensors, of_lidars=of_lidars, jobs=jobs, progress=progress)
+    log, of_cameras = check_cameras(log, config, sensors, of_lidars=of_lidars, progress=progress)
     return log, (*of_lidars, *of_cameras)

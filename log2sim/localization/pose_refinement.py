@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Sweep
-from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.odometry import densest_lidar, is_during
 from log2sim.localization.surfaces import (
@@ -24,6 +23,7 @@ from log2sim.localization.surfaces import (
     register,
     surfaces_of_sweep,
 )
+from log2sim.perception.frames import work_ahead
 from log2sim.perception.records import RecordSource
 
 # Poses between sweeps that are registered are interpolated: so many cover braking and curves of a log, unless they are farther
@@ -55,8 +55,8 @@ class Keyframe:
     surfaces: Surfaces
 
 
-def refine_poses(log: Log, during_ns: tuple[int, int] | None = None, jobs: int = 1) -> PoseTrack | None:
-    """Return poses of the ego by which surfaces in the sweeps of a time lie on each other; `jobs` processes share these.
+def refine_poses(log: Log, during_ns: tuple[int, int] | None = None) -> PoseTrack | None:
+    """Return poses of the ego by which surfaces in the sweeps of a time lie on each other.
 
     None without LiDAR on the ego, with too few sweeps, or over too long a time.
     """
@@ -70,9 +70,7 @@ def refine_poses(log: Log, during_ns: tuple[int, int] | None = None, jobs: int =
         sweep: Sweep | None = records.get(lidar, index)
         return None if sweep is None else surfaces_of_sweep(log, lidar, sweep)
 
-    keyframes = [
-        Keyframe(*found) for found in map_in_processes(surfaces_at, chosen.tolist(), jobs) if found is not None
-    ]
+    keyframes = [Keyframe(*found) for found in work_ahead(surfaces_at, chosen.tolist()) if found is not None]
     if len(keyframes) < MIN_KEYFRAMES:
         return None
     pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
@@ -81,7 +79,7 @@ def refine_poses(log: Log, during_ns: tuple[int, int] | None = None, jobs: int =
         first, second = (keyframes[k] for k in pair)
         return register(first.surfaces, second.surfaces, inverse(first.map_T_ego) @ second.map_T_ego)
 
-    found = map_in_processes(registered, pairs, jobs)
+    found = work_ahead(registered, pairs)
     links = [(*pair, registration) for pair, registration in zip(pairs, found, strict=True) if registration is not None]
     twists = solve_twists(keyframes, links)
     return corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists)

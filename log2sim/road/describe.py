@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from log2sim.config import MapConfig
@@ -56,10 +57,8 @@ def describe(
             builder = GroundMapBuilder(drawn, scenario, settings, records)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
-    with (
-        clock.stage("appearance"),
-        in_background(lambda: _appearance(scenario, log, plan, observations, records), jobs) as appearance,
-    ):
+    look = partial(_appearance, scenario, log, plan, observations, records)
+    with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         if builder is not None:
             with clock.stage("pictures", progress):
                 give_pictures(records, [builder], lambda done, total: progress("pictures", done, total))
