@@ -23,42 +23,23 @@ from log2sim.geometry import Array, wrap_angle
 class Waypoints:
     """A trajectory of the box center as columns, map frame.
 
-    Attributes
-    ----------
-    t_s : (T,) float64, s
-        Strictly increasing times since the scenario's start.
-    x_m, y_m, z_m : (T,) float64, m
-        Box center.
-    yaw_rad : (T,) float64
-    speed_mps : (T,) float64, m/s
-        Along the heading, negative when reversing.
-    observed : (T,) bool
-        False where a gap was filled.
-    sigma_xy_m : (T,) float64, m
-        One standard deviation of the position.
-    sigma_yaw_rad, sigma_speed_mps : (T,) float64 or None
-        One standard deviation of heading and speed, for each waypoint; None where unknown. Half a turn is no part of
-        `sigma_yaw_rad`: whether front and back may be swapped is a doubt of the agent.
-    visible : (T,) bool or None
-        Whether the sensors could see the agent; only in truth.
-    lidar_points : (T,) float64 or None
-        LiDAR points in the agent's box, of all LiDARs together; only in truth.
+    Half a turn is no part of `sigma_yaw_rad`: whether front and back may be swapped is a doubt of the agent.
     """
 
     __repr__ = short_repr
 
-    t_s: Array
-    x_m: Array
+    t_s: Array  # (T,), s: strictly increasing times since the scenario's start
+    x_m: Array  # (T,), m, as `y_m` and `z_m`
     y_m: Array
     z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    observed: NDArray[np.bool_]
-    sigma_xy_m: Array
-    sigma_yaw_rad: Array | None = None
+    yaw_rad: Array  # (T,)
+    speed_mps: Array  # (T,), m/s: along the heading, negative when reversing
+    observed: NDArray[np.bool_]  # (T,): False where a gap was filled
+    sigma_xy_m: Array  # (T,), m: one standard deviation of the position
+    sigma_yaw_rad: Array | None = None  # (T,): the same of heading and speed; None where unknown
     sigma_speed_mps: Array | None = None
-    visible: NDArray[np.bool_] | None = None
-    lidar_points: Array | None = None
+    visible: NDArray[np.bool_] | None = None  # (T,): whether the sensors could see the agent; only in truth
+    lidar_points: Array | None = None  # (T,): LiDAR points in the agent's box, of all LiDARs together; only in truth
 
     FLOATS = ("t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "sigma_xy_m")
     OPTIONAL_FLOATS = ("sigma_yaw_rad", "sigma_speed_mps")
@@ -161,6 +142,11 @@ class Trajectory:
         z = np.interp(t_s, self.t_s, self.z_m)
         return TrajectoryStates(x + self.origin_m[0], y + self.origin_m[1], z, wrap_angle(yaw), speed)
 
+    def _since(self, t: Array) -> tuple[NDArray[np.intp], Array, Array, NDArray[np.bool_]]:
+        """Return the number of the step that times (N,) are in, how long it has lasted then, its duration, and whether it is a jump."""
+        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
+        return i, t - self.t_s[i], self.t_s[i + 1] - self.t_s[i], self.discontinuous[i] & (t < self.t_s[i + 1])
+
     def relative(self, t_s: Array) -> tuple[Array, Array, Array, Array]:
         """Interpolate x, y relative to the origin, unwrapped yaw and speed at times (N,); the ends are held.
 
@@ -171,12 +157,9 @@ class Trajectory:
         yaw, speed = np.interp(t, self.t_s, self.yaw_rad), np.interp(t, self.t_s, self.speed_mps)
         if len(self.t_s) == 1:
             return np.full(len(t), self.x_m[0]), np.full(len(t), self.y_m[0]), yaw, speed
-        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
-        span = self.t_s[i + 1] - self.t_s[i]
-        since = t - self.t_s[i]
+        i, since, span, jumps = self._since(t)
         x = hermite(self.x_m, self.velocity_x_mps, i, since, span)
         y = hermite(self.y_m, self.velocity_y_mps, i, since, span)
-        jumps = self.discontinuous[i] & (t < self.t_s[i + 1])
         if jumps.any():
             x = np.where(jumps, self.x_m[i] + since * self.velocity_x_mps[i], x)
             y = np.where(jumps, self.y_m[i] + since * self.velocity_y_mps[i], y)
@@ -188,12 +171,9 @@ class Trajectory:
         t = np.clip(t_s, self.t_s[0], self.t_s[-1])
         if len(self.t_s) == 1:
             return np.full(len(t), self.velocity_x_mps[0]), np.full(len(t), self.velocity_y_mps[0])
-        i = np.clip(np.searchsorted(self.t_s, t, side="right") - 1, 0, len(self.t_s) - 2)
-        span = self.t_s[i + 1] - self.t_s[i]
-        since = t - self.t_s[i]
+        i, since, span, jumps = self._since(t)
         vx = hermite_slope(self.x_m, self.velocity_x_mps, i, since, span)
         vy = hermite_slope(self.y_m, self.velocity_y_mps, i, since, span)
-        jumps = self.discontinuous[i] & (t < self.t_s[i + 1])
         return np.where(jumps, self.velocity_x_mps[i], vx), np.where(jumps, self.velocity_y_mps[i], vy)
 
     def heights(self, t_s: Array) -> Array:
@@ -256,46 +236,25 @@ class AgentStates:
 
 @dataclass(frozen=True, eq=False)
 class Agent:
-    """One road user.
+    """One road user."""
 
-    Attributes
-    ----------
-    id : str
-        Unique within the scenario; `EGO` for the ego.
-    category : str
-        One of `CATEGORIES`.
-    size_m : (3,) tuple of float, m
-        Length, width, height.
-    static : bool
-        Whether it never moves.
-    rear_axle_offset_m : float, m
-        From the rear axle forward to the center of the box.
-    color : mapping or None
-        {"rgb": [r, g, b], "name": ...}; of a reconstruction the name is one of `COLOR_NAMES`, and "confidence" the probability
-        that it is right.
-    confidence : float
-        In [0, 1].
-    quarantined : bool
-        Whether it is too likely wrong to be replayed or exported unless that is asked for, see `Scenario.active`.
-    quality : mapping
-        Figures of the reconstruction, such as the number of detections.
-    doubts : tuple of Finding
-        What speaks against it.
-    observed_by : mapping of str to tuple of Span
-        Times of the scenario, s, between which each of the `ENDS` measured it; empty for truth and the ego.
-    """
-
-    id: str
-    category: str
-    size_m: tuple[float, float, float]
+    id: str  # unique within the scenario; `EGO` for the ego
+    category: str  # one of `CATEGORIES`
+    size_m: tuple[float, float, float]  # length, width, height
     waypoints: Waypoints
-    static: bool = False
-    rear_axle_offset_m: float = 0.0
+    static: bool = False  # whether it never moves
+    rear_axle_offset_m: float = 0.0  # from the rear axle forward to the center of the box
+    # {"rgb": [r, g, b], "name": ...}; of a reconstruction the name is one of `COLOR_NAMES`, and "confidence" the probability
+    # that it is right
     color: Mapping[str, Any] | None = None
-    confidence: float = 1.0
-    quality: Mapping[str, Any] = field(default_factory=dict)
-    doubts: tuple[Finding, ...] = ()
+    confidence: float = 1.0  # in [0, 1]
+    quality: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # figures of the reconstruction, such as the number of detections
+    doubts: tuple[Finding, ...] = ()  # what speaks against it
+    # Times of the scenario, s, between which each of the `ENDS` measured it; empty for truth and the ego
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
+    # Whether it is too likely wrong to be replayed or exported unless that is asked for, see `Scenario.active`
     quarantined: bool = False
 
     def __repr__(self) -> str:
@@ -339,11 +298,7 @@ class Agent:
 
 def agent_to_dict(agent: Agent) -> dict[str, Any]:
     """Return the entry of an agent in a document of `schemas/scenario-1.json`."""
-    w = agent.waypoints
-    columns = {
-        k: v.astype(bool).tolist() if k in ("observed", "visible") else v.astype(np.float64).tolist()
-        for k, v in w.columns().items()
-    }
+    columns = {k: v.astype(_type(k)).tolist() for k, v in agent.waypoints.columns().items()}
     length, width, height = (float(v) for v in agent.size_m)
     observed_by = {end: [list(span) for span in spans] for end, spans in agent.observed_by.items()}
     return {
@@ -375,9 +330,7 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     for key, values in columns.items():
         if len(values) != count:
             raise ScenarioError(f"{where}: waypoints.{key} has {len(values)} values, t_s has {count}")
-    waypoints = Waypoints(
-        **{k: np.array(v, dtype=bool if k in ("observed", "visible") else np.float64) for k, v in columns.items()}
-    )
+    waypoints = Waypoints(**{k: np.array(v, dtype=_type(k)) for k, v in columns.items()})
     problem = waypoints.problem()
     if problem is not None:
         raise ScenarioError(f"{where}: {problem}")
@@ -401,16 +354,17 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     )
 
 
+def _type(column: str) -> Any:
+    return bool if column in ("observed", "visible") else np.float64
+
+
 def _doubts_of(entry: Mapping[str, Any]) -> tuple[Finding, ...]:
     """Read the doubts of an agent; before there were any, `quality` named the limits that its motion breaks."""
     if "doubts" in entry:
         return tuple(Finding.from_dict(doubt) for doubt in entry["doubts"])
     flags = entry["quality"].get("flags")
-    return (
-        tuple(Finding(str(flag), text=f"breaks the limit of {flag}") for flag in flags)
-        if isinstance(flags, list)
-        else ()
-    )
+    listed = flags if isinstance(flags, list) else ()
+    return tuple(Finding(str(flag), text=f"breaks the limit of {flag}") for flag in listed)
 
 
 MAX_LISTED = 5

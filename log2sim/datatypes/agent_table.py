@@ -30,10 +30,9 @@ class AgentTable:
 
     @classmethod
     def of(cls, agents: Sequence[Agent], t_s: Array, *, margin_s: float = MARGIN_S, permanent: bool = False) -> Self:
-        """Evaluate agents at times (T,).
+        """Evaluate agents at times (T,); those with `is_permanent` are there at all of them where `permanent` says so.
 
-        Up to `margin_s` before and after its life an agent moves on as it starts and ends. `permanent`: whether agents with
-        `is_permanent` are there at all times.
+        Up to `margin_s` before and after its life an agent moves on as it starts and ends.
         """
         columns = np.full((5, len(agents), len(t_s)), np.nan)
         for k, agent in enumerate(agents):

@@ -10,31 +10,18 @@ Size = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Category:
-    """What is known of a category before anything was measured; sizes are length, width, height in m.
+    """What is known of a category before anything was measured; sizes are length, width, height in m."""
 
-    Attributes
-    ----------
-    group : str
-        Categories of one group are confused by detectors and labelers, and therefore associated with each other.
-    typical_size_m : Size
-        Of an object that was not observed from end to end.
-    min_size_m, max_size_m : Size
-        A smaller object was hardly observed whole, a larger one is several objects.
-    max_speed_mps : float
-        What is faster is hardly one.
-    max_length_per_height : float
-        Longest side as a share of the height; infinite where the category has no such limit.
-    min_seen_m : float, optional
-        What points show of the longer horizontal side at least, where that is less than `min_size_m`: bodies are round, and
-        sparse rays miss their ends.
-    """
-
-    group: str
-    typical_size_m: Size
-    min_size_m: Size
+    group: (
+        str  # categories of one group are confused by detectors and labelers, and therefore associated with each other
+    )
+    typical_size_m: Size  # of an object that was not observed from end to end
+    min_size_m: Size  # a smaller object was hardly observed whole, a larger one than `max_size_m` is several objects
     max_size_m: Size
-    max_speed_mps: float
-    max_length_per_height: float = float("inf")
+    max_speed_mps: float  # what is faster is hardly one
+    max_length_per_height: float = float("inf")  # longest side as a share of the height
+    # What points show of the longer horizontal side at least, where that is less than `min_size_m`: bodies are round, and sparse
+    # rays miss their ends
     min_seen_m: float | None = None
 
 

@@ -30,9 +30,8 @@ class Boxes3D:
     category: NDArray[np.str_]  # (M,)
     score: Array  # (M,): calibrated probability in [0, 1] that the box is right
     points: NDArray[np.int64]  # (M,): number of points in the box
-    seen_by: NDArray[np.bool_] | None = (
-        None  # (M, 2): which of the `ENDS` found it; None where their clouds were searched as one
-    )
+    # (M, 2): which of the `ENDS` found it; None where their clouds were searched as one
+    seen_by: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         """Return the number of boxes."""
@@ -46,11 +45,8 @@ class Boxes3D:
     @classmethod
     def empty(cls) -> Self:
         """Return no boxes."""
-        text = np.zeros(0, dtype="<U16")
-        flat = np.zeros(0)
-        return cls(
-            np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), flat, flat, text, flat, np.zeros(0, np.int64)
-        )
+        n, flat = np.zeros(0, np.int64), np.zeros(0)
+        return cls(n, np.zeros((0, 3)), np.zeros((0, 3)), flat, flat, np.zeros(0, dtype="<U16"), flat, n)
 
     @classmethod
     def join(cls, parts: Sequence[Boxes3D]) -> Boxes3D:
@@ -99,12 +95,10 @@ class OtherView:
     """What a second LiDAR, far from the first, shows of an object at the same tick."""
 
     sensor_m: Array  # (3,): viewpoint, m, map frame
-    ends_visible: NDArray[
-        np.bool_
-    ]  # (2,): whether the right and the left end of the points, as seen from there, are ends of the object
-    cluster: NDArray[
-        np.float64
-    ]  # (n, 4): these points, subsampled: x, y, z in m, and the time after `t_ns` of the row in s
+    # (2,): whether the right and the left end of the points, as seen from there, are ends of the object
+    ends_visible: NDArray[np.bool_]
+    # (n, 4): these points, subsampled: x, y, z in m, and the time after `t_ns` of the row in s
+    cluster: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +126,8 @@ class BoxEvidence:
     high_m: Array
     # (M, 2): whether the right and the left end of the points, as seen from the viewpoint, are ends of the object
     ends_visible: NDArray[np.bool_]
-    bottom_m: (
-        Array  # (M,): heights of the ground under the object and, `top_m`, of its highest points; NaN where unknown
-    )
+    # (M,): heights of the ground under the object and, `top_m`, of its highest points; NaN where unknown
+    bottom_m: Array
     top_m: Array
     box_center_m: Array  # (M, 3): center of the box that a detector found in the LiDAR's sweep, m; NaN without one, as in the next three
     box_size_m: Array  # (M, 3): its length, width, height, m
@@ -202,13 +195,9 @@ class Measurements(BoxEvidence):
         """Return a row for each box (M,) of a 3D detector, seen from a sensor (3,), without LiDAR points and position."""
         found = Detections(np.full((len(boxes), 4), np.nan), boxes.score, boxes.category)
         return replace(
-            cls.unplaced(found, t_ns=0, camera="", sensor_m=sensor_m),
-            t_ns=boxes.t_ns,
-            box_center_m=boxes.center_m,
-            box_size_m=boxes.size_m,
-            box_yaw_rad=boxes.yaw_rad,
-            heading_score=boxes.heading_score,
-        )
+            cls.unplaced(found, t_ns=0, camera="", sensor_m=sensor_m), t_ns=boxes.t_ns, box_center_m=boxes.center_m,
+            box_size_m=boxes.size_m, box_yaw_rad=boxes.yaw_rad, heading_score=boxes.heading_score,
+        )  # fmt: skip
 
     @classmethod
     def unplaced(
@@ -277,9 +266,8 @@ class Obstacles:
     t_s: Deferred[NDArray[np.float32]] = Deferred()  # (N,): times relative to `stamp_ns`
     # (3,): position of the sensor relative to `origin`, mean over several; of viewpoints far from each other the first
     sensor: NDArray[np.float32]  # type: ignore[misc]  # those before it are descriptors, they have no default
-    free: Deferred[Rays | None] = Deferred(
-        None
-    )  # a sample of all rays, those that end on the ground too: where they passed is nothing
+    # A sample of all rays, those that end on the ground too: where they passed is nothing
+    free: Deferred[Rays | None] = Deferred(None)
     # (V, 3): positions of LiDARs far from each other relative to `origin`; None where all points are seen from `sensor`
     viewpoints: NDArray[np.float32] | None = None
     seen_from: Deferred[NDArray[np.uint8] | None] = Deferred(None)  # (N,): the viewpoint of each point

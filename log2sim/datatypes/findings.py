@@ -294,37 +294,18 @@ KINDS: Mapping[str, Kind] = {**AGENT_KINDS, **SENSOR_KINDS, **RUN_KINDS}
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is doubtful or wrong in a run.
+    """Something that is doubtful or wrong in a run."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`; of a file, any.
-    subject : str
-        Camera or LiDAR, "ego" for poses, "cache"; empty for an agent, which holds its findings itself.
-    treatment : {"left_out", "corrected", "kept"}
-        Whether the run does not use the records or poses in question, uses corrected ones, or uses them as they are.
-    start_s, end_s : float or None, s
-        When it holds, from the start of the scenario; None for the whole log or the whole life of an agent.
-    values : mapping of str to float
-        Numbers of the kind, by name with unit.
-    other : str
-        What the subject was compared with, such as the agent that it passes through.
-    case : str
-        Which sentence of its kind fits; without, that of its treatment.
-    text : str, optional
-        The sentence, of a file, which does not hold what it is made of.
-    """
-
-    kind: str
-    subject: str = ""
+    kind: str  # one of `KINDS`; of a file, any
+    subject: str = ""  # camera or LiDAR, "ego" for poses, "cache"; empty for an agent, which holds its findings itself
+    # Whether the run does not use the records or poses in question, uses corrected ones, or uses them as they are
     treatment: Treatment = "kept"
-    start_s: float | None = None
+    start_s: float | None = None  # when it holds; None for the whole log or the whole life of an agent
     end_s: float | None = None
-    values: Mapping[str, float] = field(default_factory=dict, hash=False)
-    other: str = ""
-    case: str = ""
-    text: str | None = None
+    values: Mapping[str, float] = field(default_factory=dict, hash=False)  # numbers of the kind, by name with unit
+    other: str = ""  # what the subject was compared with, such as the agent that it passes through
+    case: str = ""  # which sentence of its kind fits; without, that of its treatment
+    text: str | None = None  # the sentence, of a file, which does not hold what it is made of
 
     def __post_init__(self) -> None:
         """Refuse numbers that its kind does not name, and an unknown kind without a sentence; `ValueError`."""

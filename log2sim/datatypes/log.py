@@ -93,10 +93,7 @@ class IgnoreRegions:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> IgnoreRegions:
-        """Build them from the part `unlabeled` of a document that keeps the schema.
-
-        Raises `ScenarioError` when columns do not fit each other.
-        """
+        """Build them from a part of a document that keeps the schema; `ScenarioError` when columns do not fit each other."""
         views = tuple(_view_from_dict(v, f"unlabeled.views[{k}]") for k, v in enumerate(document["views"]))
         return cls(views, bool(document["outside_views"]), tuple(document.get("categories", ())))
 
@@ -120,15 +117,9 @@ def camera_of(name: str, intrinsics: Mapping[str, Any], mount: Mount, mount_T_ca
 
 
 def _view_to_dict(view: LabelView) -> dict[str, Any]:
-    return {
-        "camera": view.camera.name,
-        "intrinsics": intrinsics_to_dict(view.camera),
-        "t_s": view.t_s.tolist(),
-        "translation_m": view.translation_m.tolist(),
-        "rotation_wxyz": view.rotation_wxyz.tolist(),
-        "region_frame": view.region_frame.tolist(),
-        "region_px": view.region_px.tolist(),
-    }
+    columns = ("t_s", "translation_m", "rotation_wxyz", "region_frame", "region_px")
+    about = {"camera": view.camera.name, "intrinsics": intrinsics_to_dict(view.camera)}
+    return about | {name: getattr(view, name).tolist() for name in columns}
 
 
 def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
@@ -163,9 +154,8 @@ class Labels:
     center_m: Array  # (L, 3), m: box centers
     size_m: Array  # (L, 3), m: length, width, height
     yaw_rad: Array  # (L,)
-    visible: NDArray[np.bool_] | None = (
-        None  # (L,): as the log states it; None where it states nothing and visibility is computed
-    )
+    # (L,): as the log states it; None where it states nothing and visibility is computed
+    visible: NDArray[np.bool_] | None = None
     # The cameras in whose images alone objects were labeled; None when they were labeled all around
     cameras: tuple[str, ...] | None = None
     # (L,): the log's own word for the category, such as "Van"; None where the log has none of its own
@@ -174,9 +164,8 @@ class Labels:
     occlusion: NDArray[np.int64] | None = None
     # (F,): increasing stamps of all that was labeled, also where nothing was there; None where the log does not state it
     labeled_ns: NDArray[np.int64] | None = None
-    never_labeled: tuple[
-        str, ...
-    ] = ()  # categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI
+    # Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI
+    never_labeled: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,9 +198,8 @@ class Sweep:
     stamp_ns: int  # absolute time of the sweep
     xyz_m: NDArray[np.floating[Any]]  # (N, 3), m: finite points in `frame`
     frame: Literal["lidar", "map"] = "lidar"  # "lidar": the sensor's frame; "map": already motion-compensated
-    t_ns: NDArray[np.int64] | None = (
-        None  # (N,): absolute stamps at which the points were measured; None when the log has none
-    )
+    # (N,): absolute stamps at which the points were measured; None when the log has none
+    t_ns: NDArray[np.int64] | None = None
     # For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each point is in the
     # sensor's frame at its own time
     compensated_ns: int | None = None
@@ -266,7 +254,7 @@ class Stream:
     name: str  # of the sensor
     t_ns: Deferred[NDArray[np.int64]] = (
         Deferred()
-    )  # (F,): absolute stamps, increasing; may be given as a function that reads them
+    )  # (F,): absolute stamps, increasing; may be a function that reads them
     # Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that cannot be read.
     # Several threads may call it at once.
     read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
@@ -298,53 +286,29 @@ class EgoVehicle:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """An opened log. The records of its streams are read on request.
-
-    Attributes
-    ----------
-    format : str
-        Name of the reader.
-    cameras, lidars : mapping of str to Camera, Lidar
-    streams : mapping of str to Stream
-        By the name of the sensor.
-    ego : PoseTrack or None
-        None for a log of roadside sensors only.
-    labels : Labels or None
-        May be given as a function that reads them.
-    image_labels : mapping of str to ImageLabels
-        By camera.
-    ignored_regions : mapping of str to ImageRegions
-        By camera: where `labels` are incomplete.
-    ground_z_ego_m : float, m
-        Height of the road in the ego frame; 0 when the ego's origin lies on the ground. May be given as a function.
-    reference_camera : str or None
-        The camera whose stamps make the ticks.
-    digest : str
-        SHA-256 over the log's index.
-    notes : tuple of str
-        Remarks of the reader for the report; may be given as a function.
-    calibrations : mapping of str to str
-        By sensor: where its calibration is, for messages.
-    details : mapping of str to Any
-        What only this format has, as JSON values, for `log2sim inspect`; for example the topics of a bag.
-    """
+    """An opened log. The records of its streams are read on request; what is `Deferred` may be a function that reads it."""
 
     name: str
-    format: str
-    cameras: Mapping[str, Camera]
+    format: str  # name of the reader
+    cameras: Mapping[str, Camera]  # by name, as `lidars` and `streams`
     lidars: Mapping[str, Lidar]
     streams: Mapping[str, Stream]
-    ego: PoseTrack | None = None
+    ego: PoseTrack | None = None  # None for a log of roadside sensors only
     ego_vehicle: EgoVehicle = field(default_factory=EgoVehicle)
     map: MapFrame = field(default_factory=MapFrame)
     labels: Deferred[Labels | None] = Deferred(None)
-    image_labels: Mapping[str, ImageLabels] = field(default_factory=dict)
-    ignored_regions: Mapping[str, ImageRegions] = field(default_factory=dict)
-    ground_z_ego_m: Deferred[float] = Deferred(0.0)
-    reference_camera: str | None = None
-    digest: str = ""
-    notes: Deferred[tuple[str, ...]] = Deferred(())
-    calibrations: Mapping[str, str] = field(default_factory=dict)
+    image_labels: Mapping[str, ImageLabels] = field(default_factory=dict)  # by camera
+    ignored_regions: Mapping[str, ImageRegions] = field(
+        default_factory=dict
+    )  # by camera: where `labels` are incomplete
+    ground_z_ego_m: Deferred[float] = Deferred(
+        0.0
+    )  # height of the road in the ego frame; 0 when its origin is on the ground
+    reference_camera: str | None = None  # the camera whose stamps make the ticks
+    digest: str = ""  # SHA-256 over the log's index
+    notes: Deferred[tuple[str, ...]] = Deferred(())  # remarks of the reader for the report
+    calibrations: Mapping[str, str] = field(default_factory=dict)  # by sensor: where its calibration is, for messages
+    # What only this format has, as JSON values, for `log2sim inspect`; for example the topics of a bag
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

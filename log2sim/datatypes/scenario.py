@@ -76,14 +76,11 @@ PER_AGENT = ("category", "length_m", "width_m", "height_m", "static", "confidenc
 def columns_of(agents: Sequence[Agent]) -> dict[str, NDArray[Any]]:
     """Return the columns (R,) with one row for each agent and waypoint, in the order of the agents."""
     parts = [_columns_of(agent) for agent in agents]
-    return {key: np.concatenate([part[key] for part in parts] or [_none(key)]) for key in COLUMNS}
+    return {key: np.concatenate([np.zeros(0, _kind(key)), *(part[key] for part in parts)]) for key in COLUMNS}
 
 
 def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
-    """Return the columns as a pandas DataFrame; `about` becomes its `attrs`.
-
-    Raises `MissingExtra` when pandas is not installed.
-    """
+    """Return the columns as a pandas DataFrame with `about` as its `attrs`; `MissingExtra` when pandas is not installed."""
     try:
         import pandas as pd
     except ImportError:
@@ -94,10 +91,7 @@ def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
 
 
 def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
-    """Return the columns as an xarray Dataset along agents (A,) and the times of all waypoints (T,); `about` becomes its `attrs`.
-
-    Raises `MissingExtra` when xarray is not installed.
-    """
+    """Return the columns as an xarray Dataset along agents (A,) and the times of all waypoints (T,); `about` becomes its `attrs`."""
     try:
         import xarray
     except ImportError:
@@ -124,10 +118,7 @@ def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
 
 
 def write_states(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
-    """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata.
-
-    Raises `MissingExtra` when pyarrow is not installed; `ConfigError` when the file cannot be written.
-    """
+    """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -162,10 +153,6 @@ def _kind(key: str) -> Any:
     return object if key in TEXTS else bool if key in FLAGS else np.float64
 
 
-def _none(key: str) -> NDArray[Any]:
-    return np.zeros(0, dtype=_kind(key))
-
-
 VERSION = 1
 EGO = "ego"
 """Id of the ego."""
@@ -173,42 +160,22 @@ EGO = "ego"
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """Road users with their trajectories, as simulators run them.
-
-    Attributes
-    ----------
-    t0_ns : int
-        Absolute time of t_s = 0.
-    duration_s : float, s
-    agents : tuple of Agent
-        The ego is the one with id `EGO`, if there is one.
-    cameras : tuple of mapping
-        The cameras of the log with the homographies that were fitted.
-    stages : tuple of mapping
-        Stages of the reconstruction that were run or left out, each with its reason.
-    provenance : mapping
-        Log, settings and versions that the scenario came from.
-    ignore_regions : IgnoreRegions or None
-        Only in truth: where objects were left without labels; None when the labels are complete.
-    map_features : MapFeatures or None
-        Markings, borders and lanes; None where they were not looked for.
-    tags : tuple of Tag or None
-        What its road users do; None where that was not looked for.
-    """
+    """Road users with their trajectories, as simulators run them."""
 
     name: str
-    t0_ns: int
+    t0_ns: int  # absolute time of t_s = 0
     duration_s: float
-    agents: tuple[Agent, ...]
+    agents: tuple[Agent, ...]  # the ego is the one with id `EGO`, if there is one
     map: MapFrame = field(default_factory=MapFrame)
-    cameras: tuple[Mapping[str, Any], ...] = ()
-    stages: tuple[Mapping[str, Any], ...] = ()
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    cameras: tuple[Mapping[str, Any], ...] = ()  # those of the log with the homographies that were fitted
+    stages: tuple[Mapping[str, Any], ...] = ()  # of the reconstruction that were run or left out, each with its reason
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # log, settings and versions that it came from
+    # Only in truth: where objects were left without labels; None when the labels are complete
     ignore_regions: IgnoreRegions | None = None
-    map_features: MapFeatures | None = None
+    map_features: MapFeatures | None = None  # markings, borders and lanes; None where they were not looked for
     signals: tuple[Signal, ...] = ()
     sensors: tuple[Mapping[str, Any], ...] = ()
-    tags: tuple[Tag, ...] | None = None
+    tags: tuple[Tag, ...] | None = None  # what its road users do; None where that was not looked for
 
     def __repr__(self) -> str:
         """Return name, agents and duration in one line."""
@@ -266,10 +233,7 @@ class Scenario:
         return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or not a.is_doubtful))
 
     def trusted(self, min_confidence: float) -> Scenario:
-        """Return a copy with the agents whose confidence is at least `min_confidence`, in [0, 1]; the ego stays.
-
-        Raises `ConfigError` when `min_confidence` is no number from 0 to 1.
-        """
+        """Return a copy with the agents whose confidence is at least `min_confidence`, from 0 to 1, and the ego."""
         if not 0 <= min_confidence <= 1:
             raise ConfigError(f"confidence: {min_confidence:g}, expected a number from 0 to 1")
         return replace(self, agents=tuple(a for a in self.agents if a.id == EGO or a.confidence >= min_confidence))
@@ -282,11 +246,7 @@ class Scenario:
 
     @classmethod
     def load(cls, path: Path | str) -> Scenario:
-        """Read and check a scenario file.
-
-        Raises `ScenarioError` when the file is missing, is not JSON, violates the schema or holds impossible values; it names
-        the agent and the field.
-        """
+        """Read and check a scenario file; `ScenarioError` names the agent and the field that are wrong."""
         document = read_json(path, ScenarioError)
         try:
             return cls.from_dict(document)
@@ -404,10 +364,7 @@ class Scenario:
 
     @classmethod
     def from_dict(cls, document: Any) -> Scenario:
-        """Build a scenario from a document.
-
-        Raises `ScenarioError` when it violates the schema or holds impossible values.
-        """
+        """Build a scenario from a document; `ScenarioError` when it violates the schema or holds impossible values."""
         version = document.get("scenario_version") if isinstance(document, dict) else None
         if version != VERSION:
             raise ScenarioError(

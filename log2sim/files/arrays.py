@@ -36,8 +36,6 @@ class ArrayFile:
 
     The file has no name, and the system removes it when the process ends in whatever way. It lies in the folder of temporary
     files, which the environment variable TMPDIR names.
-
-    `memory_bytes`: of the arrays that stay in memory.
     """
 
     def __init__(self, memory_bytes: int | None = None) -> None:

@@ -77,10 +77,9 @@ _SETTINGS, _LAST_RUN = "settings.json", "last_run.json"
 
 
 class DiskCache:
-    """A cache folder.
+    """A cache folder, made when the first entry is kept, for this user alone.
 
-    `folder`: made when the first entry is kept, for this user alone. `max_bytes`: size of all entries; without it that
-    of the folder's settings. `problem`: why nothing more is written: what went wrong first.
+    `max_bytes`: size of all entries; without it that of the folder's settings. `problem`: why nothing more is written.
     """
 
     def __init__(self, folder: Path, max_bytes: int | None = None) -> None:
@@ -124,7 +123,8 @@ class DiskCache:
             return False
         path = self._path_of(name)
         try:
-            self._make(path.parent)
+            for folder in (self.folder, path.parent):  # for this user alone
+                folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             _write(path, content)
         except OSError as error:
             self.problem = f"{error.filename or path.parent}: {error.strerror or error}"
@@ -142,10 +142,7 @@ class DiskCache:
             self._write_json(_LAST_RUN, note)
 
     def set_limit(self, max_mb: int) -> None:
-        """Set the limit for this and all later runs, and drop what is beyond it.
-
-        Raises `ConfigError` when it cannot be written.
-        """
+        """Set the limit for this and all later runs, and drop what is beyond it; `ConfigError` when it cannot be written."""
         self.max_bytes = max_mb * 1024**2
         self._write_json(_SETTINGS, {"max_mb": max_mb})
         if self.problem is not None:
@@ -170,11 +167,6 @@ class DiskCache:
         if not _NAME.fullmatch(name):
             raise ValueError(f"name of an entry {name!r}: expected a group, a dot and a key in hexadecimal digits")
         return self.folder / name[-1] / name
-
-    def _make(self, folder: Path) -> None:
-        """Make this folder or one in it, for this user alone."""
-        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        folder.mkdir(mode=0o700, exist_ok=True)
 
     def _entries(self, digits: str = DIGITS) -> Iterator[tuple[Path, os.stat_result]]:
         """Yield the entries of some folders."""
@@ -210,7 +202,7 @@ class DiskCache:
 
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
         try:
-            self._make(self.folder)
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             _write(self.folder / name, json.dumps(dict(value)).encode())
         except OSError as error:
             self.problem = self.problem or f"{error.filename or self.folder}: {error.strerror or error}"

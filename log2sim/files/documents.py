@@ -94,10 +94,9 @@ class RepeatedKeysError(ValueError):
 
 
 def parse_unique(text: str, **hooks: Any) -> Any:
-    """Parse a JSON text in which no key occurs twice in one object.
+    """Parse a JSON text in which no key occurs twice in one object, with `json.loads`' parsers of numbers as `hooks`.
 
-    `**hooks`: parsers of numbers, as `json.loads` takes them. Raises `RepeatedKeysError` for keys that do; all others
-    are found first; `ValueError` for what is no JSON.
+    Raises `RepeatedKeysError` for keys that do; all others are found first; `ValueError` for what is no JSON.
     """
     repeated: list[str] = []
     value = json.loads(text, object_pairs_hook=partial(_unique, repeated), **hooks)
@@ -134,11 +133,10 @@ SHOWN_CHARACTERS = 80
 
 
 def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
-    """Describe the first error of a document, unknown keys before all others.
+    """Describe the first error of a document, unknown keys before all others; the model's JSON Schema tells what is possible.
 
-    `error`: what `model.model_validate` raised. `model`: the model; its JSON Schema tells which keys and values are
-    possible. Returns such as "unknown key 'agent[0].colour'; did you mean 'agent[0].color'?" or "'rate_hz' is 0,
-    expected a number from 0.1 to 200".
+    Returns such as "unknown key 'agent[0].colour'; did you mean 'agent[0].color'?" or "'rate_hz' is 0, expected a number from 0.1
+    to 200".
     """
     problems = error.errors(include_url=False)
     problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
@@ -156,7 +154,9 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
         location = location[:-1]
     expected = _schema_at(schema, location)
     if isinstance(found, list | tuple) and expected.get("type") == "array":
-        return f"'{_key(location)}' has {len(found)} values, expected {_count(expected)}"
+        low, high = expected.get("minItems", 0), expected.get("maxItems")
+        count = f"{low} or more" if high is None else f"{low}" if low == high else f"{low} to {high}"
+        return f"'{_key(location)}' has {len(found)} values, expected {count}"
     text = repr(found) if len(repr(found)) <= SHOWN_CHARACTERS else f"{repr(found)[:SHOWN_CHARACTERS]}..."
     wanted = "a finite number" if problem["type"] == "finite_number" else _expected(expected)
     return f"'{_key(location)}' is {text}, expected {wanted}" if location else str(problem["msg"])
@@ -183,11 +183,6 @@ def _schema_at(schema: dict[str, Any], location: Sequence[Any]) -> dict[str, Any
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rpartition("/")[2]]
     return node
-
-
-def _count(schema: dict[str, Any]) -> str:
-    low, high = schema.get("minItems", 0), schema.get("maxItems")
-    return f"{low} or more" if high is None else f"{low}" if low == high else f"{low} to {high}"
 
 
 def _expected(schema: dict[str, Any]) -> str:
@@ -217,9 +212,7 @@ _SURROGATE_ESCAPE = re.compile(r"\\u[dD][89a-fA-F]")
 def replaced(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path`, renamed to it when the block succeeds and removed when it fails.
 
-    Within `log2sim.files.outputs.together` it is renamed at the end of that.
-
-    Raises `ConfigError` for a path that cannot be written.
+    Within `log2sim.files.outputs.together` it is renamed at the end of that. Raises `ConfigError` for a path that cannot be written.
     """
     target = Path(path)
     if target.is_dir():
@@ -286,11 +279,7 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
 
 
 def check_folder(folder: Path, *, overwrite: bool) -> None:
-    """Refuse an output folder that cannot be written, or that another run is writing, before any work is done for it.
-
-    Raises `ConfigError` for a file, a parent that is a file or may not be written in, or a folder that another run is
-    about to write.
-    """
+    """Refuse with `ConfigError` a folder that cannot be written, or that another run is writing, before any work is done for it."""
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; give the name of a folder")
     refuse_below_file(folder / "any file" if folder.exists() else folder)
@@ -306,8 +295,8 @@ def write_json(path: Path | str, value: Any) -> None:
 def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
     """Read a JSON file.
 
-    Raises `error` for a file that is missing, too large, not valid JSON, or has a number that is not finite; with its
-    position. For keys that occur twice in one object, too: which of the two values is meant, no program can tell.
+    Raises `error`, with its position, for a file that is missing, too large, not valid JSON, or has a number that is not finite or
+    keys that occur twice in one object: which of the two values is meant, no program can tell.
     """
     path = Path(path)
     if path.is_dir():
@@ -320,8 +309,12 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
             json.dumps(value, ensure_ascii=False).encode()
         return value
     except _NotFinite as problem:
+        try:
+            place = _path_of_not_finite(json.loads(text)) or "the document"
+        except (ValueError, RecursionError):  # another error follows it, or too deep nesting
+            place = "a number"
         raise error(
-            f"{path}: {_location_of_not_finite(text)} is {problem}, expected a finite number; write one, or null where the schema allows it"
+            f"{path}: {place} is {problem}, expected a finite number; write one, or null where the schema allows it"
         ) from None
     except RepeatedKeysError as problem:
         raise error(f"{path}: {problem}") from None
@@ -354,14 +347,6 @@ def _whole(word: str) -> int | float:
     return int(word) if len(word) <= MAX_DIGITS else _refuse(word)
 
 
-def _location_of_not_finite(text: str) -> str:
-    """Return where the first number of a JSON text is that is not finite."""
-    try:
-        return _path_of_not_finite(json.loads(text)) or "the document"
-    except (ValueError, RecursionError):  # another error follows it, or too deep nesting
-        return "a number"
-
-
 def _path_of_not_finite(value: Any) -> str | None:
     """Return the path of the first number that is not finite, as "a.b[3]"; None when there is none."""
     if isinstance(value, (float, int)):
@@ -392,17 +377,11 @@ def load_schema(name: str) -> dict[str, Any]:
 
 
 def check(document: Any, name: str, error: type[Log2SimError]) -> None:
-    """Validate a document against a schema.
-
-    Raises `error` naming the first field that violates the schema and what was expected there.
-    """
+    """Validate a document against a schema; `error` names the first field that violates it and what was expected there."""
     problem = next(_validator()(load_schema(name)).iter_errors(document), None)
     if problem is None:
         return
-    place = (
-        "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in problem.absolute_path).lstrip(".")
-        or "the document"
-    )
+    place = _key(list(problem.absolute_path)) or "the document"
     message = problem.message if len(problem.message) < 200 else f"{problem.message[:80]} ... {problem.message[-100:]}"
     raise error(f"{place}: {message}")
 

@@ -31,10 +31,9 @@ class TooLargeError(OSError):
 
 
 def open_regular(path: Path | str, *, buffering: int = -1) -> BinaryIO:
-    """Open a regular file to read its bytes.
+    """Open a regular file to read its bytes; `OSError` for one that is missing or may not be read, and for whatever else it is.
 
-    `buffering`: as for `open`. Raises `OSError` for a file that is missing or may not be read, and for whatever is no
-    regular file. A pipe would wait for somebody who writes, a device may never end, and both have a size of 0.
+    A pipe would wait for somebody who writes, a device may never end, and both have a size of 0.
     """
     _require_regular(os.stat(path).st_mode, path)  # before it is opened: opening a device may already do something
     # Without waiting, should it have become a pipe by now.
@@ -48,11 +47,7 @@ def open_regular(path: Path | str, *, buffering: int = -1) -> BinaryIO:
 
 
 def read_bytes(path: Path | str, limit_bytes: int) -> bytes:
-    """Read a whole regular file.
-
-    Raises `TooLargeError` for more than `limit_bytes`, also in a file that grows while it is read; no more than that is
-    read; `OSError` as `open_regular` does.
-    """
+    """Read a whole regular file of up to `limit_bytes`, also one that grows meanwhile, else `TooLargeError`; as `open_regular`."""
     with open_regular(path, buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
         parts, count = list[bytes](), 0
@@ -77,27 +72,21 @@ def read_file(
 ) -> bytes:
     """Read a whole regular file as `read_bytes` does; whatever is wrong with it is an `error` of one line.
 
-    `error`: of the exception that is raised. `where`: what its message begins with; by default the path. `missing`:
-    what it says of a file that is not there.
+    It begins with `where`, by default the path; `missing` is what it says of a file that is not there.
     """
     try:
         return read_bytes(path, limit_bytes)
     except FileNotFoundError:
-        raise error(f"{where or path}: {missing}") from None
-    except TooLargeError as problem:
-        raise error(f"{where or path}: {problem.strerror}") from None
-    except OSError as problem:
-        raise error(f"{where or path}: cannot be read: {problem.strerror}") from None
-    except ValueError as problem:  # a zero byte in the path
-        raise error(f"{where or path}: cannot be read: {problem}") from None
+        problem = missing
+    except OSError as other:
+        problem = f"{'' if isinstance(other, TooLargeError) else 'cannot be read: '}{other.strerror}"
+    except ValueError as other:  # a zero byte in the path
+        problem = f"cannot be read: {other}"
+    raise error(f"{where or path}: {problem}")
 
 
 def require_readable(path: Path | str, limit_bytes: int, error: type[Exception], what: str) -> None:
-    """Check a file that another library is going to open by its name.
-
-    `error`: of the exception that is raised for a file that is missing, empty, too large or no regular file. `what`:
-    what it should be, for the message.
-    """
+    """Check a file that another library is going to open by its name; `error` where it is missing, empty, too large or irregular."""
     try:
         with open_regular(path, buffering=0) as file:
             size = os.fstat(file.fileno()).st_size
@@ -153,10 +142,7 @@ def follows_links() -> bool:
 
 
 def inside(root: Path, relative: str, what: str) -> Path:
-    """Resolve a path that a log names.
-
-    Raises `LogError` for a path outside the log's folder, also through a symbolic link unless links are followed.
-    """
+    """Resolve a path that a log names; `LogError` where it leaves the log's folder, also by a link unless links are followed."""
     for name, most in (*((part, MAX_NAME_BYTES) for part in Path(relative).parts), (relative, MAX_PATH_BYTES)):
         if len(os.fsencode(name)) > most:
             raise LogError(f"{what}: the file name '{name[:20]}...' is longer than the {most} bytes of file systems")
@@ -181,9 +167,9 @@ def require_links_inside(folder: Path, *roots: Path, files: Iterable[Path] = ())
     name, or of the same number ("000007.bin" and "0000000007.bin"). This is for layouts that fix the names of their files; where
     a log states them, `inside` allows no link that leaves.
 
-    `folder`: all that is in it is looked at; it may lie behind links itself. `*roots`: other folders that belong to the
-    log, such as the one that was named. `files`: files of the log elsewhere; each must lie in one of the folders.
-    Raises `LogError` naming the first link that leads out, and where to.
+    `folder`: all that is in it is looked at; it may lie behind links itself. `roots`: other folders that belong to the log, such as
+    the one that was named. `files`: files of the log elsewhere; each must lie in one of the folders. Raises `LogError` naming the
+    first link that leads out, and where to.
     """
     if _followed.get():
         return
@@ -193,10 +179,7 @@ def require_links_inside(folder: Path, *roots: Path, files: Iterable[Path] = ())
 
 
 def require_link_inside(file: Path, *roots: Path) -> None:
-    """Refuse one file of a log that is a link out of its folders, as `require_links_inside` does.
-
-    Raises `LogError` naming the link and where it leads to.
-    """
+    """Refuse one file of a log that is a link out of its folders, as `require_links_inside` does."""
     if not _followed.get():
         _require_inside(file, [root.resolve() for root in roots])
 

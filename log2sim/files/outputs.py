@@ -41,10 +41,9 @@ def holding_claims() -> Iterator[None]:
 def claim(target: Path, *, overwrite: bool) -> None:
     """Within `holding_claims`: refuse a file or folder that another living run is about to write, or that cannot be written.
 
-    `overwrite`: whether another run does not matter. Raises `ConfigError` before anything was done.
-
-    A locked file next to the target shows it to others. The system unlocks it when the process ends in any way, so that no claim of a
-    dead run stays. Folders that are missing above the target are made, and removed again where nothing came into them.
+    Raises `ConfigError` before anything was done; with `overwrite` another run does not matter. A locked file next to the target
+    shows it to others. The system unlocks it when the process ends in any way, so that no claim of a dead run stays. Folders that
+    are missing above the target are made, and removed again where nothing came into them.
     """
     claims, path = _claims.get(), target.absolute()
     if claims is None or path in claims:
@@ -159,8 +158,7 @@ def remove(path: Path) -> None:
 def put(temporary: Path, target: Path) -> bool:
     """Rename a finished file to its target, or keep it for the end of `together`; return whether it waits for that.
 
-    Raises `ConfigError` when another run wrote the target meanwhile and this one may not replace it; `OSError` when it
-    cannot be renamed.
+    Raises `ConfigError` when another run wrote the target meanwhile and this one may not replace it; `OSError` when it fails.
     """
     waiting = _waiting.get()
     if waiting is not None:
@@ -190,10 +188,7 @@ def written_meanwhile(target: Path) -> ConfigError:
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Within the block files are written under temporary names; at its end all of them appear, after an error none.
-
-    Raises `ConfigError` when one of them cannot be renamed; those that are new are removed again.
-    """
+    """Within the block files are written under temporary names; at its end all of them appear, after an error none."""
     files: list[tuple[Path, Path]] = []
     token = _waiting.set(files)
     try:
@@ -208,10 +203,7 @@ def together() -> Iterator[None]:
 
 
 def place_all(files: Sequence[tuple[Path, Path]]) -> None:
-    """Rename finished files to their targets, all of them or none.
-
-    Raises `ConfigError` when one of them cannot be renamed; those that are new are removed again.
-    """
+    """Rename finished files to their targets, all of them or none; `ConfigError` when one of them cannot be renamed."""
     placed: list[Path] = []
     try:
         for temporary, target in files:
@@ -320,16 +312,13 @@ def unfinished_folder(temporary: Path, target: Path) -> Iterator[Path]:
             raise
         raise ConfigError(str(error).replace(str(temporary), str(target))) from error
     except OSError as error:
-        path = Path(error.filename) if isinstance(error.filename, str) else _latest_in(temporary)
+        # Writing names no file when it fails for lack of space: then it is the one that was changed last.
+        inside = [path for path in temporary.rglob("*") if path.is_file()]
+        latest = max(inside, key=lambda path: path.stat().st_mtime_ns, default=temporary)
+        path = Path(error.filename) if isinstance(error.filename, str) else latest
         if path != target and not path.is_relative_to(temporary):
             raise  # of a file that is read
-        inside = path.relative_to(temporary) if path.is_relative_to(temporary) else Path()
-        raise ConfigError(f"{target / inside}: cannot be written: {error.strerror or error}") from error
+        place = target / path.relative_to(temporary) if path.is_relative_to(temporary) else target
+        raise ConfigError(f"{place}: cannot be written: {error.strerror or error}") from error
     finally:
         remove(temporary)
-
-
-def _latest_in(folder: Path) -> Path:
-    """Return the file of a folder that was changed last: writing names no file when it fails for lack of space."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return max(files, key=lambda path: path.stat().st_mtime_ns, default=folder)

@@ -71,10 +71,7 @@ def find_defect(kind: str, found: Any) -> str | None:
 
 
 def require_members(found: Any, members: tuple[str, ...], call: Call, source: str) -> None:
-    """Require that an object has its members and that its method `detect` can be called.
-
-    Raises `PluginError` in one line that begins with `source`.
-    """
+    """Require that an object has its members and that its method `detect` can be called; `PluginError` begins with `source`."""
     missing = [name for name in members if not hasattr(found, name)]
     if missing:
         lacking = f"without {', '.join(map(repr, missing))}; expected an object with {', '.join(members)}"
@@ -168,8 +165,8 @@ def installed(kind: str) -> EntryPoints:
 def load(kind: str, name: str) -> Any:
     """Import the plug-in `name` of a kind.
 
-    Raises `ConfigError` when no plug-in has that name; the message lists the known ones and the nearest; `PluginError`
-    when one of another package cannot be imported, or is not what the kind asks for; the message names the package.
+    Raises `ConfigError` that lists the known ones when none has that name; `PluginError` that names the package when one of another
+    package cannot be imported, or is not what the kind asks for.
     """
     if name in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][name].partition(":")

@@ -29,7 +29,7 @@ from log2sim.geometry import (
     undistort,
     yaw_of,
 )
-from log2sim.localization.odometry import share_of_motion
+from log2sim.localization.odometry import is_during, share_of_motion
 from log2sim.perception.records import RecordSource
 
 MIN_CORNER = 1e-4
@@ -46,10 +46,9 @@ MIN_SHOWN_SHARE = 0.2
 
 
 class RoadView:
-    """The road before a camera, seen from above.
+    """The road before a camera, seen from above: `map_uv` (H, W, 2) are pixels of the image to look at, for each of the view.
 
-    `map_uv`: (H, W, 2): pixels of the image to look at, for each pixel of the view. `shown`: (H, W) uint8: 1 where the
-    image shows the road, away from its border.
+    `shown` (H, W) uint8: 1 where the image shows the road, away from its border.
     """
 
     def __init__(self, camera: Camera, height_m: float, scale: float) -> None:
@@ -89,10 +88,8 @@ class RoadView:
             return np.zeros((0, 2)), np.zeros((0, 2))
         start = cv2.goodFeaturesToTrack(first, ROAD_POINTS, MIN_CORNER, ROAD_SPACING_PX, mask=self.shown)
         rows, columns = -self.axes @ guess_m * ROAD_PX_PER_M
-        guess_px = np.array([columns, rows])
-        begin, end = follow_points(
-            first, second, start, window_px=ROAD_WINDOW_PX, levels=ROAD_LEVELS, guess_px=guess_px
-        )
+        how: Any = {"window_px": ROAD_WINDOW_PX, "levels": ROAD_LEVELS, "guess_px": np.array([columns, rows])}
+        begin, end = follow_points(first, second, start, **how)
         inside = np.clip(np.round(end).astype(int), 0, np.array(self.shown.shape)[::-1] - 1)
         good = self.shown[inside[:, 1], inside[:, 0]] > 0
         return self.in_ego(begin[good]), self.in_ego(end[good])
@@ -103,8 +100,8 @@ def follow_points(
 ) -> tuple[Array, Array]:
     """Follow points (N, 1, 2), or None, to the next image and back: pixels (M, 2) of those that return.
 
-    `window_px`: side of the patch around a point. `levels`: halvings of the image in which motion is searched first. `guess_px`: (2,):
-    expected motion.
+    They move by about `guess_px` (2,), patches around them are `window_px` wide, and motion is searched in the image halved `levels`
+    times first.
     """
     import cv2
 
@@ -180,19 +177,12 @@ def height_m(log: Log, camera: Camera) -> float:
 def follow_camera(
     log: Log, name: str, *, during_ns: tuple[int, int] | None = None, progress: Progress | None = None
 ) -> CameraPath:
-    """Estimate the path of the ego from the images of a camera.
+    """Estimate the path of the ego from the images of a camera; `LogError` where these are too dark or show too little of the road.
 
-    Raises `LogError` where the images are too dark, or show too little of the road for most of their time.
-
-    Notes
-    -----
-    The road is taken for a plane, to which the ego is level on average. Scale and heading drift: expect some percent of
-    the path.
+    The road is taken for a plane, to which the ego is level on average. Scale and heading drift: expect some percent of the path.
     """
     stream = log.streams[name]
-    index = np.arange(len(stream.t_ns))
-    if during_ns is not None:
-        index = index[(stream.t_ns >= during_ns[0]) & (stream.t_ns <= during_ns[1])]
+    index = np.flatnonzero(is_during(stream.t_ns, during_ns))
     follower, records = _Follower(log, log.cameras[name]), RecordSource(log)
     t_ns, poses, predicted = [], [np.eye(4)], [False]
     last, motion, motion_s, dark, unreadable = None, np.eye(4), 1.0, 0, 0
@@ -213,36 +203,22 @@ def follow_camera(
             last = gray
         if progress is not None:
             progress(done, len(index))
-    _check(log, name, np.array(predicted), frames=len(index), read=len(t_ns), dark=dark)
-    return CameraPath(
-        name,
-        np.array(t_ns, dtype=np.int64),
-        np.stack(poses),
-        np.array(predicted),
-        len(index),
-        float(np.median(follower.agreed)) if follower.agreed else 0.0,
-    )
-
-
-def _check(log: Log, name: str, predicted: NDArray[np.bool_], *, frames: int, read: int, dark: int) -> None:
-    """Raise `LogError` for a path that is mostly a guess."""
     where = f"{log.name}: camera motion by '{name}'"
-    if read < 2:
-        raise LogError(f"{where}: {read} of {frames} images can be read; expected two at least")
-    if dark > read / 2:
-        raise LogError(f"{where}: {dark} of {read} images are too dark to show motion; give poses")
-    if predicted[1:].mean() > 0.5:
+    if len(t_ns) < 2:
+        raise LogError(f"{where}: {len(t_ns)} of {len(index)} images can be read; expected two at least")
+    if dark > len(t_ns) / 2:
+        raise LogError(f"{where}: {dark} of {len(t_ns)} images are too dark to show motion; give poses")
+    if np.mean(predicted[1:]) > 0.5:
         raise LogError(
-            f"{where}: {int(predicted.sum())} of {read} images show too little of the road to tell how far the ego moves; "
-            "give poses"
+            f"{where}: {sum(predicted)} of {len(t_ns)} images show too little of the road to tell how far the ego moves; give poses"
         )
+    on_road = float(np.median(follower.agreed)) if follower.agreed else 0.0
+    stamps = np.array(t_ns, dtype=np.int64)
+    return CameraPath(name, stamps, np.stack(poses), np.array(predicted), len(index), on_road)
 
 
 class _Follower:
-    """Motion between two images of one camera.
-
-    `agreed` collects the numbers of points on the road that agreed on each motion.
-    """
+    """Motion between two images of one camera; `agreed`: numbers of points on the road that agreed on each motion."""
 
     def __init__(self, log: Log, camera: Camera) -> None:
         self.camera, self.height_m = camera, height_m(log, camera)
@@ -262,7 +238,10 @@ class _Follower:
 
     def motion(self, first: NDArray[np.uint8], second: NDArray[np.uint8], dt_s: float) -> Array | None:
         """Estimate the pose (4, 4) of the ego at the second image in its frame at the first; None where too little is seen."""
-        from_px, to_px = _followed(first, second)
+        import cv2
+
+        corners = cv2.goodFeaturesToTrack(first, MAX_POINTS, MIN_CORNER, SPACING_PX)
+        from_px, to_px = follow_points(first, second, corners, window_px=WINDOW_PX, levels=LEVELS)
         if len(from_px) < MIN_FOLLOWED:
             return None
         if np.median(np.linalg.norm(to_px - from_px, axis=1)) < STANDING_PX:
@@ -342,11 +321,3 @@ def _pure_rotation(from_xy: Array, to_xy: Array, tolerance: float) -> Array | No
         off = np.linalg.norm(second - first @ rotation.T, axis=1)
         weight = 1 / (1 + (off / tolerance) ** 2) ** 2
     return rotation if np.mean(off < tolerance) > MIN_ROTATION_SHARE else None
-
-
-def _followed(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Array, Array]:
-    """Follow corners from one image to the next: pixels (N, 2) in both."""
-    import cv2
-
-    corners = cv2.goodFeaturesToTrack(first, MAX_POINTS, MIN_CORNER, SPACING_PX)
-    return follow_points(first, second, corners, window_px=WINDOW_PX, levels=LEVELS)

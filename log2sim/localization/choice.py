@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -135,25 +136,15 @@ Progress = Callable[[str, int, int], None]
 def localize(log: Log, config: Config, *, progress: Progress | None = None) -> tuple[Log, PoseChoice]:
     """Return the log with the poses that the settings ask for, and where they come from.
 
-    `config`: `poses.source`, `poses.check`, and `start_s` and `stop_s`, outside of which nothing is estimated.
-
-    Raises `ConfigError` for poses from a sensor that the log does not have. Raises `LogError` for a log without poses
-    whose sensors do not show how the ego moves. Raises `MissingExtra` for LiDAR odometry without its library.
+    Raises `ConfigError` for poses from a sensor that the log does not have, `LogError` for a log without poses whose sensors do not
+    show how the ego moves, `MissingExtra` for LiDAR odometry without its library.
     """
-    return _localize(
-        _Request(
-            log, config.poses.source, during_ns(log, config), progress or (lambda *_: None), check=config.poses.check
-        )
-    )
+    progress = progress or (lambda *_: None)
+    return _localize(_Request(log, config.poses.source, during_ns(log, config), progress, check=config.poses.check))
 
 
 def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress | None = None) -> Log:
-    """Return a log with the poses that something was made with, as its provenance states them under "poses".
-
-    Without such an entry these are the log's own.
-
-    Raises `LogError, MissingExtra` as `localize` does.
-    """
+    """Return a log with the poses that something was made with, as its provenance states them under "poses", else its own."""
     entry = provenance.get("poses")
     entry = entry if isinstance(entry, Mapping) else {}
     source, during = entry.get("source"), entry.get("during_ns")
@@ -187,9 +178,7 @@ def _localize(request: _Request) -> tuple[Log, PoseChoice]:
         log, choice = _choose(request)
         return log, replace(choice, checked=request.check)
     given = request.log.ego
-    checked = bridge_by_lidar(
-        request.log, check_poses(given), lambda done, total: request.progress("odometry", done, total)
-    )
+    checked = bridge_by_lidar(request.log, check_poses(given), partial(request.progress, "odometry"))
     if checked.track is given:
         mended = request.log
     elif checked.moved:
@@ -237,10 +226,8 @@ def _mounts(log: Log) -> set[str]:
 def _by_camera(request: _Request) -> tuple[Log, PoseChoice]:
     """Estimate poses by the motion of a camera."""
     log = request.log
-    found = follow_camera(
-        log, motion_camera(log), during_ns=request.during_ns,
-        progress=lambda done, total: request.progress("camera motion", done, total),
-    )  # fmt: skip
+    progress = partial(request.progress, "camera motion")
+    found = follow_camera(log, motion_camera(log), during_ns=request.during_ns, progress=progress)
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.start_T_ego, _max_gap_s(found.t_ns)))
     estimate = {**camera_figures(found), **_difference(track, log.ego), "frame": frame}
     findings = (Finding("planar_motion", "ego"), *_predicted("camera motion", found.predicted))
@@ -265,14 +252,13 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         )
     stamps = log.streams[lidar].t_ns
     if log.ego is None and len(stamps) == 1:
-        return _pose_of_single_sweep(request, lidar, stamps)
+        # The ego's frame at the only sweep is the map.
+        track, frame = _in_map(log, PoseTrack(stamps, np.eye(4)[None]), lidar)
+        reason = "the log has no poses and a single sweep, whose frame is the map"
+        estimate: dict[str, Any] = {"lidar": lidar, "sweeps": 1, "poses": 1, "frame": frame}
+        return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate)
     try:
-        found = run_odometry(
-            log,
-            lidar,
-            during_ns=request.during_ns,
-            progress=lambda done, total: request.progress("odometry", done, total),
-        )
+        found = run_odometry(log, lidar, during_ns=request.during_ns, progress=partial(request.progress, "odometry"))
     except LogError as problem:
         if not may_keep:
             raise
@@ -280,7 +266,12 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
     track, frame = _in_map(log, PoseTrack(found.t_ns, found.odom_T_ego, _max_gap_s(found.t_ns)), lidar)
     estimate = {**odometry_figures(found), **_difference(track, log.ego), "frame": frame}
     if may_keep:
-        return _better_of(request, found, track, estimate)
+        verdict = compare_with_given(log, found, track)
+        choice = request.answer(
+            "given" if verdict.keep else "lidar", verdict.reason, excess_m=verdict.excess_m, scatter_m=verdict.scatter_m,
+            estimate=estimate, findings=_doubts(log, found),
+        )  # fmt: skip
+        return (log if verdict.keep else replace_poses(log, track)), choice
     unsure = unsure_share(found)
     if log.ego is None and unsure > MAX_UNSURE_SHARE_ALONE:
         raise LogError(
@@ -289,28 +280,6 @@ def _by_lidar(request: _Request) -> tuple[Log, PoseChoice]:
         )
     reason = "as requested" if requested == "lidar" else "the log has no poses" + _unplaced(log)
     return replace_poses(log, track), request.answer("lidar", reason, estimate=estimate, findings=_doubts(log, found))
-
-
-def _better_of(
-    request: _Request, found: Odometry, track: PoseTrack, estimate: dict[str, Any]
-) -> tuple[Log, PoseChoice]:
-    """Keep the poses of the log unless those of odometry, `track`, are better."""
-    log = request.log
-    verdict = compare_with_given(log, found, track)
-    choice = request.answer(
-        "given" if verdict.keep else "lidar", verdict.reason, excess_m=verdict.excess_m, scatter_m=verdict.scatter_m,
-        estimate=estimate, findings=_doubts(log, found),
-    )  # fmt: skip
-    return (log if verdict.keep else replace_poses(log, track)), choice
-
-
-def _pose_of_single_sweep(request: _Request, lidar: str, t_ns: NDArray[np.int64]) -> tuple[Log, PoseChoice]:
-    """Take the ego's frame at the only sweep of a log as its map."""
-    track, frame = _in_map(request.log, PoseTrack(t_ns, np.eye(4)[None]), lidar)
-    estimate = {"lidar": lidar, "sweeps": 1, "poses": 1, "frame": frame}
-    return replace_poses(request.log, track), request.answer(
-        "lidar", "the log has no poses and a single sweep, whose frame is the map", estimate=estimate
-    )
 
 
 def during_ns(log: Log, config: Config) -> tuple[int, int] | None:
@@ -336,7 +305,11 @@ def _in_map(log: Log, estimated: PoseTrack, lidar: str | None = None) -> tuple[P
     map_T_start = None if log.ego is None else fit_to_given(estimated, log.ego)
     frame = "fitted to the given poses"
     if map_T_start is None:
-        level = None if lidar is None else _level(log, lidar, int(estimated.t_ns[0]))
+        sweep = None
+        if lidar is not None:
+            nearest = int(nearest_index(log.streams[lidar].t_ns, int(estimated.t_ns[0]))[0])
+            sweep = read_ego_sweep(log, lidar, nearest)
+        level = None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
         frame = "the ego's at the first pose" + ("" if level is None else ", level on the ground")
         map_T_start = np.eye(4) if level is None else level
     return replace(estimated, map_T_ego=map_T_start @ estimated.map_T_ego), frame
@@ -345,12 +318,6 @@ def _in_map(log: Log, estimated: PoseTrack, lidar: str | None = None) -> tuple[P
 def _unplaced(log: Log) -> str:
     """Say that without poses the map of a log is not where the log places it on Earth; nothing where it names no place."""
     return "" if log.map.projection is None else "; the map begins at the ego, not where the log places it on Earth"
-
-
-def _level(log: Log, lidar: str, t_ns: int) -> Array | None:
-    """Return the pose (4, 4) of the ego that puts the ground of the sweep at a stamp level; None without enough points on it."""
-    sweep = read_ego_sweep(log, lidar, int(nearest_index(log.streams[lidar].t_ns, t_ns)[0]))
-    return None if sweep is None else level_on_ground(sweep.xyz_m, log.ground_z_ego_m)
 
 
 def _difference(track: PoseTrack, given: PoseTrack | None) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -109,14 +110,11 @@ class PoseNoise:
         return [(float(w), noise, tau) for w, (_, noise, tau) in zip(weights / weights.sum(), found)]
 
     def solve(self, noise: Array, tau: float) -> tuple[Array, Array, float]:
-        """Solve for the values under errors of given sizes (4,) and time constant, s.
+        """Solve for the step (7,) under errors of given sizes (4,) and time constant, s, with its covariance (7, 7).
 
-        Returns the step (7,), its covariance (7, 7), and the share of the offset's information that is noise.
-
-        Notes
-        -----
-        The velocities by which a time offset shows have the errors of the poses in them: what these seem to tell about the
-        offset is taken off its information, as in regression with errors in the variables (Fuller, 1987, section 1.2).
+        Also the share of the offset's information that is noise: the velocities by which a time offset shows have the errors of the
+        poses in them, and what these seem to tell about the offset is taken off its information, as in regression with errors in
+        the variables (Fuller, 1987, section 1.2).
         """
         both, _ = self._eliminate(noise, tau)
         information, right = both[:-1, :-1] + self._prior, both[:-1, -1] + self._pull
@@ -230,12 +228,10 @@ def fit_clock_and_mount(seen: SweepPairs) -> Estimate:
 
 
 def _fit(seen: SweepPairs, prior_sigma: Array) -> Estimate:
-    """Fit with standard deviations (7,) of what is expected.
+    """Fit with standard deviations (7,) of what is expected, by Gauss-Newton.
 
-    Notes
-    -----
-    Gauss-Newton; sizes of the errors of the poses are estimated after the first steps, and the results for several time
-    constants of these are weighed by their likelihood.
+    Sizes of the errors of the poses are estimated after the first steps, and the results for several time constants of these are
+    weighed by their likelihood.
     """
     values = np.zeros(len(prior_sigma))
     for _ in range(FIRST_STEPS):
@@ -292,11 +288,8 @@ class Findings:
 
     def faults(self) -> list[Finding]:
         """Describe what is wrong, and what cannot be corrected although it was asked for."""
-        faults, asked, pose_error_m = (
-            unseen_faults(self.lidar, self.found, self.asked),
-            self.asked,
-            self.found.pose_error_m,
-        )
+        asked, pose_error_m = self.asked, self.found.pose_error_m
+        faults = unseen_faults(self.lidar, self.found, asked)
         if self.offset_s:
             values = {"offset_s": -self.offset_s, "offset_sigma_s": float(self.found.sigma[OFFSET])}
             values["pose_error_m"] = pose_error_m
@@ -347,34 +340,24 @@ MAX_POSE_ERROR_M = 0.5
 
 
 def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> tuple[Log, tuple[Finding, ...]]:
-    """Estimate time offset and mount of each LiDAR on the ego.
+    """Estimate time offset and mount of each LiDAR on the ego: the log, corrected where the settings ask for it, and what is wrong.
 
-    Returns `log`: corrected where the settings ask for it; `faults`: what is certain and large enough to matter; and
-    what cannot be corrected although it was asked for.
-
-    Notes
-    -----
-    Nothing is read where there is nothing to see: without a LiDAR on the ego, where it hardly moves, with poses that come from
-    a sensor of the log itself.
+    Faults are what is certain and large enough to matter, and what cannot be corrected although it was asked for. Nothing is read
+    where there is nothing to see: without a LiDAR on the ego, where it hardly moves, with poses that come from a sensor of the log.
     """
     faults: list[Finding] = []
     if log.ego is None or config.poses.source not in ("given", "auto"):
         return log, ()
+    asked = config.calibration
     for lidar in lidars_on_ego(sensors.restrict(log)):
-        log, found = _check_lidar(log, lidar, config, progress)
-        faults += found
+        seen = pair_sweeps(log, lidar, during_ns(log, config), partial(progress, f"check {lidar}"))
+        found = None if seen is None else fit_clock_and_mount(seen)
+        if seen is None or found is None or found.pose_error_m > MAX_POSE_ERROR_M:
+            faults += unseen_faults(lidar, None, asked)
+            continue
+        findings = Findings(lidar, found, seen, asked)
+        log, faults = corrected(log, findings), [*faults, *findings.faults()]
     return log, tuple(faults)
-
-
-def _check_lidar(log: Log, lidar: str, config: Config, progress: Progress) -> tuple[Log, list[Finding]]:
-    """Return the log with one LiDAR corrected, and its faults."""
-    asked, stage = config.calibration, f"check {lidar}"
-    seen = pair_sweeps(log, lidar, during_ns(log, config), lambda done, total: progress(stage, done, total))
-    found = None if seen is None else fit_clock_and_mount(seen)
-    if seen is None or found is None or found.pose_error_m > MAX_POSE_ERROR_M:
-        return log, unseen_faults(lidar, None, asked)
-    findings = Findings(lidar, found, seen, asked)
-    return corrected(log, findings), findings.faults()
 
 
 def corrected(log: Log, findings: Findings) -> Log:

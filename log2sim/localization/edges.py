@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, line_time_s, nearest_index, project
 from log2sim.localization.clocks import turn_mount
+from log2sim.localization.odometry import is_during
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
 
@@ -80,12 +81,9 @@ def keep_standing(edges: DepthEdges, others: DepthEdges) -> DepthEdges:
 
 
 def find_depth_edges(points: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Find the points at which a near surface ends on its left or right.
+    """Find the points (n,) at which a near surface ends on its left, counter-clockwise, or right, and which of the two.
 
-    `points`: (N, 3), m: around the sensor, z along the axis that it turns about.
-
-    Returns `index`: (n,) int; `left`: (n,) bool: whether the surface ends on its left, counter-clockwise; else on its
-    right.
+    `points` (N, 3), m: around the sensor, z along the axis that it turns about.
     """
     x, y, z = points.T
     range_m = np.sqrt(x * x + y * y + z * z)
@@ -233,13 +231,9 @@ def _near_image(camera: Camera, view: EdgeView) -> tuple[Array, NDArray[np.bool_
 def estimate_yaw(frames: Sequence[FrameScores]) -> YawEstimate | None:
     """Find the yaw angle at which depth edges and image edges agree, over frames in the order of time.
 
-    None where no angle stands out, or parts of the log disagree.
-
-    Notes
-    -----
-    Surfaces end somewhat beyond their last point, or before it, which moves edges on the left and on the right in opposite
-    ways: the overhang is found along with the angle. Sigma is that of the block jackknife over successive frames, which
-    share errors, with `SYSTEMATIC_RAD`.
+    None where no angle stands out, or parts of the log disagree. Surfaces end somewhat beyond their last point, or before it, which
+    moves edges on the left and on the right in opposite ways: the overhang is found along with the angle. Sigma is that of the block
+    jackknife over successive frames, which share errors, with `SYSTEMATIC_RAD`.
     """
     if len(frames) < MIN_FRAMES:
         return None
@@ -247,7 +241,11 @@ def estimate_yaw(frames: Sequence[FrameScores]) -> YawEstimate | None:
     sides = np.sum([frame.edges for frame in frames], axis=0)
     count, chance = int(sides.sum()), float(np.sqrt(sum(frame.squares for frame in frames)))
     angle_rad, height, ratio = _highest(scores.sum(axis=0))
-    if sides.min() < MIN_EDGES_A_SIDE or _count_supporting(scores, angle_rad) < MIN_FRAMES:
+    # As many frames support the angle as would, if all did alike, give a sum of this spread.
+    near = np.abs(yaw_angles() - angle_rad) <= MAX_OVERHANG_RAD
+    each = (scores - np.median(scores, axis=2, keepdims=True)).sum(axis=1)[:, near].max(axis=1).clip(min=0.0)
+    supporting = float(each.sum() ** 2 / (each**2).sum()) if each.any() else 0.0
+    if sides.min() < MIN_EDGES_A_SIDE or supporting < MIN_FRAMES:
         return None
     gain = height / count
     if ratio < MIN_RATIO or gain < MIN_GAIN or height < MIN_CHANCES * chance:
@@ -258,13 +256,6 @@ def estimate_yaw(frames: Sequence[FrameScores]) -> YawEstimate | None:
     if scatter > MAX_SCATTER_RAD:
         return None
     return YawEstimate(angle_rad, float(np.hypot(scatter, SYSTEMATIC_RAD)), gain, count)
-
-
-def _count_supporting(scores: Array, angle_rad: float) -> float:
-    """Count the frames that support an angle: as many as would, if all did alike, give a sum of that spread."""
-    near = np.abs(yaw_angles() - angle_rad) <= MAX_OVERHANG_RAD
-    height = (scores - np.median(scores, axis=2, keepdims=True)).sum(axis=1)[:, near].max(axis=1).clip(min=0.0)
-    return float(height.sum() ** 2 / (height**2).sum()) if height.any() else 0.0
 
 
 def _highest(scores: Array) -> tuple[float, float, float]:
@@ -298,18 +289,17 @@ MAX_CAMERA_TO_LIDAR_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """The sweeps that are looked at."""
+    """The sweeps that are looked at: rows (S,) of the stream of a LiDAR and their stamps (S,)."""
 
     lidar: str
-    sweeps: NDArray[np.int64]  # (S,): rows of its stream
-    t_ns: NDArray[np.int64]  # (S,)
+    sweeps: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
 
 
 def choose_moments(log: Log, lidar: str, reference: str, during_ns: tuple[int, int] | None) -> Moments:
     """Choose up to `MAX_FRAMES` sweeps, evenly spaced, that are near in time to frames of a reference camera."""
     frames, sweeps = log.streams[reference].t_ns, log.streams[lidar].t_ns
-    if during_ns is not None:
-        frames = frames[(frames >= during_ns[0]) & (frames <= during_ns[1])]
+    frames = frames[is_during(frames, during_ns)]
     if not len(frames) or not len(sweeps):
         return Moments(lidar, np.zeros(0, np.int64), np.zeros(0, np.int64))
     # Away from the ends, where poses are extrapolated.
@@ -340,7 +330,12 @@ class EdgeViews:
     def _view(self, name: str, k: int) -> EdgeView | None:
         log, stamps, t_ns = self._log, self._log.streams[name].t_ns, int(self._moments.t_ns[k])
         if k not in self._edges:
-            self._edges[k] = _standing_edges(log, self._moments.lidar, int(self._moments.sweeps[k]))
+            row = int(self._moments.sweeps[k])
+            # Edges that are there in the next sweep too, or in the one before the last.
+            next_row = row + 1 if row + 1 < len(log.streams[self._moments.lidar].t_ns) else row - 1
+            own = read_depth_edges(log, self._moments.lidar, row)
+            others = None if own is None or next_row < 0 else read_depth_edges(log, self._moments.lidar, next_row)
+            self._edges[k] = None if own is None or others is None else keep_standing(own, others)
             self._progress(len(self._edges), len(self._moments.sweeps))
         edges, frame = self._edges[k], int(nearest_index(stamps, np.array([t_ns]))[0])
         if edges is None or abs(int(stamps[frame]) - t_ns) > MAX_APART_NS:
@@ -360,10 +355,7 @@ def is_near(log: Log, name: str, lidar: str) -> bool:
 
 
 def points_in_mount(log: Log, camera: Camera, t_ns: int, points_map: Array) -> Array | None:
-    """Transform points (N, 3) to the frame that a camera is fixed in, at the times when their lines are exposed.
-
-    None where the ego's pose is not known.
-    """
+    """Transform points (N, 3) to the frame that a camera is fixed in, when their lines are exposed; None without the ego's pose."""
     if camera.mount == "map":
         return points_map
     if log.ego is None:
@@ -378,11 +370,3 @@ def points_in_mount(log: Log, camera: Camera, t_ns: int, points_map: Array) -> A
     exposed_ns = t_ns + np.round(line_time_s(camera, uv) * NS_PER_S).astype(np.int64)
     poses, known = log.ego.at(exposed_ns)
     return apply(inverse(np.where(known[:, None, None], poses, map_T_ego)), points_map)
-
-
-def _standing_edges(log: Log, lidar: str, row: int) -> DepthEdges | None:
-    """Find the edges of a sweep that are there in the next one too, or in the one before the last."""
-    edges = read_depth_edges(log, lidar, row)
-    next_row = row + 1 if row + 1 < len(log.streams[lidar].t_ns) else row - 1
-    others = None if edges is None or next_row < 0 else read_depth_edges(log, lidar, next_row)
-    return None if edges is None or others is None else keep_standing(edges, others)

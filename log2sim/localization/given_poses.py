@@ -114,8 +114,6 @@ MAX_BRIDGED_S = 8.0
 def check_poses(given: PoseTrack) -> CheckedPoses:
     """Check given poses and repair them where a vehicle cannot have moved so, or where they are far apart.
 
-    Notes
-    -----
     Stretches that are off by a constant are moved back, which keeps what they measured; what cannot be right, and gaps, are
     bridged by the most probable motion between the poses around. Of two parts of a path the one that lasts longer is taken for
     right. Roll and pitch stay as they are. Linear in the number of poses.

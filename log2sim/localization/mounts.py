@@ -29,7 +29,7 @@ from log2sim.localization.edges import (
     is_near,
     score_angles,
 )
-from log2sim.localization.odometry import densest_lidar
+from log2sim.localization.odometry import densest_lidar, is_during
 from log2sim.perception.records import RecordSource
 from log2sim.plan import LABELS, Sensors
 
@@ -90,12 +90,7 @@ def flow_agreement(camera: Camera, pairs: Sequence[FlowPair]) -> float | None:
 
 
 def find_exchanged(cameras: Mapping[str, Camera], pairs: Mapping[str, Sequence[FlowPair]]) -> dict[str, str]:
-    """Find cameras in whose images points move against their own mounts, but as the mount of the other says in both.
-
-    `pairs`: by camera, of those that may be exchanged.
-
-    Returns dict of str to str: the other camera, by camera.
-    """
+    """Find cameras in whose images points move against their own mounts, but as the mount of the other says in both: it, by camera."""
     own = {name: flow_agreement(cameras[name], pairs[name]) for name in pairs}
     against = [name for name, cosine in own.items() if cosine is not None and cosine < MAX_DISAGREEMENT]
     fits: dict[str, set[str]] = {}
@@ -111,8 +106,7 @@ def _choose_pairs(log: Log, t_ns: NDArray[np.int64], during_ns: tuple[int, int] 
     """Choose up to `MAX_PAIRS` pairs of rows between which the ego moves by about `MIN_APART_M`."""
     assert log.ego is not None
     poses, known = log.ego.at(t_ns) if len(t_ns) else (np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-    if during_ns is not None:
-        known &= (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+    known = known & is_during(t_ns, during_ns)
     rows = np.flatnonzero(known)
     if len(rows) < 2:
         return []
@@ -274,24 +268,17 @@ def check_cameras(
     jobs: int = 1,
     progress: Progress,
 ) -> tuple[Log, tuple[Finding, ...]]:
-    """Return the log, corrected where the settings ask for it, and what is wrong with its cameras.
+    """Return the log, corrected where the settings ask for it, and what is wrong with the cameras that the run uses.
 
-    `log`: with the poses and the LiDARs that the run uses. `config`: `calibration.fix_mounts`: whether mounts are
-    corrected. `sensors`: those that the run uses; others are not checked. `of_lidars`: of clocks and mounts of LiDARs.
-    Cameras are not checked against a LiDAR with one that is not corrected. `jobs`: processes that share the cameras.
-
-    Notes
-    -----
-    No yaw is estimated of a camera with which no LiDAR is mounted, that shows no edges, or of which several angles fit
-    alike; and no image is read where boxes come from the log. Where all cameras are turned alike, it is the LiDAR that is.
+    Against a LiDAR that `of_lidars` finds wrong and the run does not correct they are not checked. No yaw is estimated of a camera
+    with which no LiDAR is mounted, that shows no edges, or of which several angles fit alike; and no image is read where boxes come
+    from the log. Where all cameras are turned alike, it is the LiDAR that is. `jobs`: processes that share the cameras.
     """
     if config.detect.in_images in ("", LABELS):
         return log, ()
     lidar = densest_lidar(sensors.restrict(log)) or ""
-    if any(
-        f.subject == lidar and f.treatment == "kept" and f.kind in ("time_offset", "lidar_rotation") for f in of_lidars
-    ):
-        lidar = ""
+    doubtful = {f.subject for f in of_lidars if f.treatment == "kept" and f.kind in ("time_offset", "lidar_rotation")}
+    lidar = "" if lidar in doubtful else lidar
     check = _look(log, lidar, config, sensors, jobs, progress)
     fix = config.calibration.fix_mounts
     treatment: Treatment = "corrected" if fix else "kept"
@@ -391,13 +378,7 @@ def _values(yaw: YawEstimate) -> dict[str, float]:
 def check_calibration(
     log: Log, config: Config, sensors: Sensors, *, jobs: int = 1, progress: Progress
 ) -> tuple[Log, tuple[Finding, ...]]:
-    """Estimate offsets of clocks and rotations of mounts from a log.
-
-    `log`: with the poses that the run uses. `config`: `calibration`: whether to check, and what to correct; `start_s`,
-    `stop_s`: what is looked at. `sensors`: those that the run uses; others are not checked. `jobs`: processes that share the cameras.
-
-    Returns `log`: with the corrections that the settings ask for; `faults`.
-    """
+    """Estimate offsets of clocks and rotations of mounts: the log with the corrections that the settings ask for, and the faults."""
     if not config.calibration.check:
         return log, ()
     log, of_lidars = check_lidars(log, config, sensors, progress=progress)

@@ -37,10 +37,7 @@ TransformAt = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
 
 
 def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T_src_at: TransformAt) -> Array | None:
-    """Transform points (N, 3), m, each by the transform at its own stamp (N,).
-
-    Returns (N, 3) float64, m, or None: None where a transform is not known.
-    """
+    """Transform points (N, 3), m, each by the transform at its own stamp (N,); None where one is not known."""
     if len(xyz_m) == 0:
         return np.zeros((0, 3))
     first, span = int(t_ns.min()), int(t_ns.max() - t_ns.min())
@@ -153,10 +150,7 @@ def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:
 
 
 def compensated(sweep: EgoSweep, motion: Array, motion_s: float) -> Array:
-    """Take a constant motion out of a sweep: points (N, 3), m, in the ego's frame at its reference stamp.
-
-    `motion`: (4, 4): pose of the ego after `motion_s` in its frame before.
-    """
+    """Take a constant motion, the pose (4, 4) after `motion_s`, out of a sweep: points (N, 3), m, in the ego's frame at its stamp."""
     if sweep.t_ns is None or motion_s <= 0:
         return sweep.xyz_m
 
@@ -171,8 +165,6 @@ def compensated(sweep: EgoSweep, motion: Array, motion_s: float) -> Array:
 def share_of_motion(motion: Array, share: Array) -> Array:
     """Compute the parts (N, 4, 4) of a motion (4, 4) that is steady in the moving frame, for shares (N,) of its time.
 
-    Notes
-    -----
     The translation is scaled, which leaves out the bend of the path: 4 mm in 0.1 s at 10 m/s and 0.3 rad/s.
     """
     q = np.repeat(quaternion_from_rotation(motion[:3, :3])[None], len(share), axis=0)
@@ -212,10 +204,7 @@ class Fit:
 
 
 def load_small_gicp() -> ModuleType:
-    """Import the library for registration.
-
-    Raises `MissingExtra` where it is not installed.
-    """
+    """Import the library for registration; `MissingExtra` where it is not installed."""
     try:
         import small_gicp
     except ImportError:
@@ -280,12 +269,8 @@ class SurfaceMap:
 def weakest_direction(information: Array, points: int) -> tuple[float, Array]:
     """Find the direction of translation that a registration holds least: its constraint and unit vector (3,), ego frame.
 
-    `information`: (6, 6): of rotation and translation, in this order.
-
-    Notes
-    -----
-    The least eigenvalue of the information about translation alone, with rotation free (Zhang, Kaess, Singh, ICRA 2016, look at
-    the same eigenvalues).
+    The least eigenvalue of the information (6, 6) about translation alone, with rotation free (Zhang, Kaess, Singh, ICRA 2016, look
+    at the same eigenvalues).
     """
     rotation, both, translation = information[:3, :3], information[:3, 3:], information[3:, 3:]
     alone = translation - both.T @ np.linalg.pinv(rotation) @ both
@@ -332,25 +317,21 @@ class Odometry:
         return float(np.linalg.norm(np.diff(self.odom_T_ego[:, :3, 3], axis=0), axis=1).sum())
 
 
+def is_during(t_ns: NDArray[np.int64], during_ns: tuple[int, int] | None) -> NDArray[np.bool_]:
+    """Mark the stamps (N,) from the first to the last one of a time; all without it."""
+    return np.full(len(t_ns), True) if during_ns is None else (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+
+
 def run_odometry(
     log: Log, lidar: str, *, during_ns: tuple[int, int] | None = None, progress: Progress | None = None
 ) -> Odometry:
-    """Estimate the motion of the ego from the sweeps of a LiDAR.
+    """Estimate the motion of the ego from the sweeps of a LiDAR on it, all or those of a time.
 
-    `lidar`: one on the ego. `during_ns`: (int, int): first and last stamp of the sweeps to use; all by default.
-
-    Raises `LogError` when no sweeps fit to each other. Raises `MissingExtra` where the library for registration is not
-    installed.
-
-    Notes
-    -----
     Each sweep is compensated by the motion that is expected at constant velocity, and again by the one found where they
     differ. Sweeps that do not fit are bridged for `MAX_COASTING_S`; after that a new path begins, and the longest is kept.
+    Raises `LogError` when no sweeps fit to each other, `MissingExtra` where the library for registration is not installed.
     """
-    t_ns = log.streams[lidar].t_ns
-    index = np.arange(len(t_ns))
-    if during_ns is not None:
-        index = index[(t_ns >= during_ns[0]) & (t_ns <= during_ns[1])]
+    index = np.flatnonzero(is_during(log.streams[lidar].t_ns, during_ns))
     run = _Run(SurfaceMap())
     for done, i in enumerate(index.tolist(), 1):
         run.add(read_ego_sweep(log, lidar, i))
@@ -521,22 +502,13 @@ def _is_possible(expected: Array, found: Array, dt_s: float) -> bool:
 
 
 def _odometry(lidar: str, path: list[_Step], sweeps: int, problems: dict[str, int]) -> Odometry:
-    nan = np.full(3, np.nan)
     fits = [step.fit for step in path]
 
-    def column(name: str) -> Array:
-        return np.array([np.nan if fit is None else float(getattr(fit, name)) for fit in fits])
+    def column(name: str, missing: Any = np.nan) -> Array:
+        return np.array([missing if fit is None else getattr(fit, name) for fit in fits], dtype=np.float64)
 
     return Odometry(
-        lidar,
-        np.array([step.t_ns for step in path], dtype=np.int64),
-        np.stack([step.pose for step in path]),
-        column("overlap"),
-        column("residual"),
-        column("constraint"),
-        np.stack([nan if fit is None else fit.weakest for fit in fits]),
-        np.array([not step.held for step in path]),
-        np.array([step.predicted for step in path]),
-        sweeps,
-        problems,
-    )
+        lidar, np.array([step.t_ns for step in path], dtype=np.int64), np.stack([step.pose for step in path]),
+        column("overlap"), column("residual"), column("constraint"), column("weakest", np.full(3, np.nan)),
+        np.array([not step.held for step in path]), np.array([step.predicted for step in path]), sweeps, problems,
+    )  # fmt: skip

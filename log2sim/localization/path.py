@@ -27,8 +27,6 @@ WHITENESS_SPAN, MAX_GROWTH = 3.0, 1.3
 def noise_of(t_s: Array, values: Array, usual_sigma: float) -> float:
     """Estimate the standard deviation, u, of the noise of samples (P, D); the usual one for few samples.
 
-    Notes
-    -----
     From third differences over the shortest of `SPANS_S`. The median absolute value, 0.6745 standard deviations of a Gaussian, is
     insensitive to jumps (Rousseeuw and Croux, J. Am. Stat. Assoc. 88, 1993). Slow errors, such as those of a GNSS that drifts, do
     not show; where samples are sparse the third derivative of the motion itself counts as noise.
@@ -43,8 +41,6 @@ def noise_of(t_s: Array, values: Array, usual_sigma: float) -> float:
 def independent_noise(t_s: Array, xy_m: Array) -> float:
     """Estimate the standard deviation, m, of the errors of positions (P, 2) across the path that change from sample to sample.
 
-    Notes
-    -----
     Across the path stamps that are off change nothing. 0 where errors last, as those of a GNSS that drifts: over three times the
     time such errors grow by its root, while independent ones stay.
     """
@@ -124,13 +120,10 @@ def fit_path(
     *,
     after: NDArray[np.bool_] | None = None,
 ) -> FittedPath:
-    """Fit a path to samples and evaluate it, in units u of the samples.
+    """Fit a path to samples (n, D) at times (n,) and evaluate it at others (T,), in units u of the samples.
 
-    `t_s`: (n,). `samples`: (n, D) u. `sigma`: u: standard deviation of each sample. `asked_s`: (T,). `after`: (n,)
-    bool: samples that are off all others by one unknown step.
+    `sigma`: standard deviation of each sample. `after` (n,): samples that are off all others by one unknown step.
 
-    Notes
-    -----
     Gaussian process regression with the kernel of a twice integrated acceleration whose derivative is white noise; it equals
     the fixed-interval smoother of the constant-acceleration model and a smoothing spline of fifth degree (Wahba, J. Royal Stat.
     Soc. B 40, 1978). Cost O(n^3): for some hundred samples around a gap.
@@ -180,12 +173,9 @@ MAX_SAMPLES = 150
 def smooth_path(
     t_s: Array, values: Array, measured: NDArray[np.bool_], noise: float, prior: PathPrior
 ) -> tuple[Array, Array]:
-    """Smooth the measured samples of a path, in units u; the others stay as they are.
+    """Smooth the measured samples (P, D) of a path, in units u, whose noise is independent; the others stay as they are.
 
-    `t_s`: (P,). `values`: (P, D) u. `measured`: (P,) bool. `noise`: u: standard deviation of the samples, independent
-    of each other.
-
-    Returns `values`: (P, D) u; `sigma`: (P,) u: standard deviations of the smoothed samples, 0 of the others.
+    Also returns the standard deviations (P,) of the smoothed samples, 0 of the others.
     """
     out, sigma = values.copy(), np.zeros(len(t_s))
     rows = np.flatnonzero(measured)
@@ -466,10 +456,7 @@ class RepairedPath:
 
 
 def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.bool_] | None = None) -> RepairedPath:
-    """Find and repair the faults of a path.
-
-    `t_s`: (P,). `values`: (P, D) u. `wrong`: (P,) bool: samples that are known to be wrong.
-    """
+    """Find and repair the faults of a path, samples (P, D) u at times (P,); `wrong` (P,) are known to be so."""
     rows = np.arange(len(t_s)) if wrong is None else np.flatnonzero(~wrong)
     new, sigma = values.copy(), np.zeros(len(t_s))
     none = np.zeros(len(t_s), dtype=bool)
@@ -592,11 +579,10 @@ def _blended(
     t_s: Array, from_left: tuple[Array, float] | None, from_right: tuple[Array, float] | None
 ) -> tuple[Array, float]:
     """Join what the right parts before and after a part say about its offset; it drifts from one to the other if they differ."""
-    if from_left is None or from_right is None:
-        known = from_left if from_left is not None else None
-        if known is not None:
-            return known[0][None], known[1]
-        assert from_right is not None
+    if from_right is None:
+        assert from_left is not None
+        return from_left[0][None], from_left[1]
+    if from_left is None:
         return -from_right[0][None], from_right[1]
     (start, start_sigma), (end, end_sigma) = from_left, from_right
     both = np.hypot(start_sigma, end_sigma)

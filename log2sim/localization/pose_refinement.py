@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Log, Sweep
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
-from log2sim.localization.odometry import densest_lidar
+from log2sim.localization.odometry import densest_lidar, is_during
 from log2sim.localization.surfaces import (
     Registration,
     Surfaces,
@@ -56,9 +56,9 @@ class Keyframe:
 
 
 def refine_poses(log: Log, during_ns: tuple[int, int] | None = None, jobs: int = 1) -> PoseTrack | None:
-    """Return poses of the ego by which surfaces in the sweeps between two stamps lie on each other.
+    """Return poses of the ego by which surfaces in the sweeps of a time lie on each other; `jobs` processes share these.
 
-    None without LiDAR on the ego, with too few sweeps, or over too long a time. `jobs`: processes that share the sweeps.
+    None without LiDAR on the ego, with too few sweeps, or over too long a time.
     """
     lidar = densest_lidar(log)
     if log.ego is None or lidar is None:
@@ -121,8 +121,7 @@ def _choose(log: Log, lidar: str, during_ns: tuple[int, int] | None) -> NDArray[
     """Choose sweeps evenly by the way and by the time of the ego: poses err along both."""
     t_ns = log.streams[lidar].t_ns
     pose, known = log.map_T_sensor(lidar, t_ns)
-    if during_ns is not None:
-        known &= (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+    known &= is_during(t_ns, during_ns)
     usable = np.flatnonzero(known)
     if len(usable) <= MIN_KEYFRAMES:
         return usable.astype(np.int64)
@@ -147,8 +146,6 @@ def corrected(track: PoseTrack, t_ns: NDArray[np.int64], twists: Array) -> PoseT
 def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registration]]) -> Array:
     """Solve for the twists (K, 6), m and rad, of keyframes in their own frames that fit all registrations best.
 
-    Notes
-    -----
     With poses P and a registration M of j to i, exp(-x_i) G exp(x_j) = M with G = P_i^-1 P_j, which is linear in small
     twists: x_j - Ad(G^-1) x_i = log(G^-1 M). Cauchy weights on the Mahalanobis distance of each registration.
     """

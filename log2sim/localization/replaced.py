@@ -13,6 +13,7 @@ from log2sim.datatypes import Labels, Log, MapFrame, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, PoseTrack, apply, inverse, wrap_angle
 from log2sim.localization.odometry import TransformAt, move_points
+from log2sim.logs.excerpt import take_labels
 
 
 def replace_poses(log: Log, new: PoseTrack) -> Log:
@@ -65,22 +66,9 @@ def _moved_labels(labels: Labels | None, new_T_old: TransformAt) -> Labels | Non
     k = np.flatnonzero(known)
     heading = np.stack([np.cos(labels.yaw_rad[k]), np.sin(labels.yaw_rad[k]), np.zeros(len(k))], axis=1)
     turned = np.einsum("nij,nj->ni", poses[k, :3, :3], heading)
-
-    def rows(column: NDArray[Any] | None) -> Any:
-        return None if column is None else column[k]
-
-    return replace(
-        labels,
-        t_ns=labels.t_ns[k],
-        track_id=labels.track_id[k],
-        category=labels.category[k],
-        center_m=apply(poses[k], labels.center_m[k]),
-        size_m=labels.size_m[k],
-        yaw_rad=wrap_angle(np.arctan2(turned[:, 1], turned[:, 0])),
-        visible=rows(labels.visible),
-        kind=rows(labels.kind),
-        occlusion=rows(labels.occlusion),
-    )
+    moved = take_labels(labels, k)
+    yaw_rad = wrap_angle(np.arctan2(turned[:, 1], turned[:, 0]))
+    return replace(moved, center_m=apply(poses[k], moved.center_m), yaw_rad=yaw_rad)
 
 
 def shift_stream(stream: Stream, shift_ns: int, moved: Array | None = None) -> Stream:

@@ -86,10 +86,9 @@ def units_of(log: Log, lidars: Sequence[str]) -> list[Unit]:
 
 
 def correct_unit(log: Log, unit: Unit, correction: Array, delay_s: float) -> Log:
-    """Return the log with a unit's sensors moved and its stamps put right.
+    """Return the log with a unit's sensors moved and its stamps, which are late by `delay_s`, put right.
 
-    `correction`: (4, 4): takes places by the unit's poses to right ones, both in the frame of the site: map axes,
-    origin at `site_m`. `delay_s`: by which its stamps are late.
+    `correction` (4, 4) takes places by the unit's poses to right ones, both in the frame of the site: map axes, origin at `site_m`.
     """
     shift = transform(np.eye(3), unit.site_m)
     moved = shift @ correction @ inverse(shift)
@@ -130,6 +129,21 @@ class Sight:
     objects: CommonObjects
     # (7, 7): of what the unit's pose seems to lack because the ego's poses err
     of_poses: Array = field(default_factory=lambda: np.zeros((7, 7)))
+
+    def near(self, values: Array, within_m: float) -> MatchedStructure | None:
+        """Match structure as values (7,) move it."""
+        if self.surfaces is None:
+            return None
+        return match_structure(self.surfaces, self.road.xyz_m, exp_of(values[:DELAY]), within_m)
+
+    def objects_near(self, values: Array, within_m: float) -> Matched | None:
+        """Match road users as values (7,) move them."""
+        return match_objects(self.objects, exp_of(values[:DELAY]), float(values[DELAY]), within_m)
+
+    def gain(self, values: Array, within_m: float) -> float:
+        """Tell how well road users fit together."""
+        found = self.objects_near(values, within_m)
+        return 0.0 if found is None else found.gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,20 +202,17 @@ def _objects_around(log: Log, config: Config, unit: Unit, road_m: Array, moments
 def estimate_error(sight: Sight) -> Estimate:
     """Estimate what a unit's pose and clock lack.
 
-    Notes
-    -----
     Structure first, with limits that become tighter; then the delay with which most common objects fall onto each other; then
     all together by Gauss and Newton's method.
     """
     by_structure, _ = _refine(sight, np.zeros(7), with_objects=False)
     tried = [_refine(sight, start, with_objects=True) for start in _starts(sight, by_structure)]
-    values, covariance = max(tried, key=lambda found: _gain(sight, found[0], OBJECT_WITHIN_M[-1]))
+    values, covariance = max(tried, key=lambda found: sight.gain(found[0], OBJECT_WITHIN_M[-1]))
+    without, near_m, far_m = np.zeros(7), JUDGED_WITHIN_M, OBJECT_WITHIN_M[0]
     return Estimate(
-        values,
-        covariance + sight.of_poses,
-        (_structure(sight, np.zeros(7), JUDGED_WITHIN_M), _structure(sight, values, JUDGED_WITHIN_M)),
-        (_objects(sight, np.zeros(7), OBJECT_WITHIN_M[0]), _objects(sight, values, OBJECT_WITHIN_M[0])),
-    )
+        values, covariance + sight.of_poses, (sight.near(without, near_m), sight.near(values, near_m)),
+        (sight.objects_near(without, far_m), sight.objects_near(values, far_m)),
+    )  # fmt: skip
 
 
 def covariance_of_poses(track: PoseTrack, view: VehicleView) -> Array:
@@ -220,8 +231,6 @@ def covariance_of_poses(track: PoseTrack, view: VehicleView) -> Array:
 def add_drift(sight: Sight, found: Estimate) -> Estimate:
     """Return the estimate with the drift of the ego's poses that is seen in its covariance.
 
-    Notes
-    -----
     What parts of the ego's way say about the unit's pose differs by the errors of its poses, and the mean of them all
     errs by the square root of their number less. Of each kind, translation and rotation, one variance is taken for all axes.
     """
@@ -247,21 +256,16 @@ def _starts(sight: Sight, by_structure: Array) -> list[Array]:
     nearest_first = TRIED_DELAYS_S[np.argsort(np.abs(TRIED_DELAYS_S), kind="stable")]
     tried = [np.append(pose[:DELAY], delay_s) for pose in (by_structure, np.zeros(7)) for delay_s in nearest_first]
     limits = (OBJECT_WITHIN_M[0], OBJECT_WITHIN_M[-1])
-    chosen = {int(np.argmax([_gain(sight, values, within_m) for values in tried])) for within_m in limits}
+    chosen = {int(np.argmax([sight.gain(values, within_m) for values in tried])) for within_m in limits}
     return [tried[k] for k in sorted(chosen)]
-
-
-def _gain(sight: Sight, values: Array, within_m: float) -> float:
-    found = _objects(sight, values, within_m)
-    return 0.0 if found is None else found.gain
 
 
 def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, Array]:
     """Improve values (7,) step by step; return them with their covariance (7, 7)."""
     values, covariance = start, np.diag(PRIOR_SIGMA**2)
     for near_surface, near_object in zip(SURFACE_WITHIN_M, OBJECT_WITHIN_M):
-        structure = _structure(sight, values, near_surface)
-        objects = _objects(sight, values, near_object) if with_objects else None
+        structure = sight.near(values, near_surface)
+        objects = sight.objects_near(values, near_object) if with_objects else None
         parts = [part.evidence for part in (structure, objects) if part is not None]
         ground = None if sight.ground is None else match_ground(sight.ground, exp_of(values[:DELAY]), near_surface)
         parts += [] if ground is None else [ground]
@@ -269,16 +273,6 @@ def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, A
         pose = exp_of(step[:DELAY]) @ exp_of(values[:DELAY])
         values = np.append(log_of(pose), values[DELAY] + step[DELAY])
     return values, covariance
-
-
-def _structure(sight: Sight, values: Array, within_m: float) -> MatchedStructure | None:
-    if sight.surfaces is None:
-        return None
-    return match_structure(sight.surfaces, sight.road.xyz_m, exp_of(values[:DELAY]), within_m)
-
-
-def _objects(sight: Sight, values: Array, within_m: float) -> Matched | None:
-    return match_objects(sight.objects, exp_of(values[:DELAY]), float(values[DELAY]), within_m)
 
 
 # What is certain is corrected if it matters: as much as agents are misplaced anyway, near the unit and 20 to 40 m away; stamps
@@ -313,14 +307,11 @@ class Findings:
     @cached_property
     def _looked_rows(self) -> list[int]:
         """The rows of the pose that both ends show: all, or height, roll and pitch where the ground alone ties them."""
-        certain = self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2 and self._objects_agree
-        return list(range(DELAY)) if self._known_to(MAX_SIGMA_M, MAX_SIGMA_RAD) or certain else HEIGHT_AND_TILT
-
-    @property
-    def _objects_agree(self) -> bool:
-        """Whether several common objects fit better with the correction: one alone may be matched by mistake."""
+        # One common object alone may be matched by mistake.
         before, after = self.found.objects
-        return after is not None and after.pairs > 1 and after.gain > (0.0 if before is None else before.gain)
+        agree = after is not None and after.pairs > 1 and after.gain > (0.0 if before is None else before.gain)
+        certain = agree and self._chi2(PLANE) > MAX_CHANCE_PLANE_CHI2
+        return list(range(DELAY)) if self._known_to(MAX_SIGMA_M, MAX_SIGMA_RAD) or certain else HEIGHT_AND_TILT
 
     def _chi2(self, rows: list[int]) -> float:
         """How far some values are from 0, squared, in units of their covariance."""
@@ -339,14 +330,15 @@ class Findings:
     def moved(self) -> bool:
         """Whether the pose is off for certain, by enough to matter, and both ends fit better with another."""
         rows, values = self._looked_rows, self.found.values
-        if len(rows) == DELAY:
-            chi2 = self._chi2(rows)
-        else:
+        chi2 = self._chi2(rows)
+        if len(rows) < DELAY:
             values, covariance = self._likeliest(rows)
             chi2 = float(values[rows] @ np.linalg.solve(covariance, values[rows]))
         large = np.linalg.norm(values[:3]) > MIN_SHIFT_M or np.linalg.norm(values[3:DELAY]) > MIN_TURN_RAD
-        better = self._fits and self._fits_better and self._is_free(1, MAX_LEFT)
-        return bool(large and chi2 > MAX_CHANCE_CHI2 and better)
+        structure = [0 if part is None else part.on_surface for part in self.found.structure]
+        objects = [0.0 if part is None else part.gain for part in self.found.objects]
+        better = structure[1] + objects[1] > structure[0] + objects[0]
+        return bool(large and chi2 > MAX_CHANCE_CHI2 and self._fits and better and self._is_free(1, MAX_LEFT))
 
     @cached_property
     def late(self) -> bool:
@@ -355,13 +347,6 @@ class Findings:
         delay_s = abs(float(self.found.values[DELAY]))
         seen = objects is not None and objects.moving > 0
         return seen and delay_s > max(MIN_DELAY_S, MIN_SIGMAS * self.sigma[DELAY])
-
-    @property
-    def _fits_better(self) -> bool:
-        """Whether more points lie on surfaces and objects on each other with the correction."""
-        structure = [0 if part is None else part.on_surface for part in self.found.structure]
-        objects = [0.0 if part is None else part.gain for part in self.found.objects]
-        return structure[1] + objects[1] > structure[0] + objects[0]
 
     @property
     def _fits(self) -> bool:
@@ -478,13 +463,8 @@ class RoadRegistration:
 
 
 def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> RoadRegistration:
-    """Estimate poses and clocks of the road's sensors against what the vehicle's sensors see.
+    """Estimate poses and clocks of the road's sensors against what the vehicle's sensors see, if `cooperation.register_road` says so.
 
-    `log`: with the poses that the run uses. `config`: `cooperation.register_road`: whether to do so. `sensors`: those
-    that the run uses.
-
-    Notes
-    -----
     The ego's poses and its clock are the reference. Nothing is read of a log without LiDARs at both ends.
     """
     used = sensors.restrict(log)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, nearest_index, wrap_angle
-from log2sim.localization.odometry import MIN_RANGE_M, lidars_on_ego
+from log2sim.localization.odometry import MIN_RANGE_M, is_during, lidars_on_ego
 from log2sim.localization.surfaces import (
     CAUCHY,
     FEW_PIECES,
@@ -111,9 +111,7 @@ def _near_sweeps(
     t_ns = log.streams[lidar].t_ns
     pose, known = log.map_T_sensor(lidar, t_ns)
     away = np.linalg.norm(pose[:, :3, 3] - site_m, axis=1)
-    near = known & (away < MAX_REACH_M)
-    if during_ns is not None:
-        near &= (t_ns >= during_ns[0]) & (t_ns <= during_ns[1])
+    near = known & (away < MAX_REACH_M) & is_during(t_ns, during_ns)
     rows = np.flatnonzero(near)
     if len(rows) == 0:
         return rows
@@ -150,9 +148,7 @@ def view_from_road(
 def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, int] | None) -> Array:
     """Return points with the share of sweeps that have one in the same place, (N, 4)."""
     t_ns = log.streams[lidar].t_ns
-    rows = np.arange(len(t_ns))
-    if during_ns is not None:
-        rows = rows[(t_ns >= during_ns[0]) & (t_ns <= during_ns[1])]
+    rows = np.flatnonzero(is_during(t_ns, during_ns))
     chosen = (
         rows[np.unique(np.linspace(0, len(rows) - 1, MAX_ROAD_SWEEPS).round().astype(np.int64))] if len(rows) else rows
     )
@@ -189,11 +185,9 @@ def surfaces_of(view: VehicleView, near_m: Array) -> Surfaces | None:
     Where points are too sparse for fine pieces, as between the rings of a LiDAR on a vehicle that stands, coarser ones fill in.
     """
     points = thin(np.hstack([view.xyz_m, view.sensor_m[view.sweep]]), VOXEL_M)
-    near = (
-        cKDTree(near_m).query(points[:, :3], distance_upper_bound=MAX_ERROR_M)[0]
-        if len(near_m)
-        else np.full(len(points), np.inf)
-    )
+    if not len(near_m):
+        return None
+    near = cKDTree(near_m).query(points[:, :3], distance_upper_bound=MAX_ERROR_M)[0]
     points = points[np.isfinite(near)]
     middles, normals, reach = np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros(0)
     for voxel_m, radius_m in SCALES_M:
@@ -319,7 +313,7 @@ def detect_boxes(
 ) -> list[SeenBoxes]:
     """Detect road users in the clouds of some LiDARs nearest to moments (K,); sides are moved to the points.
 
-    `floor_m`: (K, 3): where clouds begin: a place on the ground, map frame.
+    Clouds begin at `floor_m` (K, 3), places on the ground, map frame.
     """
     out, before, records = [], None, RecordSource(log)
     for moment, floor in zip(moments_ns.tolist(), floor_m):
@@ -328,11 +322,9 @@ def detect_boxes(
             continue
         before = index
         sweeps = {name: sweep for name, i in index.items() if (sweep := records.get(name, i)) is not None}
-        cloud = (
-            assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=MAX_REACH_M)
-            if sweeps
-            else None
-        )
+        if not sweeps:
+            continue
+        cloud = assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=MAX_REACH_M)
         if cloud is not None:
             boxes = detector.detect(cloud)
             boxes = refine_boxes(boxes.take(boxes.score >= MIN_SCORE), cloud)
@@ -387,8 +379,6 @@ class MatchedStructure:
 def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within_m: float) -> MatchedStructure | None:
     """Match points (N, 3) of the road, corrected by a transform (4, 4), with surfaces of the vehicle; None with too few.
 
-    Notes
-    -----
     Point-to-plane ICP (Chen, Medioni, IVC 1992) with Cauchy weights; posts hold points in two directions.
     """
     at = road_m @ correction[:3, :3].T + correction[:3, 3]
@@ -420,19 +410,19 @@ def _weights(normals: Array, residual: Array, post: NDArray[np.bool_]) -> tuple[
     """Weigh rows (K,): the share that each counts by Cauchy's function, and the inverse variance with what rows have in common."""
     up = ~post & (np.abs(normals[:, 2]) > MIN_NORMAL_Z)
     along = ~post & ~up & (np.abs(normals[:, 0]) > np.abs(normals[:, 1]))
+    across = ~post & ~up & ~along
     share, weight = np.zeros(len(residual)), np.zeros(len(residual))
-    for group, bias_m in (
-        (up, PLANE_BIAS_M),
-        (along, PLANE_BIAS_M),
-        (~post & ~up & ~along, PLANE_BIAS_M),
-        (post, POST_BIAS_M),
-    ):
-        if not group.any():
-            continue
-        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual[group]))), MIN_SCALE_M)
-        share[group] = 1.0 / (1.0 + (residual[group] / (CAUCHY * scale)) ** 2)
-        weight[group] = share[group] / (scale**2 + float(share[group].sum()) * bias_m**2)
+    for group, bias_m in ((up, PLANE_BIAS_M), (along, PLANE_BIAS_M), (across, PLANE_BIAS_M), (post, POST_BIAS_M)):
+        if group.any():
+            share[group], weight[group] = _cauchy(residual[group], bias_m)
     return share, weight
+
+
+def _cauchy(residual: Array, bias_m: float) -> tuple[Array, Array]:
+    """Weigh rows that have an error of `bias_m` in common."""
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE_M)
+    share = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2)
+    return share, share / (scale**2 + float(share.sum()) * bias_m**2)
 
 
 def _damped(jacobian: Array, residual: Array, share: Array, weight: Array) -> Evidence:
@@ -521,9 +511,7 @@ def match_ground(ground: CommonGround, correction: Array, within_m: float) -> Ev
     step = STEP_M * np.eye(2)
     slope = [(ground.surface.at(at[:, :2] + d) - ground.surface.at(at[:, :2] - d)) / (2 * STEP_M) for d in step]
     normals = np.stack([-slope[0], -slope[1], np.ones(len(at))], axis=1)
-    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE_M)
-    share = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2)
-    weight = share / (scale**2 + float(share.sum()) * BIAS_M**2)
+    _, weight = _cauchy(residual, BIAS_M)
     # Slopes show height and tilt alone: what they say about the plane is the noise of the surface.
     jacobian = np.zeros((len(at), 7))
     jacobian[:, 2] = 1.0
@@ -644,12 +632,11 @@ class CommonObjects:
 
 
 def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
-    if first.group != second.group:
-        return False
     (low, high), (other_low, other_high) = (
-        (track.box[:, :2].min(axis=0), track.box[:, :2].max(axis=0)) for track in (first, second)
+        (t.box[:, :2].min(axis=0), t.box[:, :2].max(axis=0)) for t in (first, second)
     )
-    return bool((low < other_high + MAX_APART_M).all() and (other_low < high + MAX_APART_M).all())
+    near = (low < other_high + MAX_APART_M).all() and (other_low < high + MAX_APART_M).all()
+    return first.group == second.group and bool(near)
 
 
 @dataclass(frozen=True, eq=False)
@@ -676,7 +663,12 @@ def match_objects(objects: CommonObjects, correction: Array, delay_s: float, wit
         moving += float(np.hypot(*velocity.mean(axis=0))) > MOVING_MPS
         gain += float((1 - away[-1] ** 2 / within_m**2).sum())
         jacobian = np.zeros((len(off), 3, 7))
-        jacobian[:, :2] = axes @ _jacobian(place, velocity)
+        (x, y, z), in_plane = place.T, np.zeros((len(off), 2, 7))  # places along x and y by a correction
+        in_plane[:, 0, 0] = in_plane[:, 1, 1] = 1.0
+        in_plane[:, 0, 4], in_plane[:, 0, 5] = z, -y
+        in_plane[:, 1, 3], in_plane[:, 1, 5] = -z, x
+        in_plane[:, :, DELAY] = velocity
+        jacobian[:, :2] = axes @ in_plane
         jacobian[:, 2, 5] = 1.0
         # Each end sees the same sides again and again, so that all boxes of a track say as much as one; those that jump say less.
         sigma = np.maximum(sigma, off.std(axis=0))
@@ -689,16 +681,6 @@ def match_objects(objects: CommonObjects, correction: Array, delay_s: float, wit
     # Of a distance in the plane, the median is 1.18 times the standard deviation along an axis.
     rms_m = float(np.median(np.concatenate(away))) / 1.18 * np.sqrt(2.0)
     return Matched(Evidence(information, gradient), len(away), moving, gain, float(rms_m))
-
-
-def _jacobian(place: Array, velocity: Array) -> Array:
-    """Differentiate places (N, 3) along x and y by a correction: (N, 2, 7)."""
-    (x, y, z), out = place.T, np.zeros((len(place), 2, 7))
-    out[:, 0, 0] = out[:, 1, 1] = 1.0
-    out[:, 0, 4], out[:, 0, 5] = z, -y
-    out[:, 1, 3], out[:, 1, 5] = -z, x
-    out[:, :, DELAY] = velocity
-    return out
 
 
 Match = tuple[Array, Array, Array, Array, Array]

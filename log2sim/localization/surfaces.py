@@ -21,7 +21,7 @@ from log2sim.geometry import (
     rotation_from_quaternion,
     transform,
 )
-from log2sim.localization.odometry import MAX_POINTS, MIN_RANGE_M
+from log2sim.localization.odometry import MAX_POINTS, MIN_RANGE_M, is_during
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
 
@@ -68,10 +68,9 @@ def adjoint_of(dst_T_src: Array) -> Array:
 
 
 def velocities_at(track: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-    """Compute how the ego moves at stamps (K,), by poses `MOTION_SPAN_NS` before and after.
+    """Compute how the ego moves at stamps (K,), by poses `MOTION_SPAN_NS` before and after, and whether these are known (K,).
 
-    Returns `velocity`: (K, 6), m/s and rad/s: twists in the ego's frame; `known`: (K,) bool: whether these poses are
-    known.
+    Velocities (K, 6), m/s and rad/s, are twists in the ego's frame.
     """
     (before, known), (at, is_known), (after, will_be_known) = (
         track.at(t_ns + shift) for shift in (-MOTION_SPAN_NS, 0, MOTION_SPAN_NS)
@@ -184,8 +183,6 @@ def _choose(normals: Array) -> Array:
 def register(first: Surfaces, second: Surfaces, guess: Array) -> Registration | None:
     """Find the motion (4, 4) from a second sweep's frame to the first one's, from a guess; None where they show too little in common.
 
-    Notes
-    -----
     Point-to-plane ICP (Chen, Medioni, IVC 1992) with the normals of the first sweep and Cauchy weights.
     """
     pose = guess
@@ -274,10 +271,7 @@ def pair_sweeps(
 ) -> SweepPairs | None:
     """Compare sweeps of a LiDAR on the ego with each other.
 
-    `during_ns`: (2,) tuple of int or None: first and last stamp to look at; None for all.
-
-    Returns SweepPairs or None: None where the ego hardly moves, sweeps show too little, or points are given in the map,
-    which hides clock and mount.
+    None where the ego hardly moves, sweeps show too little, or points are given in the map, which hides clock and mount.
     """
     track = log.ego
     if track is None:
@@ -307,10 +301,10 @@ def choose_sweeps(
     track: PoseTrack, t_ns: NDArray[np.int64], during_ns: tuple[int, int] | None = None
 ) -> NDArray[np.intp]:
     """Choose rows (K,) of sweeps at stamps (N,): none where the ego hardly moves, of a long log where its motion changes most."""
-    rows = np.arange(len(t_ns))
-    if during_ns is not None:
-        rows = rows[(t_ns >= during_ns[0]) & (t_ns <= during_ns[1])]
-    spaced = _spaced(t_ns, rows)
+    rows = np.flatnonzero(is_during(t_ns, during_ns))
+    # Rows whose stamps are `SPACING_S` apart.
+    slot = (t_ns[rows] - t_ns[rows[:1]]) // round(SPACING_S * NS_PER_S)
+    spaced = rows[np.unique(slot, return_index=True)[1]]
     velocity, known = velocities_at(track, t_ns[spaced])
     spaced, velocity = spaced[known], velocity[known]
     if len(spaced) == 0 or np.linalg.norm(np.ptp(track.at(t_ns[spaced])[0][:, :3, 3], axis=0)) < MIN_PATH_M:
@@ -320,14 +314,6 @@ def choose_sweeps(
     usable = rows[(rows >= spaced[0]) & (rows <= spaced[-1])]
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, MAX_SWEEPS).round().astype(np.int64))]
     return np.asarray(chosen[velocities_at(track, t_ns[chosen])[1]])
-
-
-def _spaced(t_ns: NDArray[np.int64], rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Keep rows whose stamps are `SPACING_S` apart."""
-    if len(rows) == 0:
-        return rows
-    slot = (t_ns[rows] - t_ns[rows[0]]) // round(SPACING_S * NS_PER_S)
-    return np.asarray(rows[np.unique(slot, return_index=True)[1]])
 
 
 def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:

@@ -63,8 +63,6 @@ MAX_TILT_RAD = np.deg2rad(15.0)
 def fit_to_given(estimated: PoseTrack, given: PoseTrack) -> Array | None:
     """Fit the frame of estimated poses to given ones: `map_T_odom` (4, 4); None where no given pose is at their stamps.
 
-    Notes
-    -----
     The rotation is the mean of the differences between the attitudes (chordal mean; Hartley et al., IJCV 2013, section 5.3),
     the translation that between the positions. Attitudes of GNSS with an IMU hold the vertical, and the direction where the
     path is short; positions alone would leave the roll about a straight path open.
@@ -81,14 +79,9 @@ def fit_to_given(estimated: PoseTrack, given: PoseTrack) -> Array | None:
 def level_on_ground(xyz_m: Array, ground_z_m: float) -> Array | None:
     """Fit the ground around the ego: the pose (4, 4) of the ego in a frame with this ground level at `ground_z_m`.
 
-    `xyz_m`: (N, 3): one sweep in the ego's frame. `ground_z_m`: expected height of the road in the ego's frame, m.
-
-    Returns `level_T_ego`: (4, 4) or None: None where there are too few points on a ground. The origin keeps its place
-    above the ground, and the x axis its direction.
-
-    Notes
-    -----
-    A slope that is the same all around is taken for level: a LiDAR alone does not measure the vertical.
+    `xyz_m` (N, 3): one sweep in the ego's frame. None where there are too few points on a ground. The origin keeps its place above
+    the ground, and the x axis its direction. A slope that is the same all around is taken for level: a LiDAR alone does not measure
+    the vertical.
     """
     away = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     points = xyz_m[(away < GROUND_REACH_M) & (np.abs(xyz_m[:, 2] - ground_z_m) < GROUND_MARGIN_M)]
@@ -130,10 +123,7 @@ class Scatter:
 
 
 def compare_poses(log: Log, lidar: str, tracks: Mapping[str, PoseTrack], t_ns: NDArray[np.int64]) -> dict[str, Scatter]:
-    """Measure how sharp the surroundings are under several poses, on the same pairs of sweeps.
-
-    `t_ns`: (P,) int64: stamps of the sweeps to choose from, two at least.
-    """
+    """Measure how sharp the surroundings are under several poses, on the same pairs of the sweeps at stamps (P,), two at least."""
     library, stream_t_ns = load_small_gicp(), log.streams[lidar].t_ns
     apart_ns = min(round(APART_S * NS_PER_S), int(t_ns[-1] - t_ns[0]) // 2)
     starts = np.unique(np.linspace(t_ns[0], t_ns[-1] - apart_ns, PAIRS).astype(np.int64))
@@ -212,7 +202,6 @@ MIN_EXCESS_M = 0.05
 MIN_WORSE_SHARE = 0.75
 # Odometry replaces given poses only if nearly all sweeps are registered and hold every direction of motion.
 MAX_UNSURE_SHARE = 0.1
-PAIRS_OF = ("apart", "neighbors")
 
 Figures = dict[str, float | None]
 
@@ -230,67 +219,42 @@ class Verdict:
 def compare_with_given(log: Log, found: Odometry, track: PoseTrack) -> Verdict:
     """Compare the given poses of a log with those of odometry, `track`, by the scatter of upright surfaces.
 
-    Notes
-    -----
     Odometry is fitted to the very sweeps that judge it, so that it is always somewhat sharper: given poses are replaced only
     where they are worse by more than `MIN_EXCESS_M`, in most pairs. What no surface holds, such as the way along a tunnel,
     shows in neither scatter; there given poses are kept.
     """
     assert log.ego is not None
     both = compare_poses(log, found.lidar, {"given": log.ego, "lidar": track}, found.t_ns)
-    scatter = {source: {name: _rms(_column(rows, name)) for name in PAIRS_OF} for source, rows in both.items()}
-    excess = {name: _excess(_column(both["given"], name), _column(both["lidar"], name)) for name in PAIRS_OF}
-    words, unsure = _words(scatter, both["given"].apart_s), unsure_share(found)
+    scatter: dict[str, Figures] = {source: {} for source in both}
+    excess, worse, words = Figures(), False, list[str]()
+    apart_s = both["given"].apart_s
+    for name, pairs in (("apart", f"in sweeps {apart_s:.1f} s apart"), ("neighbors", "in successive sweeps")):
+        squares = {source: getattr(rows, f"{name}_m") ** 2 for source, rows in both.items()}
+        known = {source: square[np.isfinite(square)] for source, square in squares.items()}
+        for source, square in known.items():
+            scatter[source][name] = rounded(float(np.sqrt(np.mean(square))), 4) if len(square) else None
+        usable = np.isfinite(squares["given"]) & np.isfinite(squares["lidar"])
+        excess[name] = None
+        if usable.any():
+            given, lidar = squares["given"][usable], squares["lidar"][usable]
+            value = rounded(float(np.sqrt(max(float(np.mean(given) - np.mean(lidar)), 0.0))), 4)
+            excess[name] = value
+            worse |= value is not None and value > MIN_EXCESS_M and float(np.mean(given > lidar)) >= MIN_WORSE_SHARE
+        given_m, lidar_m = scatter["given"][name], scatter["lidar"][name]
+        if given_m is not None and lidar_m is not None:
+            words.append(f"{pairs} {given_m:.3f} m with the given poses and {lidar_m:.3f} m with odometry")
+    said = f"upright surfaces differ {', '.join(words)}" if words else "no upright surface to compare"
+    unsure = unsure_share(found)
     if unsure > MAX_UNSURE_SHARE:
-        return Verdict(True, f"LiDAR odometry is not sure of {unsure:.0%} of the sweeps; {words}", excess, scatter)
-    worse = any(
-        value is not None
-        and value > MIN_EXCESS_M
-        and _worse_share(_column(both["given"], name), _column(both["lidar"], name)) >= MIN_WORSE_SHARE
-        for name, value in excess.items()
-    )
+        return Verdict(True, f"LiDAR odometry is not sure of {unsure:.0%} of the sweeps; {said}", excess, scatter)
     more = "more" if worse else "no more"
-    return Verdict(not worse, f"{words}; the given poses are off by {more} than {MIN_EXCESS_M} m", excess, scatter)
+    return Verdict(not worse, f"{said}; the given poses are off by {more} than {MIN_EXCESS_M} m", excess, scatter)
 
 
 def unsure_share(found: Odometry) -> float:
     """Compute the share of sweeps without a pose, or with one that is predicted or poorly held in one direction."""
     sure = np.sum(~(found.degenerate | found.predicted))
     return 1.0 - float(sure) / max(found.sweeps, 1)
-
-
-def _column(rows: Scatter, name: str) -> Array:
-    return rows.apart_m if name == "apart" else rows.neighbors_m
-
-
-def _excess(given: Array, lidar: Array) -> float | None:
-    """Compute how far given poses are off: the root of the difference of both mean squares; None without a pair."""
-    usable = np.isfinite(given) & np.isfinite(lidar)
-    if not usable.any():
-        return None
-    difference = float(np.mean(given[usable] ** 2) - np.mean(lidar[usable] ** 2))
-    return rounded(float(np.sqrt(max(difference, 0.0))), 4)
-
-
-def _worse_share(given: Array, lidar: Array) -> float:
-    """Compute the share of pairs in which given poses are worse."""
-    usable = np.isfinite(given) & np.isfinite(lidar)
-    return float(np.mean(given[usable] > lidar[usable]))
-
-
-def _rms(values: Array) -> float | None:
-    finite = values[np.isfinite(values)]
-    return rounded(float(np.sqrt(np.mean(finite**2))), 4) if len(finite) else None
-
-
-def _words(scatter: dict[str, Figures], apart_s: float) -> str:
-    """Describe both scatters in words."""
-    parts = []
-    for name, pairs in (("apart", f"in sweeps {apart_s:.1f} s apart"), ("neighbors", "in successive sweeps")):
-        given, lidar = scatter["given"][name], scatter["lidar"][name]
-        if given is not None and lidar is not None:
-            parts.append(f"{pairs} {given:.3f} m with the given poses and {lidar:.3f} m with odometry")
-    return f"upright surfaces differ {', '.join(parts)}" if parts else "no upright surface to compare"
 
 
 # Odometry begins this long before and ends this long after, which fits it to the poses there.
@@ -389,7 +353,11 @@ def _placed_on_poses(found: Odometry, track: PoseTrack, stretch: Stretch) -> Pos
     sigma_rad = np.hypot(USUAL_SIGMA_RAD, DRIFT_RAD_PER_M * away_m)
     if sigma_m.max() > MAX_SIGMA_M:
         return None
-    poses = _between(first.poses, last.poses, share)
+    # One goes over to the other.
+    first_q, last_q = (quaternion_from_rotation(side.poses[:, :3, :3]) for side in (first, last))
+    weight = share[:, None]
+    place = (1 - weight) * first.poses[:, :3, 3] + weight * last.poses[:, :3, 3]
+    poses = transform(rotation_from_quaternion(slerp(first_q, last_q, share)), place)
     return PoseTrack(t_ns[inside], poses, sigma_m=sigma_m, sigma_yaw_rad=sigma_rad)
 
 
@@ -406,10 +374,3 @@ def _side(found: Odometry, track: PoseTrack, rows: NDArray[np.intp], inside: NDA
         float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1)))),
         float(np.ptp(path_m[rows])),
     )
-
-
-def _between(first: Array, last: Array, share: Array) -> Array:
-    """Go over from poses (n, 4, 4) to others by shares (n,)."""
-    rotation = slerp(quaternion_from_rotation(first[:, :3, :3]), quaternion_from_rotation(last[:, :3, :3]), share)
-    place = (1 - share)[:, None] * first[:, :3, 3] + share[:, None] * last[:, :3, 3]
-    return transform(rotation_from_quaternion(rotation), place)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -73,11 +72,7 @@ OFFSET_STEP_M = 1000.0
 
 
 def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:
-    """Read `city_SE3_egovehicle.feather`.
-
-    Returns `track`: every row of the file, in a map whose origin is whole kilometers away from that of the city;
-    `offset_m` (3,) tuple of float, m: from the city's frame to the map: city = map + `offset_m`.
-    """
+    """Read `city_SE3_egovehicle.feather`: all its poses, in a map that lies `offset_m`, whole kilometers, off the city's frame."""
     columns = read_columns(path, {"timestamp_ns": "int", **TRANSFORM})
     city_T_ego = transforms_of(columns, path)
     if not len(city_T_ego):
@@ -110,24 +105,18 @@ MAX_OFFSET_NS = 1_000_000_000
 
 
 def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_lidar: Array) -> Stream:
-    """Stream of one LiDAR.
-
-    `lidar` {"up_lidar", "down_lidar"}. `t_ns` (F,) int64: reference stamps of the files. `files`: F files, each with
-    the points of both LiDARs. `ego_T_lidar` (4, 4) float64.
-    """
+    """Stream of one of `LIDARS`; each of the files (F,), with reference stamps `t_ns` (F,), has the points of both."""
     lidar_T_ego = inverse(ego_T_lidar)
 
     def read(i: int) -> Sweep:
-        stamp = int(t_ns[i])
-        columns = _read_points(files[i])
+        stamp, columns = int(t_ns[i]), _read_points(files[i])
         strength = columns.get("intensity")
         rows = columns["laser_number"] // LASERS == LIDARS[lidar] // LASERS
         # Points are moved in double precision: they were stored in half precision, to which nothing should be added.
         xyz_ego = np.stack([columns[k][rows] for k in "xyz"], axis=1).astype(np.float64)
         xyz = apply(lidar_T_ego, xyz_ego).astype(np.float32)
-        return sweep_of(
-            xyz, stamp, columns["offset_ns"][rows], "lidar", stamp, None if strength is None else strength[rows]
-        )
+        strength = None if strength is None else strength[rows]
+        return sweep_of(xyz, stamp, columns["offset_ns"][rows], "lidar", stamp, strength)
 
     return Stream(lidar, t_ns, read)
 
@@ -180,10 +169,7 @@ HALF_TURN_NS = PERIOD_NS // 2
 def read_labels(
     path: Path, ego: PoseTrack, upper_lidar_xy: Array, swept_ns: NDArray[np.int64], notes: list[str]
 ) -> Labels:
-    """Read `annotations.feather`.
-
-    `upper_lidar_xy` (2,) float64, m: position of the upper LiDAR, ego frame. `swept_ns` (F,) int64: stamps of the
-    sweeps that are there. `notes`: takes what was left out.
+    """Read `annotations.feather`; the upper LiDAR is at `upper_lidar_xy` (2,), m, ego frame, sweeps at `swept_ns` (F,) are there.
 
     A box is in the ego frame of its sweep's stamp, the start of the sweep, as the points are. It is drawn around the points
     of both LiDARs, which scan an object half a turn apart and each where it was at that time; ego motion alone is compensated.
@@ -229,10 +215,7 @@ def read_labels(
 
 
 def scan_time_ns(xy_lidar: Array) -> NDArray[np.int64]:
-    """Compute when both LiDARs scan objects: the mean (N,), ns, after the stamp of the sweep.
-
-    `xy_lidar` (N, 2) float64, m: positions of the objects from the LiDARs, axes of the ego.
-    """
+    """Compute when both LiDARs scan objects at `xy_lidar` (N, 2), m, ego axes: the mean (N,), ns, after the stamp of the sweep."""
     upper_ns = np.round(compute_turn_share(xy_lidar, START_AZIMUTH_RAD) * PERIOD_NS).astype(np.int64)
     return np.asarray((upper_ns + (upper_ns + HALF_TURN_NS) % PERIOD_NS) // 2)
 
@@ -240,9 +223,9 @@ def scan_time_ns(xy_lidar: Array) -> NDArray[np.int64]:
 def _join_riders(
     t_ns: NDArray[np.int64], size: Array, ego_T_box: Array, kinds: NDArray[np.str_]
 ) -> tuple[Array, Array, NDArray[np.str_], NDArray[np.bool_]]:
-    """Join each rider with the vehicle below: one road user with the vehicle's track, length and width, up to the rider's head.
+    """Join each rider with the vehicle below, up to the rider's head: sizes, poses, kinds, and which boxes (N,) are kept.
 
-    `t_ns` (N,), `size` (N, 3), `ego_T_box` (N, 4, 4), `kinds` (N,): of boxes. Returns sizes (N, 3), poses (N, 4, 4), kinds (N,) and what is kept (N,); a rider without a vehicle stays as it is.
+    The road user has the vehicle's track, length and width; a rider without a vehicle stays as it is.
     """
     poses, kinds, keep = ego_T_box.copy(), kinds.copy(), np.ones(len(kinds), dtype=bool)
     original = kinds.copy()
@@ -298,7 +281,7 @@ class ArgoverseReader:
         """Open a log; no image, no sweep and no annotation is read."""
         folder = path if _is_log(path) else path / sequence
         require_links_inside(folder, path)
-        return _Folder(folder).log()
+        return _open(folder)
 
 
 READER = ArgoverseReader()
@@ -325,98 +308,73 @@ def _logs(root: Path, depth: int) -> Iterator[Path]:
             folders += [(path / name, below - 1) for name in inside]
 
 
-@dataclass(frozen=True)
-class _Folder:
-    path: Path
-
-    def log(self) -> Log:
-        notes: list[str] = []
-        ego, offset_m = read_ego_track(self.path / POSES, notes)
-        table = read_columns(self.path / MOUNTS, {"sensor_name": "text", **TRANSFORM})
-        mounts = {str(n): mount for n, mount in zip(table["sensor_name"], transforms_of(table, self.path / MOUNTS))}
-        cameras, streams = self._cameras(mounts, notes)
-        lidars, sweeps = self._lidars(mounts, notes)
-        streams |= sweeps
-        if not streams:
-            raise LogError(f"{self.path / 'sensors'}: neither sweeps nor images; expected lidar/STAMP.feather")
-        # Three letters in the names of the map files.
-        folder = self.path / "map"
-        names = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-        found = [match[1] for match in map(CITY_IN_NAME.search, names) if match]
-        city = found[0] if found else None
-        map_frame = map_frame_of(city, offset_m, notes)
-        notes.append("stamps count from an unknown moment: only their differences are known")
-        upper_lidar_xy = mounts.get("up_lidar", np.eye(4))[:2, 3]
-        swept_ns = streams["up_lidar"].t_ns if "up_lidar" in streams else np.zeros(0, dtype=np.int64)
-        labels = self._labels(ego, upper_lidar_xy, swept_ns, notes)
-        return Log(
-            name=f"argoverse2-{self.path.resolve().name}",
-            format=READER.name,
-            cameras=cameras,
-            lidars=lidars,
-            streams=streams,
-            ego=ego,
-            ego_vehicle=EGO_VEHICLE,
-            map=map_frame,
-            labels=labels,
-            ground_z_ego_m=ROAD_Z_EGO_M,
-            reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
-            digest=self._digest(),
-            notes=defer_notes(notes, labels),
-            calibrations={n: str(self.path / (INTRINSICS if n in cameras else MOUNTS)) for n in streams},
-            details={"city": city},
-        )
-
-    def _labels(
-        self, ego: PoseTrack, upper_lidar_xy: Array, swept_ns: NDArray[np.int64], notes: list[str]
-    ) -> Callable[[], Labels | None]:
-        """Return a function that reads the labels once."""
-        path = self.path / ANNOTATIONS
-        if not is_present(path):
-            notes.append(f"no labels: {ANNOTATIONS} is missing, as in test splits")
-            return lambda: None
+def _open(path: Path) -> Log:
+    notes: list[str] = []
+    ego, offset_m = read_ego_track(path / POSES, notes)
+    table = read_columns(path / MOUNTS, {"sensor_name": "text", **TRANSFORM})
+    mounts = {str(n): mount for n, mount in zip(table["sensor_name"], transforms_of(table, path / MOUNTS))}
+    cameras, streams = _cameras(path, mounts, notes)
+    t_ns, files = stamped_files(path / "sensors" / "lidar", ".feather", notes)
+    missing = [name for name in LIDARS if name not in mounts]
+    if not files:
+        notes.append("no sweeps: sensors/lidar/ holds none")
+    elif missing:
+        raise LogError(f"{path / MOUNTS}: no sensor '{missing[0]}'; expected {', '.join(LIDARS)}")
+    lidars = {name: Lidar(name, "ego", mounts[name]) for name in (LIDARS if files else ())}
+    streams |= {name: sweep_stream(name, t_ns, files, mounts[name]) for name in lidars}
+    if not streams:
+        raise LogError(f"{path / 'sensors'}: neither sweeps nor images; expected lidar/STAMP.feather")
+    # Three letters in the names of the map files.
+    names = sorted(p.name for p in (path / "map").iterdir()) if (path / "map").is_dir() else []
+    city = next((match[1] for match in map(CITY_IN_NAME.search, names) if match), None)
+    map_frame = map_frame_of(city, offset_m, notes)
+    notes.append("stamps count from an unknown moment: only their differences are known")
+    labels: Callable[[], Labels] | None = None
+    if is_present(path / ANNOTATIONS):
         notes.append("objects were labeled only within 5 m of the drivable area")
-        return cache(partial(read_labels, path, ego, upper_lidar_xy, swept_ns, notes))
+        upper_lidar_xy = mounts.get("up_lidar", np.eye(4))[:2, 3]
+        labels = cache(partial(read_labels, path / ANNOTATIONS, ego, upper_lidar_xy, t_ns, notes))
+    else:
+        notes.append(f"no labels: {ANNOTATIONS} is missing, as in test splits")
+    index = [path / name for name in (POSES, MOUNTS, INTRINSICS) if (path / name).is_file()]
+    records = sorted(path.glob("*.feather")) + sorted((path / "sensors").rglob("*.*"))
+    return Log(
+        name=f"argoverse2-{path.resolve().name}",
+        format=READER.name,
+        cameras=cameras,
+        lidars=lidars,
+        streams=streams,
+        ego=ego,
+        ego_vehicle=EGO_VEHICLE,
+        map=map_frame,
+        labels=labels,
+        ground_z_ego_m=ROAD_Z_EGO_M,
+        reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
+        digest=digest_of([read_file(p, LIMITS.file_bytes, LogError).hex() for p in index], records),
+        notes=defer_notes(notes, *filter(None, [labels])),
+        calibrations={n: str(path / (INTRINSICS if n in cameras else MOUNTS)) for n in streams},
+        details={"city": city},
+    )
 
-    def _digest(self) -> str:
-        index = [self.path / name for name in (POSES, MOUNTS, INTRINSICS) if (self.path / name).is_file()]
-        records = sorted(self.path.glob("*.feather")) + sorted((self.path / "sensors").rglob("*.*"))
-        return digest_of([read_file(p, LIMITS.file_bytes, LogError).hex() for p in index], records)
 
-    def _lidars(self, mounts: dict[str, Array], notes: list[str]) -> tuple[dict[str, Lidar], dict[str, Stream]]:
-        t_ns, files = stamped_files(self.path / "sensors" / "lidar", ".feather", notes)
-        if not files:
-            notes.append("no sweeps: sensors/lidar/ holds none")
-            return {}, {}
-        missing = [name for name in LIDARS if name not in mounts]
-        if missing:
-            raise LogError(f"{self.path / MOUNTS}: no sensor '{missing[0]}'; expected {', '.join(LIDARS)}")
-        lidars = {name: Lidar(name, "ego", mounts[name]) for name in LIDARS}
-        return lidars, {name: sweep_stream(name, t_ns, files, mounts[name]) for name in LIDARS}
-
-    def _cameras(self, mounts: dict[str, Array], notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
-        root = self.path / "sensors" / "cameras"
-        found = {p.name: stamped_files(p, ".jpg", notes) for p in sorted(root.iterdir())} if root.is_dir() else {}
-        found = {name: (t_ns, files) for name, (t_ns, files) in found.items() if files}
-        path = self.path / INTRINSICS
-        if not found or not is_present(path):
-            notes.append(
-                f"images of {len(found)} cameras left out: {INTRINSICS} is missing"
-                if found
-                else "no images: sensors/cameras/ holds none"
-            )
-            return {}, {}
-        cameras, streams = _read_cameras(path, mounts), {}
-        for name, (t_ns, files) in found.items():
-            if name not in cameras:
-                notes.append(f"images of '{name}' left out: it is not in {INTRINSICS} and {MOUNTS}")
-                continue
-            size_px = cameras[name].width_px, cameras[name].height_px
-            streams[name] = image_stream(name, t_ns, files, size_px)
-        without = sorted(set(cameras) - set(streams))
-        if without:
-            notes.append(f"no images of {', '.join(without)}")
-        return {name: cameras[name] for name in streams}, streams
+def _cameras(folder: Path, mounts: dict[str, Array], notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
+    root, path = folder / "sensors" / "cameras", folder / INTRINSICS
+    found = {p.name: stamped_files(p, ".jpg", notes) for p in sorted(root.iterdir())} if root.is_dir() else {}
+    found = {name: (t_ns, files) for name, (t_ns, files) in found.items() if files}
+    if not found or not is_present(path):
+        left_out = f"images of {len(found)} cameras left out: {INTRINSICS} is missing"
+        notes.append(left_out if found else "no images: sensors/cameras/ holds none")
+        return {}, {}
+    cameras, streams = _read_cameras(path, mounts), {}
+    for name, (t_ns, files) in found.items():
+        if name in cameras:
+            streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
+        else:
+            notes.append(f"images of '{name}' left out: it is not in {INTRINSICS} and {MOUNTS}")
+    without = sorted(set(cameras) - set(streams))
+    if without:
+        notes.append(f"no images of {', '.join(without)}")
+    return {name: cameras[name] for name in streams}, streams
 
 
 def _read_cameras(path: Path, mounts: dict[str, Array]) -> dict[str, Camera]:

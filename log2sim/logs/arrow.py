@@ -42,10 +42,7 @@ DICTIONARY_BATCH, RECORD_BATCH = 2, 3
 
 
 def declared_size(data: bytes) -> tuple[int, int]:
-    """Return the rows and the unpacked bytes of all record batches of an Arrow file.
-
-    Raises `ValueError` when it is truncated or its structure is damaged.
-    """
+    """Return the rows and the unpacked bytes of all record batches of an Arrow file; `ValueError` for a damaged one."""
     if len(data) < 24 or data[-6:] != ARROW_MAGIC:
         raise ValueError("the Arrow file is truncated: it does not end with ARROW1")
     try:
@@ -64,25 +61,22 @@ def declared_size(data: bytes) -> tuple[int, int]:
                 if buffers > MAX_BUFFERS:
                     raise ValueError(f"more than the {MAX_BUFFERS} buffers that an Arrow file may have")
                 packed = bool(_field(data, batch, BATCH_COMPRESSION))
-                size += sum(_unpacked_bytes(data, offset + message_bytes, p, packed) for p in places)
+                for p in places:
+                    start, length = BUFFER.unpack_from(data, p)
+                    if start < 0 or length < 0 or offset + message_bytes < 0:
+                        raise ValueError("a buffer of the Arrow file is damaged")
+                    # Compressed buffers begin with their unpacked size; -1 marks one that is not compressed.
+                    if packed and length >= 8:
+                        (unpacked,) = struct.unpack_from("<q", data, offset + message_bytes + start)
+                        if unpacked < -1:
+                            raise ValueError("a buffer of the Arrow file has a negative size")
+                        length = length if unpacked == -1 else unpacked
+                    size += length
                 at = _field(data, batch, BATCH_LENGTH)
                 rows += struct.unpack_from("<q", data, at)[0] if at and field == FOOTER_BATCHES else 0
         return rows, size
     except struct.error:
         raise ValueError("the structure of the Arrow file is damaged") from None
-
-
-def _unpacked_bytes(data: bytes, body: int, place: int, packed: bool) -> int:
-    offset, length = BUFFER.unpack_from(data, place)
-    if offset < 0 or length < 0 or body < 0:
-        raise ValueError("a buffer of the Arrow file is damaged")
-    if not packed or length < 8:
-        return int(length)
-    # Compressed buffers begin with their unpacked size; -1 marks one that is not compressed.
-    (unpacked,) = struct.unpack_from("<q", data, body + offset)
-    if unpacked < -1:
-        raise ValueError("a buffer of the Arrow file has a negative size")
-    return int(length if unpacked == -1 else unpacked)
 
 
 def _batch(data: bytes, offset: int) -> int:
@@ -137,10 +131,7 @@ Kind = Literal["float", "int", "bool", "text", "bytes", "floats", "ints"]
 
 
 def values_of(column: Any, kind: Kind) -> NDArray[Any]:
-    """Convert a validated pyarrow array of N values; `log2sim.logs.arrow.read_columns` describes the kinds.
-
-    Raises `ValueError` when the column holds something else; says what was expected.
-    """
+    """Convert a validated pyarrow array of N values; `ValueError` says what was expected instead."""
     if kind not in get_args(Kind):
         raise TypeError(f"unknown kind '{kind}', expected one of {', '.join(get_args(Kind))}")
     import pyarrow
@@ -255,12 +246,9 @@ def read_columns(
     `wanted`: what each column must hold. "float": numbers, as (N,) float32 if they are float16 or float32, else
     float64, NaN where one is missing. "int": whole numbers, (N,) int64. "bool": (N,) bool. "text": (N,) object of str,
     also of whole numbers ("3"). "bytes": (N,) object of bytes. "floats" and "ints": a list of numbers a row, (N, K)
-    where the type says that all have the length K, else (N,) object of arrays. Columns encoded by a dictionary are
-    decoded. Missing text, bytes and lists are None. `optional`: names out of `wanted` that may be absent; they are
-    absent in the result then. `error`: what is raised: `LogError` for an index or calibration, `RecordError` for one
-    record. Returns dict of str to (N, ...) array: in the order of `wanted`. Raises `LogError` or `error` when the file
-    is missing, too large, damaged, or has no such column; names file, column and what was expected; `MissingExtra` when
-    pyarrow is not installed.
+    where the type says that all have the length K, else (N,) object of arrays. Missing text, bytes and lists are None.
+    `optional`: names that may be absent, in the result then too. Raises `error`, `RecordError` for one record, that names file,
+    column and what was expected; `MissingExtra` when pyarrow is not installed.
     """
     with translate_errors(path, error):
         with open_regular(path) as file:
@@ -272,7 +260,18 @@ def read_columns(
         else:
             raise ValueError("neither an Arrow (feather, version 2) nor a parquet file")
         table.validate(full=True)
-        return {name: _values(table.column(name), name, wanted[name]) for name in wanted if name in table.column_names}
+        return {
+            name: _column(table.column(name).combine_chunks(), name, wanted)
+            for name in wanted
+            if name in table.column_names
+        }
+
+
+def _column(column: Any, name: str, wanted: Mapping[str, Kind]) -> NDArray[Any]:
+    try:
+        return values_of(column, wanted[name])
+    except ValueError as problem:
+        raise ValueError(f"column '{name}': {problem}") from None
 
 
 def import_pyarrow() -> Any:
@@ -302,10 +301,9 @@ def translate_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
 
 
 def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection[str] = ()) -> list[str]:
-    """Return the names out of `wanted` that a pyarrow schema has.
+    """Return the names out of `wanted` that a pyarrow schema has; `ValueError` when one is missing, there twice, or an extension.
 
-    Raises `ValueError` when a column is missing or there twice, or when its type is an extension: those run code of
-    whoever registered them.
+    Extension types run code of whoever registered them.
     """
     pyarrow = import_pyarrow()
     names = list(schema.names)
@@ -366,13 +364,6 @@ def _read_feather(path: Path, wanted: Mapping[str, Kind], optional: Collection[s
         return file.read_all() if names else pyarrow.table({})
 
 
-def _values(column: Any, name: str, kind: Kind) -> NDArray[Any]:
-    try:
-        return values_of(column.combine_chunks(), kind)
-    except ValueError as problem:
-        raise ValueError(f"column '{name}': {problem}") from None
-
-
 # Decoded rows are kept up to this size; see `ParquetRows`.
 MAX_KEPT_BYTES = 256 * 1024**2
 PARQUET_ROWS_AT_A_TIME = 8
@@ -383,10 +374,7 @@ Row = dict[str, Any]
 
 
 class ParquetRows:
-    """Rows of a parquet file, read on request, also from several threads.
-
-    `wanted`: the columns of a row and what they hold, as for `log2sim.logs.arrow.read_columns`. `optional`: names out
-    of `wanted` that may be absent.
+    """Rows of a parquet file, read on request, also from several threads; `wanted` and `optional` as in `read_columns`.
 
     To read a row of a parquet file, the rows before it in its row group have to be decoded. Reading therefore continues after
     the last row that was read, and decoded rows are kept up to `MAX_KEPT_BYTES`: reading in the order of the file decodes it
@@ -415,10 +403,7 @@ class ParquetRows:
             return int(self._starts[-1])
 
     def read(self, index: int) -> Row:
-        """Read row `index`: a number, str, bytes or array for each column, None where it is missing.
-
-        Raises `RecordError` when the file is damaged there or lacks a wanted column; names file, row and column.
-        """
+        """Read row `index`: a number, str, bytes or array for each column, None where it is missing; `RecordError` if damaged."""
         with self._lock, translate_errors(f"{self._path}, row {index}", RecordError):
             self._open()
             if not 0 <= index < self._starts[-1]:
@@ -464,27 +449,17 @@ class ParquetRows:
                 raise ValueError(
                     f"unpacks to {batch.nbytes} bytes, more than the {self._limits.unpacked_bytes} allowed"
                 )
-            rows = self._rows(batch)
+            batch.validate(full=True)
+            columns = {name: _column(batch.column(name), name, self._wanted) for name in self._names}
+            rows = {self._next + k: {n: values[k] for n, values in columns.items()} for k in range(batch.num_rows)}
+            self._next += batch.num_rows
+            for number, row in rows.items():
+                self._kept_bytes += _size(row) - _size(self._kept.pop(number, {}))
+                self._kept[number] = row
+            while self._kept_bytes > MAX_KEPT_BYTES:
+                self._kept_bytes -= _size(self._kept.popitem(last=False)[1])
             if index in rows:
                 return rows[index]
-
-    def _rows(self, batch: Any) -> dict[int, Row]:
-        """Rows of a batch by their number; they are kept until newer ones need the room."""
-        batch.validate(full=True)
-        columns = {}
-        for name in self._names:
-            try:
-                columns[name] = values_of(batch.column(name), self._wanted[name])
-            except ValueError as problem:
-                raise ValueError(f"column '{name}': {problem}") from None
-        rows = {self._next + k: {name: values[k] for name, values in columns.items()} for k in range(batch.num_rows)}
-        self._next += batch.num_rows
-        for number, row in rows.items():
-            self._kept_bytes += _size(row) - _size(self._kept.pop(number, {}))
-            self._kept[number] = row
-        while self._kept_bytes > MAX_KEPT_BYTES:
-            self._kept_bytes -= _size(self._kept.popitem(last=False)[1])
-        return rows
 
 
 def _size(row: Row) -> int:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Log
-from log2sim.geometry import NS_PER_S, Camera, Mount, fold_radius, nearest_index, undistort
-from log2sim.geometry.transforms import Array
+from log2sim.geometry import NS_PER_S, Camera, fold_radius, nearest_index, undistort
 from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of, take_labels
 from log2sim.logs.records import MAX_POSITION_M
 
@@ -27,25 +26,19 @@ def find_possible(labels: Labels) -> NDArray[np.bool_]:
 
 def drop_impossible_labels(log: Log) -> Log:
     """Return the log without labels that no object can have, and with a note of how many there were; labels stay unread until they are asked for."""
+    possible = cache(lambda: None if log.labels is None else find_possible(log.labels))
 
-    @cache
-    def checked() -> tuple[Labels | None, int]:
-        labels = log.labels
-        if labels is None:
-            return None, 0
-        possible = find_possible(labels)
-        if possible.all():
-            return labels, 0
-        return take_labels(labels, possible), int((~possible).sum())
+    def labels() -> Labels | None:
+        kept, given = possible(), log.labels
+        return given if given is None or kept is None or kept.all() else take_labels(given, kept)
 
     def notes() -> tuple[str, ...]:
-        count = checked()[1]
-        if not count:
-            return log.notes
+        kept = possible()
+        count = 0 if kept is None else int((~kept).sum())
         words = f"{count} label{'s' * (count != 1)} left out: no object is so large or so far away, or it has no size"
-        return *log.notes, words
+        return (*log.notes, words) if count else log.notes
 
-    return log.changed(labels=lambda: checked()[0], notes=notes)
+    return log.changed(labels=labels, notes=notes)
 
 
 # In image widths: a field of view of 136 degrees without distortion, and lenses for photographs of the moon.
@@ -86,10 +79,20 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
         where = f"{place}, camera '{name}'"
         yield from _pinhole(camera, where)
         yield from _distortion(camera, where)
-        yield from _mount(camera.mount, camera.mount_T_cam, where)
+        mount, mount_T_sensor = camera.mount, camera.mount_T_cam
     elif name in log.lidars:
-        lidar = log.lidars[name]
-        yield from _mount(lidar.mount, lidar.mount_T_lidar, f"{place}, LiDAR '{name}'")
+        where, mount = f"{place}, LiDAR '{name}'", log.lidars[name].mount
+        mount_T_sensor = log.lidars[name].mount_T_lidar
+    else:
+        return
+    distance_m = float(np.linalg.norm(mount_T_sensor[:3, 3]))
+    if mount == "ego" and not distance_m <= MAX_MOUNT_DISTANCE_M:
+        x, y, z = mount_T_sensor[:3, 3].tolist()
+        yield CalibrationProblem(
+            f"{where}: its mounting is {distance_m:.6g} m from the ego, at ({x:.6g}, {y:.6g}, {z:.6g}) m; expected at most "
+            f"{MAX_MOUNT_DISTANCE_M:g} m, so check its unit and its frame",
+            True,
+        )
 
 
 def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
@@ -118,11 +121,10 @@ def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
 def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     wrong = [value for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
     if wrong:
-        yield CalibrationProblem(
-            f"{where}: its distortion has the coefficient {wrong[0]:.6g}, expected numbers up to {MAX_DISTORTION:g}",
-            True,
-        )
-    if wrong or camera.rectified or not np.arctan(fold_radius(camera)) < np.radians(MAX_FOLD_DEGREES):
+        expected = f"expected numbers up to {MAX_DISTORTION:g}"
+        yield CalibrationProblem(f"{where}: its distortion has the coefficient {wrong[0]:.6g}, {expected}", True)
+    fold_deg = 90.0 if wrong or camera.rectified else float(np.degrees(np.arctan(fold_radius(camera))))
+    if not fold_deg < MAX_FOLD_DEGREES:
         return
     u, v = ((np.arange(GRID) + 0.5) * size / GRID for size in (camera.width_px, camera.height_px))
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -130,21 +132,9 @@ def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     if share > MAX_FOLDED_SHARE:
         values = ", ".join(f"{value:.6g}" for value in camera.distortion)
         yield CalibrationProblem(
-            f"{where}: its distortion ({camera.distortion_model}: {values}) folds the image at "
-            f"{np.degrees(np.arctan(fold_radius(camera))):.0f} degrees off the axis: {100 * share:.0f} % of the pixels have no ray; "
-            "check the order and signs of the coefficients",
+            f"{where}: its distortion ({camera.distortion_model}: {values}) folds the image at {fold_deg:.0f} degrees off the axis: "
+            f"{100 * share:.0f} % of the pixels have no ray; check the order and signs of the coefficients",
             share > MAX_USABLE_FOLDED_SHARE,
-        )
-
-
-def _mount(mount: Mount, mount_T_sensor: Array, where: str) -> Iterator[CalibrationProblem]:
-    distance_m = float(np.linalg.norm(mount_T_sensor[:3, 3]))
-    if mount == "ego" and not distance_m <= MAX_MOUNT_DISTANCE_M:
-        x, y, z = mount_T_sensor[:3, 3].tolist()
-        yield CalibrationProblem(
-            f"{where}: its mounting is {distance_m:.6g} m from the ego, at ({x:.6g}, {y:.6g}, {z:.6g}) m; expected at most "
-            f"{MAX_MOUNT_DISTANCE_M:g} m, so check its unit and its frame",
-            True,
         )
 
 
@@ -195,10 +185,7 @@ class Span:
 
 
 def list_time_problems(log: Log) -> list[str]:
-    """List what is wrong with the stamps of a log, one line each.
-
-    Only stamps are read, and the labels.
-    """
+    """List what is wrong with the stamps of a log, one line each; only stamps are read, and the labels."""
     return [*_other_clocks(log), *_reference_problem(log), *_image_label_problems(log), *_label_problems(log)]
 
 
@@ -214,13 +201,11 @@ def explain_missing_poses(log: Log, t_ns: NDArray[np.int64]) -> str:
 
 def describe_gap(one: Span, other: Span) -> str:
     """Say that two spans do not overlap, by how much, and which clocks would explain it."""
-    difference_s = (one.first_ns - other.first_ns) / NS_PER_S
     hint = _explain(one, other)
-    reason = f": {hint}?" if hint else ""
+    first, second = (f"{_seconds(span.first_ns)} to {_seconds(span.last_ns)} s" for span in (one, other))
     return (
-        f"the {one.words} are from {_seconds(one.first_ns)} to {_seconds(one.last_ns)} s, the {other.words} from "
-        f"{_seconds(other.first_ns)} to {_seconds(other.last_ns)} s: they do not overlap (the difference is "
-        f"{abs(difference_s):.6g} s{reason})"
+        f"the {one.words} are from {first}, the {other.words} from {second}: they do not overlap (the difference is "
+        f"{abs(one.first_ns - other.first_ns) / NS_PER_S:.6g} s{f': {hint}?' * bool(hint)})"
     )
 
 
@@ -243,10 +228,9 @@ def _explain(one: Span, other: Span) -> str:
     zone_s = round(difference_s / SECONDS_OF_ZONES) * SECONDS_OF_ZONES
     if 0 < zone_s <= MAX_ZONE_S:
         offsets[zone_s] = f"{zone_s / 3600:g} h, a time zone"
-    misfit = {}  # distances of both ends when the later span is moved by an offset
-    for seconds in offsets:
-        first_ns, last_ns = late.first_ns - seconds * NS_PER_S, late.last_ns - seconds * NS_PER_S
-        misfit[seconds] = abs(first_ns - early.first_ns) + abs(last_ns - early.last_ns)
+    # By the distances of both ends when the later span is moved by an offset.
+    moved = {s: (late.first_ns - s * NS_PER_S, late.last_ns - s * NS_PER_S) for s in offsets}
+    misfit = {s: abs(first - early.first_ns) + abs(last - early.last_ns) for s, (first, last) in moved.items()}
     best = min(misfit, key=lambda seconds: misfit[seconds])
     length_ns = min(early.last_ns - early.first_ns, late.last_ns - late.first_ns)
     return offsets[best] if misfit[best] <= max(length_ns, MAX_APART_NS) else ""
@@ -268,14 +252,13 @@ def _other_clocks(log: Log) -> list[str]:
             groups.append(([span.words], span))
     if len(groups) < 2:
         return []
-    spans = [Span(_listed(words), span.first_ns, span.last_ns) for words, span in groups]
+    spans = []
+    for words, span in groups:
+        more = len(words) - MAX_NAMES
+        rest = f" and {more} other stream{'s' * (more > 1)}" if more > 0 else ""
+        spans.append(Span(", ".join(words[:MAX_NAMES]) + rest, span.first_ns, span.last_ns))
     most = max(range(len(groups)), key=lambda k: len(groups[k][0]))
     return [describe_gap(span, spans[most]) for k, span in enumerate(spans) if k != most]
-
-
-def _listed(words: Sequence[str]) -> str:
-    more = len(words) - MAX_NAMES
-    return ", ".join(words[:MAX_NAMES]) + (f" and {more} other stream{'s' * (more > 1)}" if more > 0 else "")
 
 
 def _reference_problem(log: Log) -> list[str]:
@@ -290,8 +273,13 @@ def _reference_problem(log: Log) -> list[str]:
     end_ns = max(max(span.last_ns for span in others) - own.last_ns, 0)
     whole_ns = own.last_ns - own.first_ns + begin_ns + end_ns
     least_ns = max(MIN_MISSING_NS, MIN_MISSING_SHARE * whole_ns)
-    late = sum(own.first_ns - span.first_ns >= least_ns for span in others) * 2 >= len(others) and begin_ns >= least_ns
-    early = sum(span.last_ns - own.last_ns >= least_ns for span in others) * 2 >= len(others) and end_ns >= least_ns
+    late, early = (
+        gap_ns >= least_ns and sum(own_ns >= least_ns for own_ns in gaps) * 2 >= len(others)
+        for gap_ns, gaps in (
+            (begin_ns, [own.first_ns - span.first_ns for span in others]),
+            (end_ns, [span.last_ns - own.last_ns for span in others]),
+        )
+    )
     if not late and not early:
         return []
     parts = [f"begins {begin_ns / NS_PER_S:.1f} s after"] * late + [f"ends {end_ns / NS_PER_S:.1f} s before"] * early

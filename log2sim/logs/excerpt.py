@@ -40,12 +40,11 @@ class _Span:
 
 
 def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = None, stop_s: float | None = None) -> Log:
-    """Restrict a log to some cameras and to a time.
+    """Restrict a log to some cameras, all where there are none, and to a time; LiDARs are always kept.
 
-    `cameras`: all where it is empty. LiDARs are always kept. `start_s`, `stop_s`: ticks, the frames of the reference
-    camera or else the sweeps of a LiDAR, are kept from `start_s` to `stop_s`, s after the first one. Other records
-    reach up to `RECORD_MARGIN_NS` beyond them, poses and labels to the next one. Raises `ConfigError` for an unknown
-    camera, and where no tick is left.
+    `start_s`, `stop_s`: ticks, the frames of the reference camera or else the sweeps of a LiDAR, are kept from `start_s` to
+    `stop_s`, s after the first one. Other records reach up to `RECORD_MARGIN_NS` beyond them, poses and labels to the next one.
+    Raises `ConfigError` for an unknown camera, and where no tick is left.
     """
     for name in cameras:
         if name not in log.cameras:
@@ -56,8 +55,14 @@ def cut_log(log: Log, *, cameras: Sequence[str] = (), start_s: float | None = No
     chosen = {name: camera for name, camera in log.cameras.items() if not cameras or name in cameras}
     streams = {name: log.streams[name] for name in (*chosen, *log.lidars)}
     reference = reference_of(log, list(chosen))
-    ticks = log.streams[reference].t_ns
-    span = None if start_s is None and stop_s is None else _span(ticks, reference, start_s, stop_s)
+    ticks, span = log.streams[reference].t_ns, None
+    if start_s is not None or stop_s is not None:
+        seconds = (ticks - ticks[0]) / NS_PER_S
+        low, high = -np.inf if start_s is None else start_s, np.inf if stop_s is None else stop_s
+        kept_ns = ticks[(seconds >= low) & (seconds <= high)]
+        if not len(kept_ns):
+            raise ConfigError(f"--start/--stop leave no record of '{reference}', which lasts {seconds[-1]:.3f} s")
+        span = _Span(int(kept_ns[0]), int(kept_ns[-1]))
     notes: list[str] = []
     margins = {name: 0 if name == reference else RECORD_MARGIN_NS for name in streams}
     if span is not None:
@@ -87,15 +92,6 @@ def reference_of(log: Log, cameras: Sequence[str]) -> str:
     return max(log.lidars, key=lambda name: len(log.streams[name].t_ns))
 
 
-def _span(ticks: NDArray[np.int64], reference: str, start_s: float | None, stop_s: float | None) -> _Span:
-    seconds = (ticks - ticks[0]) / NS_PER_S
-    low, high = -np.inf if start_s is None else start_s, np.inf if stop_s is None else stop_s
-    kept = ticks[(seconds >= low) & (seconds <= high)]
-    if not len(kept):
-        raise ConfigError(f"--start/--stop leave no record of '{reference}', which lasts {seconds[-1]:.3f} s")
-    return _Span(int(kept[0]), int(kept[-1]))
-
-
 def _cut_stream(stream: Stream, span: _Span, margin_ns: int) -> Stream:
     rows = np.flatnonzero(span.contains(stream.t_ns, margin_ns)).tolist()
     read, encoded = stream.read, stream.encoded
@@ -106,8 +102,7 @@ def _cut_stream(stream: Stream, span: _Span, margin_ns: int) -> Stream:
 def _cut_poses(track: PoseTrack, span: _Span) -> PoseTrack:
     """Keep the poses of the records and one beyond on either side, for interpolation."""
     inside = np.flatnonzero(span.contains(track.t_ns, 2 * RECORD_MARGIN_NS))
-    first = np.searchsorted(track.t_ns, span.first_ns) if not len(inside) else inside[0]
-    last = first if not len(inside) else inside[-1]
+    first, last = inside[[0, -1]] if len(inside) else [np.searchsorted(track.t_ns, span.first_ns)] * 2
     rows = slice(max(int(first) - 1, 0), int(last) + 2)
     return replace(track, t_ns=track.t_ns[rows], map_T_ego=track.map_T_ego[rows])
 

@@ -23,7 +23,7 @@ from log2sim.logs.checks import find_possible
 from log2sim.logs.kitti import labels as kitti
 from log2sim.logs.native.reader import BOX_3D_COLUMNS, BOX_3D_OPTIONAL, boxes_3d, read_csv_table
 from log2sim.logs.nuscenes import scene as nuscenes
-from log2sim.logs.stamps import count_words, note_damaged_rows
+from log2sim.logs.stamps import count_words
 
 EXPECTED = (
     "lines of KITTI's tracking labels, JSON of nuScenes (sample_annotation or results) or OpenLABEL, or a CSV table with the "
@@ -43,8 +43,7 @@ CATEGORY_OF: Mapping[str, str] = {
 def replace_labels(log: Log, path: Path) -> Log:
     """Return a log with the boxes of a file as its labels, in place of its own.
 
-    Raises `LogError` when the file cannot be read, is of none of the formats, or has no box at a time at which the log
-    has a pose.
+    Raises `LogError` for a file of none of the formats, and for one without a box at a time at which the log has a pose.
     """
     first = read_file(path, JSON_LIMIT_BYTES, LogError)[:4096].decode("utf-8-sig", errors="replace").lstrip()
     notes: list[str] = []
@@ -66,7 +65,15 @@ def replace_labels(log: Log, path: Path) -> Log:
     if not possible.all():
         row = int(np.argmin(possible))
         raise LogError(f"{path}: box of '{labels.track_id[row]}': no object has this size or place")
-    _require_common_time(log, labels, path)
+    spans = [s.t_ns[[0, -1]] for s in log.streams.values() if len(s.t_ns)]
+    if not len(labels.t_ns):
+        raise LogError(f"{path}: no box at a time and place that {log.name} knows")
+    first_ns, last_ns = (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else (0, MAX_STAMP_NS)
+    if labels.t_ns.max() < first_ns or labels.t_ns.min() > last_ns:
+        times = [f"{int(t) / NS_PER_S:.3f}" for t in (labels.t_ns.min(), labels.t_ns.max(), first_ns, last_ns)]
+        raise LogError(
+            f"{path}: its boxes are of {times[0]} to {times[1]} s, {log.name} of {times[2]} to {times[3]} s; are both of one drive?"
+        )
     said = [f"{path.name}: {note}" for note in notes]
     return log.changed(labels=labels, ignored_regions=regions, notes=lambda: (*log.notes, *said))
 
@@ -132,11 +139,8 @@ def _kitti_labels(log: Log, path: Path, notes: list[str]) -> tuple[Labels, dict[
     camera, stamps = _reference(log, path)
     if camera not in log.cameras:
         raise LogError(f"{path}: KITTI's boxes are in the frame of a camera, and {log.name} has none")
-    damaged: list[str] = []
-    rows = kitti.parse_labels(
-        read_file(path, JSON_LIMIT_BYTES, LogError).decode("utf-8", errors="replace"), path, damaged
-    )
-    note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
+    text = read_file(path, JSON_LIMIT_BYTES, LogError).decode("utf-8", errors="replace")
+    rows = kitti.parse_labels_noting(text, path, notes)
     inside = rows.frame < len(stamps)
     if not inside.all():
         notes.append(f"{int((~inside).sum())} labels left out: of frames after the last of '{camera}'")
@@ -185,7 +189,7 @@ def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
             if value is None:
                 raise LogError(f"{where}: needs {what}")
         width, length, height = _numbers(entry.get("size"), (3,), f"{where}, size")
-        rotation = rotation_from_quaternion(_unit(_numbers(entry.get("rotation"), (4,), f"{where}, rotation"), where))
+        rotation = _rotation(_numbers(entry.get("rotation"), (4,), f"{where}, rotation"), where)
         pose = transform(rotation, _numbers(entry.get("translation"), (3,), f"{where}, translation"))
         yield _Box(where, _stamp_ns(stamp, log, where), str(track), str(word), pose, (length, width, height))
 
@@ -214,14 +218,11 @@ def _openlabel_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
                 if t_ns is None:
                     t_ns = _frame_ns(number, log, path) if stamp is None else _stamp_ns(stamp, log, where)
                 values = _numbers(cuboid.get("val"), (9, 10), f"{where}, val")
-                rotation = (
-                    rotation_from_rpy(*values[3:6])
-                    if len(values) == 9
-                    else rotation_from_quaternion(_unit(values[[6, 3, 4, 5]], where))
-                )
+                angles = len(values) == 9
+                turn = rotation_from_rpy(*values[3:6]) if angles else _rotation(values[[6, 3, 4, 5]], where)
                 name = str(cuboid.get("coordinate_system", ""))
                 frame = {"scene_cs": "map", "geo": "map", "local_cs": "ego"}.get(systems.get(name, ""), name or "ego")
-                yield _Box(where, t_ns, uid, word, transform(rotation, values[:3]), values[-3:].tolist(), frame)
+                yield _Box(where, t_ns, uid, word, transform(turn, values[:3]), values[-3:].tolist(), frame)
 
 
 def _mapping(document: Any, key: str, path: Path) -> dict[str, Any]:
@@ -243,11 +244,11 @@ def _numbers(value: Any, counts: tuple[int, ...], where: str) -> Array:
     return np.array(value, dtype=np.float64)
 
 
-def _unit(quaternion: Array, where: str) -> Array:
+def _rotation(quaternion: Array, where: str) -> Array:
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1) <= 0.01:  # as rounded to two decimals
         raise LogError(f"{where}: a rotation of length {length:g}, expected a unit quaternion")
-    return np.asarray(quaternion / length)
+    return rotation_from_quaternion(quaternion / length)
 
 
 def _reference(log: Log, path: Path) -> tuple[str, Any]:
@@ -292,15 +293,3 @@ def _stamp_ns(value: Any, log: Log, where: str) -> int:
         return min(starts, default=0) + round(number * NS_PER_S)
     scale = next(s for limit, s in ((1e11, NS_PER_S), (1e14, 10**6), (1e17, 10**3), (np.inf, 1)) if number < limit)
     return round(number * scale)
-
-
-def _require_common_time(log: Log, labels: Labels, path: Path) -> None:
-    spans = [s.t_ns[[0, -1]] for s in log.streams.values() if len(s.t_ns)]
-    if not len(labels.t_ns):
-        raise LogError(f"{path}: no box at a time and place that {log.name} knows")
-    first, last = (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else (0, MAX_STAMP_NS)
-    if labels.t_ns.max() < first or labels.t_ns.min() > last:
-        times = [f"{int(t) / NS_PER_S:.3f}" for t in (labels.t_ns.min(), labels.t_ns.max(), first, last)]
-        raise LogError(
-            f"{path}: its boxes are of {times[0]} to {times[1]} s, {log.name} of {times[2]} to {times[3]} s; are both of one drive?"
-        )

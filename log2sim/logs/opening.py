@@ -198,10 +198,9 @@ def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:
 
 def _logs_below(root: Path) -> list[str]:
     """Return the logs below a folder, for who gave the folder of many; none where a short search finds none."""
-    try:
+    with suppress(Log2SimError, OSError):
         return [str(log.path) for log in plugins.call("find_logs", root, max_folders=MAX_FOLDERS_BELOW)]
-    except (Log2SimError, OSError):
-        return []
+    return []
 
 
 def is_log_file(path: Path) -> bool:

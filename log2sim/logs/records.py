@@ -162,10 +162,8 @@ def _bytes_of(sweep: Sweep) -> int:
 def guard_log(log: Log, where: str) -> Log:
     """Return the log of a reader with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
 
-    The sweeps that were read last are kept.
-
-    `where`: its path, for errors. Raises `LogError` for poses of the ego that are not finite, or farther from the origin of
-    the map than any place on Earth.
+    The sweeps that were read last are kept. `where`: its path, for errors. Raises `LogError` for poses of the ego that are not
+    finite, or farther from the origin of the map than any place on Earth.
     """
     if log.ego is not None:
         wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
@@ -211,11 +209,10 @@ MAX_IMAGE_BYTES = 256 * 1024 * 1024
 def decode_image(
     data: bytes, where: str, size_px: tuple[int, int], *, least_px: int = 0, gray: bool = False
 ) -> NDArray[np.uint8]:
-    """Decode a JPEG or PNG file as (H, W, 3) uint8 BGR, or as (H, W) `gray`.
+    """Decode a JPEG or PNG file, for a calibration of width and height `size_px`, as (H, W, 3) uint8 BGR, or as (H, W) `gray`.
 
-    `where`: names file and stamp in errors. `size_px` (int, int): width and height that the calibration is for. `least_px`: a
-    JPEG is decoded at a smaller scale as far as it stays this wide; 0 for the whole. Raises `RecordError` when it is
-    truncated, no JPEG or PNG, or of another size.
+    `where`: names file and stamp in errors. `least_px`: a JPEG is decoded at a smaller scale as far as it stays this wide; 0 for
+    the whole. Raises `RecordError` when it is truncated, no JPEG or PNG, or of another size.
     """
     width, height = image_size(data, where)
     if (width, height) != size_px:
@@ -231,9 +228,8 @@ def decode_image(
             raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
     import cv2
 
-    image = cv2.imdecode(
-        np.frombuffer(_checked_png(data, where), np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    )
+    png = np.frombuffer(_checked_png(data, where), np.uint8)
+    image = cv2.imdecode(png, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise RecordError(f"{where}: PNG cannot be decoded")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image, dtype=np.uint8)
@@ -327,13 +323,14 @@ def parse_pcd(
     """Parse points (N, 3), their times (N,) int64 ns relative to the stamp and their intensities (N,); None without such a field.
 
     A time field is `t_offset_ns`, `offset` or `t` (relative to the stamp) or `timestamp` (absolute); whole numbers are
-    nanoseconds, floating-point numbers seconds.
-
-    Raises `ValueError` when the header or the data do not follow the format.
+    nanoseconds, floating-point numbers seconds. Raises `ValueError` when the header or the data do not follow the format.
     """
     header, body = _read_header(data)
     layout = _layout(header)
-    count = _points(header, limit_points)
+    words = header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
+    count = int(words[0])
+    if not 0 <= count <= limit_points:
+        raise ValueError(f"{count} points, more than the {limit_points} that a sweep may have")
     encoding = header["DATA"][0].lower()
     if encoding == "binary":
         if len(body) < count * layout.itemsize:
@@ -383,15 +380,9 @@ def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
     spec: list[tuple[str, str, tuple[int, ...]]] = []
     for k, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts)):
         code = {"F": "f", "I": "i", "U": "u"}.get(kind.upper())
-        if (
-            code is None
-            or size not in ("1", "2", "4", "8")
-            or (code == "f" and size in ("1", "2"))
-            or not count.isdigit()
-        ):
+        sizes_of = {"f": ("4", "8"), "i": ("1", "2", "4", "8"), "u": ("1", "2", "4", "8")}
+        if code is None or size not in sizes_of[code] or not count.isdigit() or int(count) > 4096:
             raise ValueError(f"PCD header: field '{name}' has TYPE {kind} SIZE {size} COUNT {count}")
-        if int(count) > 4096:
-            raise ValueError(f"PCD header: field '{name}' has COUNT {count}")
         # Padding fields are all called "_", so names are made unique by their index.
         unique = name if names.index(name) == k and name != "_" else f"_{k}"
         spec.append((unique, f"<{code}{size}", () if count == "1" else (int(count),)))
@@ -402,14 +393,6 @@ def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
         if shape and name in ("x", "y", "z", *TIME_FIELDS):
             raise ValueError(f"PCD header: field '{name}' has COUNT {shape[0]}, expected 1")
     return np.dtype(spec)
-
-
-def _points(header: dict[str, list[str]], limit_points: int) -> int:
-    words = header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
-    count = int(words[0])
-    if not 0 <= count <= limit_points:
-        raise ValueError(f"{count} points, more than the {limit_points} that a sweep may have")
-    return count
 
 
 def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]:
@@ -460,11 +443,7 @@ Intensity = NDArray[Any] | None
 
 
 def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
-    """Read a sweep; rows that are not finite are dropped.
-
-    Raises `RecordError` when it is missing, truncated, too large or not of the layout that its suffix promises; names
-    file and stamp.
-    """
+    """Read a sweep; `RecordError` when it is missing, truncated, too large or not of the layout that its suffix promises."""
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     try:
         xyz, offset_ns, intensity = _parse(path.suffix.lower(), data, t_ns)
@@ -483,9 +462,8 @@ def sweep_of(
 ) -> Sweep:
     """Build a `Sweep` of the rows of points (N, 3) that are finite and can be on Earth, with stamps `t_ns` + `offset_ns` (N,).
 
-    Intensities (N,) of any type of numbers become float32; those that cannot be, NaN.
-
-    Raises `ValueError` for times of points farther from the stamp than `checked_offset_ns` allows.
+    Intensities (N,) of any type of numbers become float32, NaN where they are negative or not finite. Raises `ValueError` for times
+    of points farther from the stamp than `checked_offset_ns` allows.
     """
     # False for NaN. Mostly all points are possible, which their least and greatest coordinate tell in a tenth of the time.
     if len(xyz_m) and not (xyz_m.min() >= -MAX_POSITION_M and xyz_m.max() <= MAX_POSITION_M):
@@ -494,14 +472,12 @@ def sweep_of(
         offset_ns = None if offset_ns is None else offset_ns[possible]
         intensity = None if intensity is None else intensity[possible]
     point_ns = None if offset_ns is None else t_ns + checked_offset_ns(offset_ns)
-    return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns, None if intensity is None else _strengths(intensity))
-
-
-def _strengths(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Return intensities (N,) as float32, NaN where they are negative or not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        strengths = values.astype(np.float32)
-        return np.where(np.isfinite(strengths) & (strengths >= 0), strengths, np.float32(np.nan))
+    strengths: NDArray[np.float32] | None = None
+    if intensity is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            cast = intensity.astype(np.float32)
+            strengths = np.where(np.isfinite(cast) & (cast >= 0), cast, np.float32(np.nan))
+    return Sweep(t_ns, xyz_m, frame, point_ns, compensated_ns, strengths)
 
 
 def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:

@@ -21,11 +21,7 @@ def count_words(words: Iterable[str]) -> str:
 
 
 def note_left_out(kinds: Iterable[str], no_road_users: Collection[str], notes: list[str]) -> None:
-    """Note the labels that get no category.
-
-    `kinds`: what the data set calls the object of each label that is left out. `no_road_users`: kinds that are left out
-    on purpose; others are not known. `notes`: takes a note for either of the two, where there are such labels.
-    """
+    """Note the labels that get no category: kinds that are left out on purpose, `no_road_users`, and kinds that are not known."""
     kinds = list(kinds)
     for reason, known in (("they are no road users", True), ("their kind is not known", False)):
         words = [kind for kind in kinds if (kind in no_road_users) == known]
@@ -34,11 +30,7 @@ def note_left_out(kinds: Iterable[str], no_road_users: Collection[str], notes: l
 
 
 def note_damaged_rows(damaged: Sequence[str], total: int, notes: list[str]) -> None:
-    """Note the rows of a text that are left out because they cannot be read.
-
-    `damaged`: where each of them is and what is wrong with it. `total`: of all rows. `notes`: takes a note where there
-    are such rows. Raises `LogError` when no row can be read.
-    """
+    """Note the rows of a text, of so many in `total`, that are damaged and left out; `LogError` when no row can be read."""
     if damaged and len(damaged) == total:
         raise LogError(damaged[0])
     if damaged:
@@ -66,10 +58,9 @@ MAX_POINT_OFFSET_NS = NS_PER_S
 
 
 def checked_offset_ns(t_ns: NDArray[np.number], stamp_ns: int = 0) -> NDArray[np.int64]:
-    """Compute the times of points relative to the stamp of their sweep.
+    """Compute the times (N,) of points relative to the stamp of their sweep; `ValueError` for any beyond `MAX_POINT_OFFSET_NS`.
 
-    `t_ns` (N,) whole or floating-point numbers: finite. `stamp_ns`: what they count from; 0 for times that are relative
-    to the stamp already. Returns (N,) int64. Raises `ValueError` for any beyond `MAX_POINT_OFFSET_NS`.
+    `stamp_ns`: what they count from; 0 for times that are relative to the stamp already.
     """
     # As integers of Python, which do not overflow.
     ends = [int(t) - stamp_ns for t in (t_ns.min(), t_ns.max())] if len(t_ns) else []
@@ -109,33 +100,24 @@ def strictly_increasing(t_ns: NDArray[np.int64], what: str, notes: list[str]) ->
 
 
 def compute_turn_share(xy_lidar: Array, start_azimuth_rad: float = np.pi) -> Array:
-    """Compute the share of a clockwise turn after which a LiDAR scans directions.
+    """Compute the share (N,) of a clockwise turn after which a LiDAR scans points (N, >= 2), m, from the LiDAR.
 
-    `xy_lidar` (N, >= 2) float64, m: points, from the LiDAR. `start_azimuth_rad` rad: direction in which the turn starts
-    and ends, counter-clockwise from x, in (-pi, pi]. Returns (N,) float64: 0 to 1; 1 only for directions that end the
-    turn.
+    The turn starts and ends in the direction `start_azimuth_rad`, counter-clockwise from x, in (-pi, pi].
     """
     turned = (start_azimuth_rad - np.arctan2(xy_lidar[:, 1], xy_lidar[:, 0])) / (2 * np.pi)
     return np.asarray(turned + (turned < 0))
 
 
 def compute_scan_offset_ns(xy_lidar: Array, turn_ns: int) -> NDArray[np.int64]:
-    """Compute the time (N,) at which a LiDAR scans directions, relative to the end of its turn.
-
-    `xy_lidar` (N, >= 2) float64, m: points, from the LiDAR, which turns clockwise and starts and ends in the direction
-    of -x. `turn_ns`: duration of the turn.
-    """
+    """Compute the time (N,) at which a LiDAR scans points (N, >= 2), m, relative to the end of its turn, which it starts at -x."""
     return np.round((compute_turn_share(xy_lidar) - 1) * turn_ns).astype(np.int64)
 
 
 def select_spaced(t_ns: NDArray[np.int64], track_id: NDArray[np.str_], min_step_ns: int) -> NDArray[np.intp]:
-    """Select the rows (M,) that keep the stamps of each track apart.
+    """Select the rows (M,) that keep the stamps of each track, in the order of the turns, apart.
 
     An object that crosses the direction in which the turns start is scanned at the end of one turn and at the start of the
-    next: the later one is dropped.
-
-    `t_ns` (N,) int64: those of each track in the order of the turns. `track_id` (N,) str. `min_step_ns`: rows sooner
-    after the last one that was kept of their track are dropped.
+    next: what comes sooner than `min_step_ns` after the last one that was kept is dropped.
     """
     last: dict[str, int] = {}
     keep = []
@@ -166,11 +148,9 @@ def transverse_mercator(latitude_deg: float, longitude_deg: float) -> str:
 def poses_from_geodetic(map_frame: MapFrame, position: Array, attitude_rad: Array, *, where: str) -> Array:
     """Poses (N, 4, 4) in projected coordinates of `map_frame`, before its offset is subtracted.
 
-    Yaw is counter-clockwise from true east and is turned to the grid's east by the meridian convergence.
-
-    `position` (N, 3) float64: latitude and longitude in deg, altitude in m. `attitude_rad` (N, 3) float64, rad: roll,
-    pitch, yaw. `where`: names the projection in messages. Raises `LogError` when the projection is not one that PROJ
-    knows or does not reach the points; begins with `where`.
+    `position` (N, 3): latitude and longitude in deg, altitude in m. `attitude_rad` (N, 3): roll, pitch, and yaw counter-clockwise
+    from true east, which is turned to the grid's east by the meridian convergence. Raises `LogError` that begins with `where` when
+    PROJ does not know the projection or it does not reach the points.
     """
     forward = _projection(map_frame, where)
     latitude_deg, longitude_deg, altitude_m = (np.ascontiguousarray(c) for c in position.T)

@@ -47,17 +47,17 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     The ego motion holds t x y z qx qy qz qw of the IMU, one row a frame in order; its stamps are not those of the frames and
     are not used. Without it the axes of the car stand for the map.
     """
-    c = labels.read_calibration(calib)
-    P = labels.calibration_entry(c, calib, (3, 4), "P2")
+    c = labels.Calibration(calib)
+    P = c.entry((3, 4), "P2")
     if ego_motion is None:
         return View(np.repeat(transform(EGO_R_CAM, np.zeros(3))[None], frames, axis=0), P, motion_known=False)
     rows = _poses(ego_motion)
     if len(rows) < frames:
         raise LogError(f"{ego_motion}: {len(rows)} poses, expected one for each of {frames} frames of the detections")
     map_T_imu = transform(rotation_from_quaternion(rows[:, [7, 4, 5, 6]]), rows[:, 1:4])
-    rect_T_cam = transform(labels.rotation_entry(c, calib, "R0_rect", "R_rect"), np.zeros(3))
-    cam_T_velo = labels.rigid_entry(c, calib, "Tr_velo_to_cam", "Tr_velo_cam")
-    velo_T_imu = labels.rigid_entry(c, calib, "Tr_imu_to_velo", "Tr_imu_velo")
+    rect_T_cam = transform(c.rotation("R0_rect", "R_rect"), np.zeros(3))
+    cam_T_velo = c.rigid("Tr_velo_to_cam", "Tr_velo_cam")
+    velo_T_imu = c.rigid("Tr_imu_to_velo", "Tr_imu_velo")
     return View(map_T_imu @ inverse(rect_T_cam @ cam_T_velo @ velo_T_imu), P)
 
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, ImageLabels, ImageRegions, Labels, Lidar, MapFrame, Stream, Sweep
+from log2sim.datatypes import EgoVehicle, ImageLabels, ImageRegions, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
 from log2sim.files.documents import parse_float, parse_int
-from log2sim.files.inputs import read_file
+from log2sim.files.inputs import is_present, read_file
 from log2sim.geometry import (
     Array,
     Camera,
@@ -46,30 +47,25 @@ EGO_VEHICLE = EgoVehicle(size_m=(4.77, 1.82, 1.52), rear_axle_offset_m=1.25)
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Calibration of one drive."""
+    """Calibration of one drive: poses (4, 4) of the Velodyne and of the rectified camera 0, and P (3, 4) by number of camera."""
 
-    ego_T_velo: Array  # (4, 4)
-    ego_T_rect: Array  # (4, 4): pose of the rectified camera 0
-    projections: Mapping[int, Array]  # mapping of int to (3, 4) float64: P by number of camera
+    ego_T_velo: Array
+    ego_T_rect: Array
+    projections: Mapping[int, Array]
+
+    @classmethod
+    def of(cls, velo_T_imu: Array, cam_T_velo: Array, rect_R_cam: Array, projections: Mapping[int, Array]) -> Rig:
+        """Chain the links of the calibration."""
+        ego_T_velo = EGO_T_IMU @ inverse(velo_T_imu)
+        rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ cam_T_velo
+        return cls(ego_T_velo, ego_T_velo @ inverse(rect_T_velo), projections)
 
     def camera(self, number: int, width_px: int, height_px: int) -> Camera:
         """Camera `number` of the rectified images, called "image_0N"."""
         P = self.projections[number]
         cam_T_rect = transform(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
-        return Camera(
-            f"image_{number:02d}", width_px, height_px, P[:, :3], "ego", self.ego_T_rect @ inverse(cam_T_rect)
-        )
-
-    def lidar(self) -> Lidar:
-        """Return the Velodyne."""
-        return Lidar("velodyne", "ego", self.ego_T_velo)
-
-
-def rig_of(velo_T_imu: Array, cam_T_velo: Array, rect_R_cam: Array, projections: Mapping[int, Array]) -> Rig:
-    """Chain the links of the calibration."""
-    ego_T_velo = EGO_T_IMU @ inverse(velo_T_imu)
-    rect_T_velo = transform(rect_R_cam, np.zeros(3)) @ cam_T_velo
-    return Rig(ego_T_velo, ego_T_velo @ inverse(rect_T_velo), projections)
+        pose = self.ego_T_rect @ inverse(cam_T_rect)
+        return Camera(f"image_{number:02d}", width_px, height_px, P[:, :3], "ego", pose)
 
 
 def read_text(path: Path) -> str:
@@ -78,70 +74,66 @@ def read_text(path: Path) -> str:
     return data.decode("utf-8", errors="replace")
 
 
-def read_calibration(path: Path) -> dict[str, Array]:
-    """Numbers by key of a KITTI calibration file; none for lines that hold words.
+class Calibration:
+    """Entries of a KITTI calibration file, numbers by key; none for lines that hold words.
 
-    Raises `LogError` for a key that occurs twice, and for one that nothing follows, as where a file is cut.
+    Raises `LogError` for a key that occurs twice, one that nothing follows, as where a file is cut, and an entry that is asked for
+    and is not there, not of its shape, not finite, or no rotation or projection.
     """
-    values: dict[str, Array] = {}
-    for line in filter(None, map(str.strip, read_text(path).splitlines())):
-        key, _, rest = line.partition(" ")
-        if not rest:
-            raise LogError(f"{path}: nothing follows '{key[:40]}'; expected numbers")
-        try:
-            numbers = np.array([parse_float(word) for word in rest.split()])
-        except ValueError:
-            numbers = np.zeros(0)  # words are in no entry that is used
-        if key.removesuffix(":") in values:
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.text = path, read_text(path)
+        self.values: dict[str, Array] = {}
+        for line in filter(None, map(str.strip, self.text.splitlines())):
+            key, _, rest = line.partition(" ")
+            if not rest:
+                raise LogError(f"{path}: nothing follows '{key[:40]}'; expected numbers")
+            try:
+                numbers = np.array([parse_float(word) for word in rest.split()])
+            except ValueError:
+                numbers = np.zeros(0)  # words are in no entry that is used
+            key = key.removesuffix(":")
+            if key in self.values:
+                raise LogError(f"{path}: entry '{key[:40]}' occurs twice; remove the one of the two that is wrong")
+            self.values[key] = numbers
+
+    def entry(self, shape: tuple[int, ...], *keys: str) -> Array:
+        """Entry under the first of `keys` that there is, as an array of `shape`."""
+        key, count = next((k for k in keys if k in self.values), None), int(np.prod(shape))
+        if key is None:
+            raise LogError(f"{self.path}: no entry '{keys[0]}'; expected {count} numbers after it")
+        values = self.values[key]
+        if values.size != count or not np.isfinite(values).all():
+            raise LogError(f"{self.path}, entry '{key}': {values.size} numbers, expected {count} finite ones")
+        return values.reshape(shape)
+
+    def rotation(self, *keys: str) -> Array:
+        """Entry that is a rotation (3, 3)."""
+        return self._nearest_rotation(self.entry((3, 3), *keys), keys[0])
+
+    def rigid(self, *keys: str) -> Array:
+        """Entry that is a rotation and a translation, as (4, 4)."""
+        m = self.entry((3, 4), *keys)
+        return transform(self._nearest_rotation(m[:, :3], keys[0]), m[:, 3])
+
+    def projection(self, key: str) -> Array:
+        """Entry that is the P (3, 4) of a rectified camera."""
+        P = self.entry((3, 4), key)
+        if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] == 1 and P[1, 0] == 0 and not P[2, :2].any()):
             raise LogError(
-                f"{path}: entry '{key.removesuffix(':')[:40]}' occurs twice; remove the one of the two that is wrong"
+                f"{self.path}, entry '{key}': K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1"
             )
-        values[key.removesuffix(":")] = numbers
-    return values
+        return P
 
-
-def calibration_entry(calibration: Mapping[str, Array], path: Path, shape: tuple[int, ...], *keys: str) -> Array:
-    """Entry of a calibration under the first of `keys` that it has, as an array of `shape`; `LogError` without one."""
-    key = next((k for k in keys if k in calibration), None)
-    if key is None:
-        raise LogError(f"{path}: no entry '{keys[0]}'; expected {int(np.prod(shape))} numbers after it")
-    values = calibration[key]
-    if values.size != np.prod(shape) or not np.isfinite(values).all():
-        raise LogError(f"{path}, entry '{key}': {values.size} numbers, expected {int(np.prod(shape))} finite ones")
-    return values.reshape(shape)
-
-
-def checked_rotation(rotation: Array, where: str) -> Array:
-    """Return the nearest rotation matrix (3, 3); `LogError` when the given one is off by more than 1e-3."""
-    off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
-    if off > ROTATION_TOLERANCE or determinant < 0:
-        raise LogError(
-            f"{where}: not a rotation matrix: R R^T is off the identity by {off:.2g} (at most {ROTATION_TOLERANCE:g} "
-            f"is allowed), determinant {determinant:.3g} (expected +1); check the calibration"
-        )
-    return nearest_rotation(rotation)
-
-
-def rotation_entry(calibration: Mapping[str, Array], path: Path, *keys: str) -> Array:
-    """Entry of a calibration that is a rotation (3, 3)."""
-    return checked_rotation(calibration_entry(calibration, path, (3, 3), *keys), f"{path}, entry '{keys[0]}'")
-
-
-def rigid_entry(calibration: Mapping[str, Array], path: Path, *keys: str) -> Array:
-    """Entry of a calibration that is a rotation and a translation, as (4, 4)."""
-    m = calibration_entry(calibration, path, (3, 4), *keys)
-    return transform(checked_rotation(m[:, :3], f"{path}, entry '{keys[0]}'"), m[:, 3])
-
-
-def projection_entry(calibration: Mapping[str, Array], path: Path, key: str) -> Array:
-    """Entry of a calibration that is the P (3, 4) of a rectified camera."""
-    P = calibration_entry(calibration, path, (3, 4), key)
-    if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] == 1 and P[1, 0] == 0 and not P[2, :2].any()):
-        raise LogError(
-            f"{path}, entry '{key}': K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1"
-        )
-    return P
+    def _nearest_rotation(self, rotation: Array, key: str) -> Array:
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        determinant = float(np.linalg.det(rotation))
+        if off > ROTATION_TOLERANCE or determinant < 0:
+            raise LogError(
+                f"{self.path}, entry '{key}': not a rotation matrix: R R^T is off the identity by {off:.2g} (at most "
+                f"{ROTATION_TOLERANCE:g} is allowed), determinant {determinant:.3g} (expected +1); check the calibration"
+            )
+        return nearest_rotation(rotation)
 
 
 def poses_from_oxts(rows: Array) -> tuple[Array, MapFrame]:
@@ -186,25 +178,20 @@ def parse_oxts(text: str, where: str) -> Array:
 def sweep_stream(
     t_ns: NDArray[np.int64], begin_ns: NDArray[np.int64], end_ns: NDArray[np.int64], files: list[Path]
 ) -> Stream:
-    """Stream of Velodyne sweeps; the scanner faces forward at `t_ns` and backward at `begin_ns` and `end_ns`, all (F,)."""
+    """Stream of Velodyne sweeps; the scanner faces forward at `t_ns` and backward at `begin_ns` and `end_ns`, all (F,).
+
+    It turns clockwise seen from above. On drive 2011_09_26_0005, aligned sweeps 0.6 and 1.5 s apart agree to 5.1 cm (point to
+    plane, RMS) with this, to 5.7 cm without stamps, to 6.0 cm with the other sense.
+    """
 
     def read(i: int) -> Sweep:
         sweep = read_sweep(files[i], int(t_ns[i]))
-        offset = spin_offset_ns(sweep.xyz_m, int(begin_ns[i] - t_ns[i]), int(end_ns[i] - t_ns[i]))
+        clockwise = -np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0]) / np.pi
+        begin, end = int(begin_ns[i] - t_ns[i]), int(end_ns[i] - t_ns[i])
+        offset = np.round(np.where(clockwise < 0, -clockwise * begin, clockwise * end)).astype(np.int64)
         return sweep_of(sweep.xyz_m, sweep.stamp_ns, offset, "lidar", intensity=sweep.intensity)
 
     return Stream("velodyne", t_ns, read)
-
-
-def spin_offset_ns(xyz_m: NDArray[np.floating], begin_ns: int, end_ns: int) -> NDArray[np.int64]:
-    """Time (N,) ns of points (N, 3) in the velo frame, relative to the moment at which the scanner faces forward.
-
-    The scanner turns clockwise seen from above. On drive 2011_09_26_0005, aligned sweeps 0.6 and 1.5 s apart agree to 5.1 cm
-    (point to plane, RMS) with this, to 5.7 cm without stamps, to 6.0 cm with the other sense.
-    """
-    clockwise = -np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) / np.pi
-    offset_ns = np.where(clockwise < 0, -clockwise * begin_ns, clockwise * end_ns)
-    return np.asarray(np.round(offset_ns).astype(np.int64))
 
 
 CATEGORY_OF = {
@@ -246,22 +233,30 @@ class LabelRows:
 
     def take(self, index: NDArray[np.bool_]) -> LabelRows:
         """Select the rows of a mask."""
-        return LabelRows(self.frame[index], self.track_id[index], self.type[index], self.values[index])
+        return LabelRows(*(column[index] for column in vars(self).values()))
 
 
 def read_labels(
     path: Path, rig: Rig, track: PoseTrack, stamp_of: Callable[[NDArray[np.int64]], NDArray[np.int64]], notes: list[str]
 ) -> DriveLabels:
-    """Read a label file; `stamp_of` gives the stamps (L,) of frame numbers (L,), `notes` takes what was left out.
+    """Read a label file, empty where there is none; `stamp_of` gives the stamps (L,) of frame numbers (L,).
 
     Only objects in view of camera 2 have labels. Regions of its images with objects too far, too occluded or too crowded to
     be labeled are marked by boxes of the type DontCare.
     """
+    if not is_present(path):
+        return DriveLabels()
     text = read_text(path)
+    rows = parse_labels_noting(text, path, notes)
+    return labels_of_rows(rows, poses_of_rect(track, rig.ego_T_rect), stamp_of, text)
+
+
+def parse_labels_noting(text: str, path: Path, notes: list[str]) -> LabelRows:
+    """Parse a label file; lines that are damaged are left out and noted."""
     damaged: list[str] = []
     rows = parse_labels(text, path, damaged)
     note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
-    return labels_of_rows(rows, poses_of_rect(track, rig.ego_T_rect), stamp_of, text)
+    return rows
 
 
 def poses_of_rect(track: PoseTrack, ego_T_rect: Array) -> PosesAt:
@@ -314,12 +309,8 @@ def labels_of_rows(
 
 
 def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> LabelRows:
-    """Parse the lines of a label file.
-
-    `path`: for messages. `damaged`: takes a message for each line that is wrong, which is left out. Raises `LogError`
-    naming the first line that is wrong, without `damaged`.
-    """
-    frames, ids, types, values = [], [], [], []
+    """Parse the lines of a label file; `damaged` takes a message for each that is wrong, without it the first is a `LogError`."""
+    rows = []
     for k, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -344,14 +335,10 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
                 raise LogError(message) from None
             damaged.append(message)
             continue
-        frames.append(frame)
-        ids.append(words[1])
-        types.append(words[2])
-        values.append(row)
+        rows.append((frame, words[1], words[2], row))
+    frames, ids, types, values = zip(*rows) if rows else ((), (), (), ())
     table = np.array(values, dtype=np.float64).reshape(-1, LABEL_FIELDS - 3)
-    return LabelRows(
-        np.array(frames, dtype=np.int64), np.array(ids, dtype="<U16"), np.array(types, dtype="<U16"), table
-    )
+    return LabelRows(np.array(frames, np.int64), np.array(ids, "<U16"), np.array(types, "<U16"), table)
 
 
 def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
@@ -360,10 +347,32 @@ def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]
     `map_T_rect` (L, 4, 4): pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
     `values` (L, 7): height, width, length, x, y, z of the bottom's center, rotation about the camera's y axis.
     """
-    height, width, length = values[:, 0], values[:, 1], values[:, 2]
-    center = values[:, 3:6] - np.stack([np.zeros_like(height), height / 2, np.zeros_like(height)], axis=1)
-    turn = values[:, 6]
-    ahead = np.stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)], axis=1)
+    height, width, length, turn = values[:, 0], values[:, 1], values[:, 2], values[:, 6]
+    level = np.zeros_like(turn)
+    center = values[:, 3:6] - np.stack([level, height / 2, level], axis=1)
+    ahead = np.stack([np.cos(turn), level, -np.sin(turn)], axis=1)
     heading = np.einsum("lij,lj->li", map_T_rect[:, :3, :3], ahead)
     yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
     return apply(map_T_rect, center), np.stack([length, width, height], axis=1), yaw
+
+
+def drive_log(
+    rig: Rig,
+    cameras: Mapping[str, Camera],
+    streams: Mapping[str, Stream],
+    track: PoseTrack,
+    labels: DriveLabels,
+    **about: Any,
+) -> Log:
+    """Make the log of a drive of KITTI's car."""
+    return Log(
+        cameras=cameras,
+        lidars={"velodyne": Lidar("velodyne", "ego", rig.ego_T_velo)} if "velodyne" in streams else {},
+        streams=streams,
+        ego=track,
+        ego_vehicle=EGO_VEHICLE,
+        labels=labels.boxes_3d,
+        image_labels=labels.boxes_2d,
+        ignored_regions=labels.ignored,
+        **about,
+    )

@@ -58,11 +58,11 @@ _EXPECTED = {
 
 @dataclass(frozen=True, eq=False)
 class CsvTable:
-    """A CSV file with typed columns."""
+    """A CSV file with typed columns (N,); `line` (N,) is where each row is in the file, for messages."""
 
     path: Path
-    columns: Mapping[str, NDArray[Any]]  # mapping of str to (N,) array
-    line: NDArray[np.int64]  # (N,): line of the file of each row, for messages
+    columns: Mapping[str, NDArray[Any]]
+    line: NDArray[np.int64]
     sha256: str  # of the file
 
     def __len__(self) -> int:
@@ -81,6 +81,14 @@ class CsvTable:
         """Location of a value, for a message."""
         return f"{self.path}, line {self.line[row]}, field '{field}'"
 
+    def refuse(self, wrong: NDArray[np.bool_], field: str, words: str) -> None:
+        """Raise `LogError` for the first row that is wrong (N,), if there is one; VALUE in `words` stands for what it has."""
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            value = self.columns[field][row] if field in self.columns else ""
+            shown = f"{value:g}" if isinstance(value, float) else str(value)
+            raise LogError(f"{self.where(row, field)}: {words.replace('VALUE', shown, 1)}")
+
 
 def read_csv_table(
     path: Path,
@@ -89,11 +97,10 @@ def read_csv_table(
     *,
     damaged: list[str] | None = None,
 ) -> CsvTable:
-    """Read a CSV file with a header.
+    """Read a CSV file with a header; an unknown column is an error.
 
-    `columns`, `optional`: columns that must and that may be there, in any order. An unknown one is an error. `damaged`:
-    takes a message for each row with fewer or more fields than the header, which is left out; else it is an error.
-    Raises `LogError` naming file, line and field.
+    `columns`, `optional`: columns that must and that may be there, in any order. `damaged`: takes a message for each row with
+    fewer or more fields than the header, which is left out; else it is an error. Raises `LogError` naming file, line and field.
     """
     kinds = {**columns, **(optional or {})}
     data = read_file(path, MAX_TABLE_BYTES, LogError)
@@ -119,16 +126,13 @@ def read_csv_table(
             raise LogError(f"{path}, line 1: unknown column '{name}'{hint}; known: {', '.join(kinds)}")
         if header.count(name) > 1:
             raise LogError(f"{path}, line 1: column '{name}' occurs twice")
-    wrong = [
-        f"{path}, line {n}: {len(row)} fields, the header has {len(header)}"
-        for n, row in rows[1:]
-        if len(row) != len(header)
-    ]
-    if wrong and damaged is None:
-        raise LogError(wrong[0])
-    if damaged is not None:
-        damaged += wrong
     whole = [(n, row) for n, row in rows[1:] if len(row) == len(header)]
+    wrong = [(n, row) for n, row in rows[1:] if len(row) != len(header)]
+    said = [f"{path}, line {n}: {len(row)} fields, the header has {len(header)}" for n, row in wrong]
+    if damaged is not None:
+        damaged += said
+    elif said:
+        raise LogError(said[0])
     line = np.array([n for n, _ in whole], dtype=np.int64)
     cells = {name: [row[k].strip() for _, row in whole] for k, name in enumerate(header)}
     values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
@@ -144,9 +148,7 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
         values: NDArray[Any] = np.array([words.get(t.lower(), False) for t in text], dtype=bool)
     else:
         try:
-            if not is_plain("".join(text)):
-                raise ValueError
-            values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
+            values = _numbers(text, kind)
             good = list(_is_possible(values))
         except (ValueError, OverflowError):
             values, good = np.zeros(0), [_parses(t, kind) for t in text]
@@ -156,9 +158,15 @@ def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind
     return values
 
 
+def _numbers(text: list[str], kind: str) -> NDArray[Any]:
+    if not is_plain("".join(text)):
+        raise ValueError
+    return np.array(text, dtype=np.str_).astype(_DTYPE[kind])
+
+
 def _parses(text: str, kind: str) -> bool:
     try:
-        return is_plain(text) and bool(_is_possible(np.array([text]).astype(_DTYPE[kind]))[0])
+        return bool(_is_possible(_numbers([text], kind))[0])
     except (ValueError, OverflowError):
         return False
 
@@ -182,14 +190,11 @@ BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
 def boxes_3d(table: CsvTable) -> Labels:
     """Labels of a table with `BOX_3D_COLUMNS` and, optionally, some of `BOX_3D_OPTIONAL`."""
     _check_categories(table)
-    size = table.stack(*SIZE_FIELDS)
-    if np.any(size <= 0):
-        row, column = np.argwhere(size <= 0)[0]
-        raise LogError(f"{table.where(row, SIZE_FIELDS[column])}: {size[row, column]:g}, expected a size above 0")
-    occlusion = table.columns.get("occlusion")
-    if occlusion is not None and not np.isin(occlusion, OCCLUSIONS).all():
-        row = int(np.argmin(np.isin(occlusion, OCCLUSIONS)))
-        raise LogError(f"{table.where(row, 'occlusion')}: {occlusion[row]}, expected 0, 1, 2 or 3")
+    size, occlusion = table.stack(*SIZE_FIELDS), table.columns.get("occlusion")
+    for name in SIZE_FIELDS:
+        table.refuse(table[name] <= 0, name, "VALUE, expected a size above 0")
+    if occlusion is not None:
+        table.refuse(~np.isin(occlusion, OCCLUSIONS), "occlusion", "VALUE, expected 0, 1, 2 or 3")
     return Labels(
         table["t_ns"],
         table["track_id"],
@@ -205,25 +210,17 @@ def boxes_3d(table: CsvTable) -> Labels:
 
 def boxes_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, tuple[NDArray[np.bool_], Array]]:
     """Rows (N,) and boxes (L, 4), u0, v0, u1, v1 in px, of each camera that a table with `REGION_COLUMNS` has some of."""
-    box = table.stack(*BOX_2D_FIELDS)
-    empty = np.flatnonzero((box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1]))
-    if len(empty):
-        raise LogError(f"{table.where(empty[0], 'u1_px,v1_px')}: the box is empty, expected u0 < u1 and v0 < v1")
-    unknown = np.flatnonzero(~np.isin(table["camera"], sorted(cameras)))
-    if len(unknown):
-        name = table["camera"][unknown[0]]
-        raise LogError(
-            f"{table.where(unknown[0], 'camera')}: no camera '{name}'; there are: {', '.join(sorted(cameras))}"
-        )
+    box, names = table.stack(*BOX_2D_FIELDS), sorted(cameras)
+    empty = (box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1])
+    table.refuse(empty, "u1_px,v1_px", "the box is empty, expected u0 < u1 and v0 < v1")
+    table.refuse(~np.isin(table["camera"], names), "camera", f"no camera 'VALUE'; there are: {', '.join(names)}")
     rows = {name: table["camera"] == name for name in sorted(cameras)}
     return {n: (r, box[r]) for n, r in rows.items() if r.any()}
 
 
 def _check_categories(table: CsvTable) -> None:
-    unknown = np.flatnonzero(~np.isin(table["category"], CATEGORIES))
-    if len(unknown):
-        found = table["category"][unknown[0]]
-        raise LogError(f"{table.where(unknown[0], 'category')}: '{found}', expected one of {', '.join(CATEGORIES)}")
+    words = f"'VALUE', expected one of {', '.join(CATEGORIES)}"
+    table.refuse(~np.isin(table["category"], CATEGORIES), "category", words)
 
 
 OFFSET_STEP_M = 1000.0
@@ -231,14 +228,11 @@ OFFSET_STEP_M = 1000.0
 
 def offset_of(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: Labels | None) -> Array:
     """Choose the whole kilometers (3,), m, by which a log is shifted towards the map's origin."""
-    if track is not None:
-        first = track.map_T_ego[0, :3, 3]
-    else:
-        mounts = [s.mount_T_cam if isinstance(s, Camera) else s.mount_T_lidar for s in sensors if s.mount == "map"]
-        positions = [mount_T_sensor[:3, 3] for mount_T_sensor in mounts]
-        if not positions and labels is not None and len(labels.t_ns):
-            positions = [labels.center_m[0]]
-        first = positions[0] if positions else np.zeros(3)
+    mounts = [s.mount_T_cam if isinstance(s, Camera) else s.mount_T_lidar for s in sensors if s.mount == "map"]
+    positions = [mount_T_sensor[:3, 3] for mount_T_sensor in (mounts if track is None else track.map_T_ego[:1])]
+    if not positions and labels is not None and len(labels.t_ns):
+        positions = [labels.center_m[0]]
+    first = positions[0] if positions else np.zeros(3)
     return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
 
 
@@ -374,17 +368,11 @@ class _Folder:
         else:
             table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
             for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
-                bad = np.flatnonzero(np.abs(table[field]) > limit)
-                if len(bad):
-                    value = f"{table[field][bad[0]]:g}"
-                    raise LogError(f"{table.where(bad[0], field)}: {value}, expected at most {limit:g} degrees")
+                table.refuse(np.abs(table[field]) > limit, field, f"VALUE, expected at most {limit:g} degrees")
             map_frame = map_frame_of(map_frame, *(float(table[f][0]) for f in GNSS_FIELDS[:3]))
-            poses = poses_from_geodetic(
-                map_frame,
-                table.stack(*GNSS_FIELDS[:3]),
-                table.stack(*GNSS_FIELDS[3:]),
-                where=f"{self.file}, field 'map.projection'",
-            )
+            attitude = table.stack(*GNSS_FIELDS[3:])
+            where = f"{self.file}, field 'map.projection'"
+            poses = poses_from_geodetic(map_frame, table.stack(*GNSS_FIELDS[:3]), attitude, where=where)
         keep = strictly_increasing(table["t_ns"], "ego", self.notes)
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
 

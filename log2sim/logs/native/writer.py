@@ -44,8 +44,8 @@ def write_log(
     `log`: its records are read one by one, so that a log may render them on demand. `overwrite`: replace a log folder of that
     name; a folder that is no log is never replaced. `jpeg_quality`: 1 to 100, of images that the log does not hold as files;
     those are copied. `ego`: "gnss" writes latitude, longitude and angles; the log's map then needs a projection. `sweep`: points
-    are rounded to 1 mm; only "npz" keeps the stamps of the points. `progress`: called as `progress(done, total)` after each
-    record. `problems`: takes why records cannot be read, which are then left out; without it the first one is an error.
+    are rounded to 1 mm; only "npz" keeps the stamps of the points. `progress`: called as `progress(done, total)`. `problems`:
+    takes why records cannot be read, which are then left out; without it the first one is an error.
 
     Raises `ConfigError` when the folder exists and may not be replaced, or cannot be written; `RecordError` when a record of the
     log cannot be read, `LogError` when none of a stream can be.

@@ -58,20 +58,20 @@ class NuScenesReader(FolderReader):
         A list of scenes that cannot be read counts as one, so that opening it raises why.
         """
         versions, scenes = _versions(path), {}
-        for folder in versions:
-            tables = Tables(folder)
+        for tables in map(Tables, versions):
+            version = tables.folder.name
             try:
                 names = [record["name"] for record in tables.read(SCENES, "name")]
             except LogError:
-                names = [folder.name]
-            scenes.update({f"{folder.name}/{n}" if len(versions) > 1 else n: (tables, n) for n in names})
+                names = [version]
+            scenes.update({f"{version}/{n}" if len(versions) > 1 else n: (tables, n) for n in names})
         return scenes
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a scene; the tables are read but for the annotations, no image and no sweep."""
         tables, name = self.find(path)[sequence]
         record = next(record for record in tables.read(SCENES, "name") if record["name"] == name)
-        return _SceneReader(Scene(tables, record)).log()
+        return _open(Scene(tables, record))
 
 
 READER = NuScenesReader()
@@ -79,131 +79,116 @@ READER = NuScenesReader()
 
 def _versions(path: Path) -> list[Path]:
     """Folders of tables at a path."""
-    return [path] if _is_version(path) else [p for p in list_folders(path) if _is_version(p)]
+    found = [p for p in (path, *list_folders(path)) if all((p / f"{name}.json").is_file() for name in (SCENES, DATA))]
+    return [path] if path in found else found
 
 
-def _is_version(path: Path) -> bool:
-    return (path / f"{SCENES}.json").is_file() and (path / f"{DATA}.json").is_file()
-
-
-class _SceneReader:
-    """Builds the log of one scene."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene, self.tables, self.notes = scene, scene.tables, scene.notes
-        self.root = scene.tables.folder.resolve().parent
-        self.files: list[Path] = []
-
-    def log(self) -> Log:
-        """Read the tables and return the log."""
-        scene, ego = self.scene, self.scene.ego
-        offset_m = whole_kilometers(ego.map_T_ego[:, :3, 3])
-        map_T_ego = shift_poses(ego.map_T_ego, offset_m)
-        track = PoseTrack(ego.t_ns, map_T_ego)
-        cameras, lidars, streams = self._sensors(track)
-        climb = float(np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max()))
-        if np.ptp(map_T_ego[:, 2, 3]) < MAX_FLAT_M:
-            self.notes.append(
-                f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees: "
-                "the map is as flat as the log states it"
-            )
-        # The records with files may last much shorter than the scene.
-        of_scene = [c.t_ns for c in self.scene.channels.values() if c.modality in ("camera", "lidar")]
-        whole_s = float(max(t[-1] for t in of_scene) - min(t[0] for t in of_scene)) / NS_PER_S
-        stamps = [stream.t_ns for stream in streams.values()]
-        there_s = float(max(t[-1] for t in stamps) - min(t[0] for t in stamps)) / NS_PER_S
-        if there_s < whole_s - 1.0:
-            self.notes.append(
-                f"images and sweeps that are there last {there_s:.1f} s of the {whole_s:.1f} s of the scene; "
-                "labels and ego poses cover all of it, a scenario only that part"
-            )
-
-        @cache
-        def labels() -> Labels | None:
-            channels = {name: c for name, c in scene.channels.items() if c.modality == "lidar"}
-            lidar = channels.get(LABELED_LIDAR) or next(iter(channels.values()), None)
-            return read_labels(scene, lidar, offset_m, self.notes)
-
-        index = [scene.record, scene.samples, scene.data, [c.calibration for c in scene.channels.values()]]
-        poses = [scene.ego.t_ns.tobytes().hex(), scene.ego.map_T_ego.tobytes().hex()]
-        return Log(
-            name=f"nuscenes-{scene.record['name']}",
-            format=READER.name,
-            cameras=cameras,
-            lidars=lidars,
-            streams=streams,
-            ego=track,
-            ego_vehicle=EGO_VEHICLE,
-            map=self._map_frame(offset_m),
-            labels=labels,
-            reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
-            digest=digest_of([json.dumps(index, sort_keys=True), *poses], self.files),
-            notes=defer_notes(self.notes, labels),
-            calibrations=dict.fromkeys(streams, str(self.tables.path("calibrated_sensor"))),
-            details={
-                "tables": self.tables.folder.resolve().name,
-                "scene": {key: str(scene.record.get(key, "")) for key in ("name", "description")},
-                "location": scene.location,
-                "key_frames": len(scene.samples),
-            },
+def _open(scene: Scene) -> Log:
+    """Read the tables and return the log of a scene."""
+    notes, tables, ego = scene.notes, scene.tables, scene.ego
+    offset_m = whole_kilometers(ego.map_T_ego[:, :3, 3])
+    map_T_ego = shift_poses(ego.map_T_ego, offset_m)
+    track = PoseTrack(ego.t_ns, map_T_ego)
+    cameras, lidars, streams, files = _sensors(scene, track)
+    climb = float(np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max()))
+    if np.ptp(map_T_ego[:, 2, 3]) < MAX_FLAT_M:
+        notes.append(
+            f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees: "
+            "the map is as flat as the log states it"
         )
-
-    def _sensors(self, track: PoseTrack) -> tuple[dict[str, Camera], dict[str, Lidar], dict[str, Stream]]:
-        cameras: dict[str, Camera] = {}
-        lidars: dict[str, Lidar] = {}
-        streams: dict[str, Stream] = {}
-        unused, missing = [], 0
-        for name, channel in self.scene.channels.items():
-            if channel.modality not in ("camera", "lidar"):
-                unused.append(name)
-                continue
-            records, t_ns, files = channel.present(self.root, self.tables.path(DATA))
-            missing += len(channel.records) - len(files)
-            if len(files) < len(channel.records):
-                left_out = "; the sensor is left out" if not files else ""
-                self.notes.append(
-                    f"{name}: {len(channel.records) - len(files)} of {len(channel.records)} records are missing{left_out}"
-                )
-            if not files:
-                continue
-            self.files += files
-            if channel.modality == "camera":
-                cameras[name] = self._camera(channel, records[0], files)
-                streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
-            else:
-                lidars[name] = Lidar(name, "ego", channel.ego_T_sensor)
-                streams[name] = Stream(name, t_ns, partial(_read_sweep, channel, track, t_ns, files))
-        if not streams:
-            raise LogError(
-                f"{self.root}: none of the {missing} images and sweeps of scene '{self.scene.record['name']}' "
-                "is there; unpack samples/ and sweeps/ next to the folder of the tables"
-            )
-        if unused:
-            self.notes.append(f"not read, as log2sim makes no use of radar: {', '.join(unused)}")
-        return cameras, lidars, streams
-
-    def _camera(self, channel: Channel, record: Record, files: list[Path]) -> Camera:
-        K = numbers_of([channel.calibration], "camera_intrinsic", (3, 3), self.tables.path("calibrated_sensor"))[0]
-        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
-            raise LogError(
-                f"{self.tables.path('calibrated_sensor')}: {channel.name}: camera_intrinsic is {K.tolist()}, "
-                "expected positive focal lengths and a last row 0 0 1"
-            )
-        width, height = record.get("width"), record.get("height")
-        stated = all(isinstance(v, int) and 0 < v <= MAX_IMAGE_PX for v in (width, height))
-        width, height = (width, height) if stated else first_image_size(files)
-        return Camera(channel.name, int(width or 0), int(height or 0), K, "ego", channel.ego_T_sensor)
-
-    def _map_frame(self, offset_m: Array) -> MapFrame:
-        place = MAP_ORIGIN_DEG.get(self.scene.location)
-        offset = (float(offset_m[0]), float(offset_m[1]), float(offset_m[2]))
-        if place is None:
-            self.notes.append(f"log.json: location {self.scene.location[:40]!a} is not known: the map is only local")
-            return MapFrame(offset_m=offset)
-        latitude, longitude = place
+    # The records with files may last much shorter than the scene.
+    of_scene = [c.t_ns for c in scene.channels.values() if c.modality in ("camera", "lidar")]
+    there = [stream.t_ns for stream in streams.values()]
+    whole_s, there_s = (float(max(t[-1] for t in s) - min(t[0] for t in s)) / NS_PER_S for s in (of_scene, there))
+    if there_s < whole_s - 1.0:
+        notes.append(
+            f"images and sweeps that are there last {there_s:.1f} s of the {whole_s:.1f} s of the scene; "
+            "labels and ego poses cover all of it, a scenario only that part"
+        )
+    place = MAP_ORIGIN_DEG.get(scene.location)
+    x, y, z = offset_m.tolist()
+    map_frame = MapFrame(offset_m=(x, y, z))
+    if place is None:
+        notes.append(f"log.json: location {scene.location[:40]!a} is not known: the map is only local")
+    else:
         sphere = f"+proj=aeqd +R={EARTH_RADIUS_M:.0f} +x_0=0 +y_0=0 +units=m +no_defs"
-        projection = f"{sphere} +lat_0={latitude!r} +lon_0={longitude!r}"
-        return MapFrame(latitude, longitude, None, projection, offset)
+        map_frame = MapFrame(*place, None, f"{sphere} +lat_0={place[0]!r} +lon_0={place[1]!r}", (x, y, z))
+
+    @cache
+    def labels() -> Labels | None:
+        channels = {name: c for name, c in scene.channels.items() if c.modality == "lidar"}
+        lidar = channels.get(LABELED_LIDAR) or next(iter(channels.values()), None)
+        return read_labels(scene, lidar, offset_m, notes)
+
+    index = [scene.record, scene.samples, scene.data, [c.calibration for c in scene.channels.values()]]
+    poses = [ego.t_ns.tobytes().hex(), ego.map_T_ego.tobytes().hex()]
+    return Log(
+        name=f"nuscenes-{scene.record['name']}",
+        format=READER.name,
+        cameras=cameras,
+        lidars=lidars,
+        streams=streams,
+        ego=track,
+        ego_vehicle=EGO_VEHICLE,
+        map=map_frame,
+        labels=labels,
+        reference_camera=REFERENCE_CAMERA if REFERENCE_CAMERA in cameras else None,
+        digest=digest_of([json.dumps(index, sort_keys=True), *poses], files),
+        notes=defer_notes(notes, labels),
+        calibrations=dict.fromkeys(streams, str(tables.path("calibrated_sensor"))),
+        details={
+            "tables": tables.folder.resolve().name,
+            "scene": {key: str(scene.record.get(key, "")) for key in ("name", "description")},
+            "location": scene.location,
+            "key_frames": len(scene.samples),
+        },
+    )
+
+
+def _sensors(
+    scene: Scene, track: PoseTrack
+) -> tuple[dict[str, Camera], dict[str, Lidar], dict[str, Stream], list[Path]]:
+    cameras, lidars, streams = dict[str, Camera](), dict[str, Lidar](), dict[str, Stream]()
+    root, unused, missing, used = scene.tables.folder.resolve().parent, list[str](), 0, list[Path]()
+    for name, channel in scene.channels.items():
+        if channel.modality not in ("camera", "lidar"):
+            unused.append(name)
+            continue
+        records, t_ns, files = channel.present(root, scene.tables.path(DATA))
+        lost = len(channel.records) - len(files)
+        missing += lost
+        if lost:
+            left_out = "; the sensor is left out" if not files else ""
+            scene.notes.append(f"{name}: {lost} of {len(channel.records)} records are missing{left_out}")
+        if not files:
+            continue
+        used += files
+        if channel.modality == "camera":
+            cameras[name] = _camera(channel, records[0], files, scene.tables.path("calibrated_sensor"))
+            streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
+        else:
+            lidars[name] = Lidar(name, "ego", channel.ego_T_sensor)
+            streams[name] = Stream(name, t_ns, partial(_read_sweep, channel, track, t_ns, files))
+    if not streams:
+        raise LogError(
+            f"{root}: none of the {missing} images and sweeps of scene '{scene.record['name']}' "
+            "is there; unpack samples/ and sweeps/ next to the folder of the tables"
+        )
+    if unused:
+        scene.notes.append(f"not read, as log2sim makes no use of radar: {', '.join(unused)}")
+    return cameras, lidars, streams, used
+
+
+def _camera(channel: Channel, record: Record, files: list[Path], path: Path) -> Camera:
+    K = numbers_of([channel.calibration], "camera_intrinsic", (3, 3), path)[0]
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
+        raise LogError(
+            f"{path}: {channel.name}: camera_intrinsic is {K.tolist()}, expected positive focal lengths and a last row 0 0 1"
+        )
+    width, height = record.get("width"), record.get("height")
+    stated = all(isinstance(v, int) and 0 < v <= MAX_IMAGE_PX for v in (width, height))
+    width, height = (width, height) if stated else first_image_size(files)
+    return Camera(channel.name, int(width or 0), int(height or 0), K, "ego", channel.ego_T_sensor)
 
 
 def _read_sweep(channel: Channel, track: PoseTrack, t_ns: NDArray[np.int64], files: list[Path], i: int) -> Sweep:

@@ -42,10 +42,7 @@ Poses = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
 
 
 def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
-    """Read a sweep in the frame of the sensor at `t_ns`; points nearer than 1 m, which are no returns, are left out.
-
-    Raises `RecordError` when the file is missing or its size is not that of whole points.
-    """
+    """Read a sweep in the frame of the sensor at `t_ns`; points nearer than 1 m, which are no returns, are left out."""
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     points = len(data) // BYTES_PER_POINT
     if len(data) % BYTES_PER_POINT:
@@ -56,9 +53,17 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
         raise RecordError(f"{path} (stamp {t_ns}): {points} points, more than {MAX_SWEEP_POINTS}")
     rows = np.frombuffer(data, "<f4").reshape(-1, 5)
     xyz, offset_ns = rows[:, :3], firing_offset_ns(rows[:, 4])
-    away = xyz - sensor_path(offset_ns, t_ns, poses)
+    sensor: Array = np.zeros(
+        3
+    )  # where it was at the time of each point, in its frame at the stamp, where that is known
+    if offset_ns is not None:
+        first = int(offset_ns.min())
+        map_T_lidar, known = poses(np.array([t_ns + first, t_ns]))
+        if first and known.all():
+            start = map_T_lidar[1, :3, :3].T @ (map_T_lidar[0, :3, 3] - map_T_lidar[1, :3, 3])
+            sensor = (offset_ns / first)[:, None] * start
     with np.errstate(over="ignore", invalid="ignore"):
-        returned = np.linalg.norm(away, axis=1) >= MIN_RANGE_M
+        returned = np.linalg.norm(xyz - sensor, axis=1) >= MIN_RANGE_M
     offset_ns = None if offset_ns is None else offset_ns[returned]
     return sweep_of(xyz[returned], t_ns, offset_ns, "lidar", t_ns, rows[returned, 3])
 
@@ -71,18 +76,6 @@ def firing_offset_ns(ring: NDArray[np.float32]) -> NDArray[np.int64] | None:
     if not np.array_equal(ring.reshape(firings, RINGS), np.broadcast_to(np.arange(RINGS), (firings, RINGS))):
         return None
     return np.repeat((np.arange(firings, dtype=np.int64) - (firings - 1)) * FIRING_NS, RINGS)
-
-
-def sensor_path(offset_ns: NDArray[np.int64] | None, t_ns: int, poses: Poses) -> Array:
-    """Position (N, 3) or (3,) of the sensor at the time of each point, in its frame at the stamp; 0 where not known."""
-    if offset_ns is None:
-        return np.zeros(3)
-    first = int(offset_ns.min())
-    map_T_lidar, known = poses(np.array([t_ns + first, t_ns]))
-    if first == 0 or not known.all():
-        return np.zeros(3)
-    start = map_T_lidar[1, :3, :3].T @ (map_T_lidar[0, :3, 3] - map_T_lidar[1, :3, 3])
-    return np.asarray((offset_ns / first)[:, None] * start)
 
 
 # Names of sensors become names of files.
@@ -179,25 +172,20 @@ class Scene:
         path = self.tables.path("calibrated_sensor")
         rotation = rotation_from_quaternion(quaternions_of([calibration], path)[0])
         ego_T_sensor = transform(rotation, numbers_of([calibration], "translation", (3,), path)[0])
-        return Channel(
-            name,
-            str(calibration["modality"]),
-            calibration,
-            ego_T_sensor,
-            [same[k] for k in order[keep]],
-            stamps[order[keep]],
-        )
+        records, t_ns = [same[k] for k in order[keep]], stamps[order[keep]]
+        return Channel(name, str(calibration["modality"]), calibration, ego_T_sensor, records, t_ns)
 
     @cached_property
     def ego(self) -> PoseTrack:
         """Ego poses at the stamps of all sensors, without an offset; those of one stamp are the same."""
         path = self.tables.path("ego_pose")
-        tokens = {text_of(record, "ego_pose_token", self.tables.path(DATA)) for record in self.data}
-        records = list(self.tables.by_token("ego_pose", tokens).values())
-        stamps = np.array([stamp_ns_of(record, path) for record in records], dtype=np.int64)
-        poses = transform(
-            rotation_from_quaternion(quaternions_of(records, path)), numbers_of(records, "translation", (3,), path)
+        path, where = self.tables.path("ego_pose"), self.tables.path(DATA)
+        records = list(
+            self.tables.by_token("ego_pose", {text_of(r, "ego_pose_token", where) for r in self.data}).values()
         )
+        stamps = np.array([stamp_ns_of(record, path) for record in records], dtype=np.int64)
+        rotation = rotation_from_quaternion(quaternions_of(records, path))
+        poses = transform(rotation, numbers_of(records, "translation", (3,), path))
         t_ns, first = np.unique(stamps, return_index=True)
         return PoseTrack(t_ns, poses[first])
 
@@ -274,18 +262,13 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
     t_ns = scanned_ns(scene, lidar, stamps[rows.sample], rows.center_m)
     rows = rows.take(np.arange(len(rows.t_ns)), t_ns=t_ns)
     ends_ns = turn_ends(stamps if lidar is None else np.union1d(stamps, lidar.t_ns))
-    rows = _joined([rows, _between(scene, lidar, rows, stamps, ends_ns)])
+    parts = [rows, _between(scene, lidar, rows, stamps, ends_ns)]
+    columns = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(rows)}
+    rows = _Rows(**columns).take(np.argsort(columns["t_ns"], kind="stable"))
     return Labels(
-        rows.t_ns,
-        rows.track_id,
-        rows.category,
-        rows.center_m - offset_m,
-        rows.size_m,
-        rows.yaw_rad,
-        visible=rows.visible,
-        kind=rows.kind,
-        labeled_ns=np.unique(stamps - (0 if lidar is None else TURN_NS // 2)),
-    )
+        rows.t_ns, rows.track_id, rows.category, rows.center_m - offset_m, rows.size_m, rows.yaw_rad, rows.visible,
+        kind=rows.kind, labeled_ns=np.unique(stamps - (0 if lidar is None else TURN_NS // 2)),
+    )  # fmt: skip
 
 
 def turn_ends(t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -336,12 +319,6 @@ def _between(
     return rows.take(nearer[keep], t_ns=t_ns[keep], center_m=center[keep], yaw_rad=yaw[keep])
 
 
-def _joined(parts: list[_Rows]) -> _Rows:
-    """Join rows in the order of their stamps."""
-    columns = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
-    return _Rows(**columns).take(np.argsort(columns["t_ns"], kind="stable"))
-
-
 def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], notes: list[str]) -> _Rows:
     """Check annotations and return them as columns; stamps are still 0."""
     path = scene.tables.path(ANNOTATIONS)
@@ -367,7 +344,15 @@ def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], n
         numbers_of(annotations, "translation", (3,), path),
         size,
         yaw_of(rotation_from_quaternion(quaternions_of(annotations, path))),
-        np.array([_is_visible(a) for a in annotations], dtype=bool),
+        # The sensors hit an object, and its visibility, where it is stated, is above 40 %.
+        np.array(
+            [
+                any(isinstance(n := a.get(key, 0), int) and n > 0 for key in ("num_lidar_pts", "num_radar_pts"))
+                and a.get("visibility_token") != HARDLY_VISIBLE
+                for a in annotations
+            ],
+            dtype=bool,
+        ),
     )
     note_left_out((kind for kind, word in zip(kinds, category) if not word), NO_ROAD_USERS, notes)
     flat = ~(size > 0).all(axis=1)
@@ -384,21 +369,12 @@ def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], n
 def _kinds(scene: Scene, annotations: list[Record], path: Path) -> list[str]:
     """Names of the categories of annotations."""
     tokens = [text_of(a, "instance_token", path) for a in annotations]
-    instances = scene.tables.by_token("instance", tokens)
-    categories = scene.tables.all_of("category")
+    instances, categories = scene.tables.by_token("instance", tokens), scene.tables.all_of("category")
+    of_instances, of_categories = scene.tables.path("instance"), scene.tables.path("category")
     words = {}
     for token, instance in instances.items():
-        wanted = text_of(instance, "category_token", scene.tables.path("instance"))
+        wanted = text_of(instance, "category_token", of_instances)
         if wanted not in categories:
-            raise LogError(
-                f"{scene.tables.path('category')}: no record with token '{wanted[:40]}', which instance.json names"
-            )
-        words[token] = text_of(categories[wanted], "name", scene.tables.path("category"))
+            raise LogError(f"{of_categories}: no record with token '{wanted[:40]}', which instance.json names")
+        words[token] = text_of(categories[wanted], "name", of_categories)
     return [words[token] for token in tokens]
-
-
-def _is_visible(annotation: Record) -> bool:
-    """Whether the sensors hit an object and its visibility, where it is stated, is above 40 %."""
-    counts = [annotation.get(key, 0) for key in ("num_lidar_pts", "num_radar_pts")]
-    hit = any(isinstance(count, int) and count > 0 for count in counts)
-    return hit and annotation.get("visibility_token") != HARDLY_VISIBLE

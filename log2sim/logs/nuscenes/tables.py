@@ -39,10 +39,7 @@ class Tables:
     folder: Path
 
     def path(self, table: str) -> Path:
-        """Return the file of a table.
-
-        Raises `LogError` when it is a link that leaves the folders of the log.
-        """
+        """Return the file of a table; `LogError` when it is a link that leaves the folders of the log."""
         path = self.folder / f"{table}.json"
         require_link_inside(path, self.folder.parent)
         return path
@@ -86,10 +83,8 @@ class Tables:
 def scan_records(path: Path, key: str, values: Collection[str], chunk_bytes: int = CHUNK_BYTES) -> Iterator[Record]:
     """Find the records of a table in which `key` has one of some values, in the order of the table.
 
-    Only these records are parsed. Memory is bounded by the chunk; line breaks and spaces are as they like.
-
-    Raises `LogError` for a table that is missing or does not begin and end as a list, or a wanted record that is not
-    valid JSON.
+    Only these records are parsed. Memory is bounded by the chunk; line breaks and spaces are as they like. Raises `LogError` for a
+    table that is missing or does not begin and end as a list, or a wanted record that is not valid JSON.
     """
     wanted = frozenset(values)
     plain = frozenset(value.encode(errors="replace") for value in wanted)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from threading import Lock
@@ -97,12 +96,18 @@ class SweepFiles:
         return np.asarray(self._t_ns + np.round(moved).astype(np.int64))
 
     def _gt_middle_ns(self, path: Path) -> int | None:
+        """Return the middle of the PandarGT's times; None where they cannot be those of a sweep."""
         try:
             columns = read_pickled_table(path)
-            self._kept.add(path, columns)
         except RecordError:
             return None
-        return _gt_middle_ns(columns)
+        self._kept.add(path, columns)
+        try:
+            t_s = columns["t"][columns["d"] == LIDARS["pandargt"]].astype(np.float64)
+        except (KeyError, TypeError, ValueError, IndexError):
+            return None
+        t_s = t_s[np.abs(t_s) < MAX_TIME_S]  # False for NaN
+        return round((float(t_s.min()) + float(t_s.max())) / 2 * NS_PER_S) if len(t_s) else None
 
 
 class _KeptTables:
@@ -130,16 +135,6 @@ class _KeptTables:
                 del self._tables[path]
                 self._bytes -= sum(column.nbytes for column in columns.values())
             return columns
-
-
-def _gt_middle_ns(columns: Mapping[str, NDArray[Any]]) -> int | None:
-    """Return the middle of the PandarGT's times; None where they cannot be those of a sweep."""
-    try:
-        t_s = columns["t"][columns["d"] == LIDARS["pandargt"]].astype(np.float64)
-    except (KeyError, TypeError, ValueError, IndexError):
-        return None
-    t_s = t_s[np.abs(t_s) < MAX_TIME_S]  # False for NaN
-    return round((float(t_s.min()) + float(t_s.max())) / 2 * NS_PER_S) if len(t_s) else None
 
 
 # One file holds the sweeps of both LiDARs, which are read one after the other.
@@ -199,15 +194,12 @@ UNKNOWN_RIDER = "bicycle?"
 def read_labels(
     files: dict[int, Path], t_ns: NDArray[np.int64], gt_t_ns: NDArray[np.int64], map_T_lidar: Array, notes: list[str]
 ) -> Labels:
-    """Labels of the cuboid files by number of sweep.
+    """Labels of the cuboid files by number of sweep, whose stamps are `t_ns` and, of the PandarGT, `gt_t_ns` (N,).
 
-    `t_ns`, `gt_t_ns` (N,) int64: stamps of the sweeps of the Pandar64 and of the PandarGT. `map_T_lidar` (N, 4, 4):
-    poses of the Pandar64 at `t_ns`. `notes`: takes what was left out.
-
-    A cuboid fits the points where they were measured, and the Pandar64 scans different directions at different times; on
-    moving cars of sequence 002 the time by `compute_scan_offset_ns` is off that of the points inside the box by 0.5 +- 0.4 ms:
-    the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object
-    with a cuboid for each LiDAR the Pandar64's is kept.
+    A cuboid fits the points where they were measured, and the Pandar64, at `map_T_lidar` (N, 4, 4), scans different directions at
+    different times; on moving cars of sequence 002 the time by `compute_scan_offset_ns` is off that of the points inside the box by
+    0.5 +- 0.4 ms: the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object with a cuboid for each LiDAR
+    the Pandar64's is kept.
     """
     parts = []
     left_out: list[str] = []
@@ -227,9 +219,9 @@ def read_labels(
     if missing:
         note = f"annotations/cuboids: {len(missing)} of {len(t_ns)} files are missing"
         notes.append(f"{note}, first number {missing[0]:02d}")
-    columns = [np.concatenate([p[k] for p in parts]) for k in range(6)] if parts else None
-    if columns is None:
+    if not parts:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
+    columns = [np.concatenate(column) for column in zip(*parts)]
     keep = select_spaced(columns[0], columns[1], MIN_STEP_NS)
     t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
     # A bicycle of unknown rider is what it is in most other sweeps.
@@ -240,8 +232,8 @@ def read_labels(
         category[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
         alone += not len(words)
     if alone:
-        plural = "s" * (alone != 1)
-        notes.append(f"{alone} bicycle{plural} taken as unridden: no sweep states whether somebody rides them")
+        said = f"{alone} bicycle{'s' * (alone != 1)} taken as unridden"
+        notes.append(f"{said}: no sweep states whether somebody rides them")
     return Labels(t_ns, track_id, category, center, size, yaw)
 
 
@@ -316,7 +308,7 @@ class PandaSetReader(FolderReader):
         """Open a sequence; no sweep and no cuboid is read."""
         folder = path if _is_sequence(path) else path / sequence
         require_links_inside(folder, path)
-        return _Sequence(folder).log()
+        return _open(folder)
 
 
 READER = PandaSetReader()
@@ -326,106 +318,100 @@ def _is_sequence(path: Path) -> bool:
     return (path / "lidar" / "poses.json").is_file() and (path / "camera").is_dir()
 
 
-@dataclass(frozen=True)
-class _Sequence:
-    path: Path
+def _open(path: Path) -> Log:
+    notes: list[str] = []
+    lidar_t_ns, map_T_pose = _poses(path / "lidar")
+    map_T_ego = map_T_pose @ POSE_T_EGO
+    keep = strictly_increasing(lidar_t_ns, "lidar/timestamps.json", notes)
+    track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
+    cameras, streams = _cameras(path, track, notes)
+    kept = set(keep.tolist())  # records whose stamp is far off have no place among the others
+    files = _files(path, "lidar", TABLE, len(lidar_t_ns), notes)
+    sweeps = SweepFiles({k: file for k, file in files.items() if k in kept}, lidar_t_ns, notes)
+    lidars = {lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in (LIDARS if sweeps.files else ())}
+    streams |= {lidar: sweeps.stream(lidar) for lidar in lidars}
+    if not streams:
+        raise LogError(f"{path}: neither images nor sweeps are there; a log needs at least one record")
+    cuboids = list_numbered_files(path / "annotations" / "cuboids", (TABLE,))
+    cuboids = {k: file for k, file in cuboids.items() if k in kept or k >= len(lidar_t_ns)}
+    map_T_lidar = map_T_ego @ EGO_T_PANDAR64
 
-    def log(self) -> Log:
-        notes: list[str] = []
-        lidar_t_ns, map_T_pose = _poses(self.path / "lidar")
-        map_T_ego = map_T_pose @ POSE_T_EGO
-        keep = strictly_increasing(lidar_t_ns, "lidar/timestamps.json", notes)
-        track = PoseTrack(lidar_t_ns[keep], map_T_ego[keep])
-        cameras, streams = self._cameras(track, notes)
-        kept = set(keep.tolist())  # records whose stamp is far off have no place among the others
-        files = self._files("lidar", TABLE, len(lidar_t_ns), notes)
-        sweeps = SweepFiles({k: file for k, file in files.items() if k in kept}, lidar_t_ns, notes)
-        lidars = {lidar: Lidar(lidar, "ego", EGO_T_PANDAR64) for lidar in (LIDARS if sweeps.files else ())}
-        streams |= {lidar: sweeps.stream(lidar) for lidar in lidars}
-        if not streams:
-            raise LogError(f"{self.path}: neither images nor sweeps are there; a log needs at least one record")
-        cuboids = list_numbered_files(self.path / "annotations" / "cuboids", (TABLE,))
-        cuboids = {k: file for k, file in cuboids.items() if k in kept or k >= len(lidar_t_ns)}
-        map_T_lidar = map_T_ego @ EGO_T_PANDAR64
+    @cache
+    def labels() -> Labels | None:
+        return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
 
-        @cache
-        def labels() -> Labels | None:
-            return read_labels(cuboids, lidar_t_ns, sweeps.gt_stamps, map_T_lidar, notes) if cuboids else None
+    index = read_text(path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)
+    return Log(
+        name=f"pandaset-{path.resolve().name}",
+        format=READER.name,
+        cameras=cameras,
+        lidars=lidars,
+        streams=streams,
+        ego=track,
+        ego_vehicle=EGO_VEHICLE,
+        map=_map_frame(path / "meta" / "gps.json", map_T_pose, notes),
+        labels=labels,
+        reference_camera="front_camera" if "front_camera" in cameras else None,
+        digest=digest_of([index], sorted(path.glob(f"*/*{TABLE}")) + sorted(path.glob("*/*/*.*"))),
+        calibrations={n: f"{path}/camera/{n}/intrinsics.json" for n in cameras},
+        notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
+    )
 
-        index = read_text(self.path / "lidar" / "poses.json", JSON_LIMIT_BYTES, LogError)
-        return Log(
-            name=f"pandaset-{self.path.resolve().name}",
-            format=READER.name,
-            cameras=cameras,
-            lidars=lidars,
-            streams=streams,
-            ego=track,
-            ego_vehicle=EGO_VEHICLE,
-            map=self._map_frame(map_T_pose, notes),
-            labels=labels,
-            reference_camera="front_camera" if "front_camera" in cameras else None,
-            digest=digest_of([index], sorted(self.path.glob(f"*/*{TABLE}")) + sorted(self.path.glob("*/*/*.*"))),
-            calibrations={n: f"{self.path}/camera/{n}/intrinsics.json" for n in cameras},
-            notes=defer_notes(notes, *(partial(sweeps.index, lidar) for lidar in lidars), labels),
+
+def _files(path: Path, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
+    """Find the records of a sensor by their number and note missing ones: they are gaps."""
+    found = list_numbered_files(path / folder, (suffix,))
+    files = {k: p for k, p in found.items() if k < count}
+    if len(files) < len(found):
+        notes.append(
+            f"{folder}: {len(found) - len(files)} of {len(found)} records left out: there are stamps for {count}"
         )
+    missing = sorted(set(range(count)) - set(files))
+    if missing:
+        notes.append(f"{folder}: {len(missing)} of {count} records are missing, first number {missing[0]:02d}")
+    return files
 
-    def _files(self, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
-        """Find the records of a sensor by their number and note missing ones: they are gaps."""
-        found = list_numbered_files(self.path / folder, (suffix,))
-        files = {k: p for k, p in found.items() if k < count}
-        if len(files) < len(found):
-            notes.append(
-                f"{folder}: {len(found) - len(files)} of {len(found)} records left out: there are stamps for {count}"
-            )
-        missing = sorted(set(range(count)) - set(files))
-        if missing:
-            notes.append(f"{folder}: {len(missing)} of {count} records are missing, first number {missing[0]:02d}")
-        return files
 
-    def _cameras(self, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
-        cameras, streams = {}, {}
-        for folder in list_folders(self.path / "camera"):
-            if not is_present(folder / "intrinsics.json"):
-                images = len(list_numbered_files(folder, (".jpg",)))
-                if images:
-                    notes.append(f"camera/{folder.name}: {images} images left out: it has no intrinsics.json")
-                continue
-            t_ns, map_T_cam = _poses(folder)
-            files = self._files(f"camera/{folder.name}", ".jpg", len(t_ns), notes)
-            if not files:
-                continue
-            width, height = first_image_size(list(files.values()))
-            mount = _mount(track, t_ns, map_T_cam, folder, notes)
-            camera = Camera(folder.name, width, height, _intrinsics(folder / "intrinsics.json"), "ego", mount)
-            numbers = np.array(list(files))
-            keep = strictly_increasing(t_ns[numbers], folder.name, notes)
-            t_ns = t_ns[numbers[keep]]
-            cameras[camera.name] = camera
-            chosen = [files[int(n)] for n in numbers[keep]]
-            streams[camera.name] = image_stream(camera.name, t_ns, chosen, (width, height))
-        if not cameras:
-            notes.append(
-                "no images: camera/ has no folder with intrinsics.json, poses.json, timestamps.json and images"
-            )
-        return cameras, streams
+def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
+    cameras, streams = {}, {}
+    for folder in list_folders(path / "camera"):
+        name = folder.name
+        if not is_present(folder / "intrinsics.json"):
+            images = len(list_numbered_files(folder, (".jpg",)))
+            if images:
+                notes.append(f"camera/{name}: {images} images left out: it has no intrinsics.json")
+            continue
+        t_ns, map_T_cam = _poses(folder)
+        files = _files(path, f"camera/{name}", ".jpg", len(t_ns), notes)
+        if not files:
+            continue
+        size_px = first_image_size(list(files.values()))
+        mount = _mount(track, t_ns, map_T_cam, folder, notes)
+        cameras[name] = Camera(name, *size_px, _intrinsics(folder / "intrinsics.json"), "ego", mount)
+        numbers = np.array(list(files))
+        numbers = numbers[strictly_increasing(t_ns[numbers], name, notes)]
+        streams[name] = image_stream(name, t_ns[numbers], [files[int(n)] for n in numbers], size_px)
+    if not cameras:
+        notes.append("no images: camera/ has no folder with intrinsics.json, poses.json, timestamps.json and images")
+    return cameras, streams
 
-    def _map_frame(self, map_T_pose: Array, notes: list[str]) -> MapFrame:
-        """Georeference the map where the GNSS track is long enough to show that its axes are east and north."""
-        path = self.path / "meta" / "gps.json"
-        if not is_present(path):
-            return MapFrame()
-        fixes = read_json(path)
-        try:
-            geodetic = np.array([[f["lat"], f["long"], f["height"]] for f in fixes], dtype=np.float64).reshape(-1, 3)
-        except (TypeError, KeyError, ValueError):
-            raise LogError(f"{path}: expected a list of records with lat, long and height") from None
-        if not len(geodetic) or not np.isfinite(geodetic).all() or np.abs(geodetic[:, 0]).max() >= 90:
-            notes.append("meta/gps.json holds no usable fixes: the position of the map is unknown")
-            return MapFrame()
-        frame, reason = georeference(geodetic, map_T_pose[: len(geodetic), :3, 3], str(path))
-        if reason:
-            notes.append(f"{reason}: the map is only local and its north is not known")
-        return frame
+
+def _map_frame(path: Path, map_T_pose: Array, notes: list[str]) -> MapFrame:
+    """Georeference the map where the GNSS track is long enough to show that its axes are east and north."""
+    if not is_present(path):
+        return MapFrame()
+    fixes = read_json(path)
+    try:
+        geodetic = np.array([[f["lat"], f["long"], f["height"]] for f in fixes], dtype=np.float64).reshape(-1, 3)
+    except (TypeError, KeyError, ValueError):
+        raise LogError(f"{path}: expected a list of records with lat, long and height") from None
+    if not len(geodetic) or not np.isfinite(geodetic).all() or np.abs(geodetic[:, 0]).max() >= 90:
+        notes.append("meta/gps.json holds no usable fixes: the position of the map is unknown")
+        return MapFrame()
+    frame, reason = georeference(geodetic, map_T_pose[: len(geodetic), :3, 3], str(path))
+    if reason:
+        notes.append(f"{reason}: the map is only local and its north is not known")
+    return frame
 
 
 def georeference(geodetic: Array, xyz_map: Array, where: str) -> tuple[MapFrame, str]:
@@ -446,11 +432,10 @@ def georeference(geodetic: Array, xyz_map: Array, where: str) -> tuple[MapFrame,
     turn = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     if abs(turn) > MAX_GNSS_ANGLE_RAD:
         return local, f"GNSS and map differ by {np.degrees(turn):.1f} degrees"
-    shift = np.append(
-        east_north.mean(0) - xyz_map[:n, :2].mean(0), np.mean(geodetic[:n, 2] - altitude - xyz_map[:n, 2])
-    )
-    origin = [float(v[0]) for v in geodetic_from_map(first, shift[None], where)]
-    return MapFrame(origin[0], origin[1], origin[2], transverse_mercator(origin[0], origin[1])), ""
+    map_m = xyz_map[:n].mean(0)
+    shift = np.append(east_north.mean(0) - map_m[:2], np.mean(geodetic[:n, 2] - altitude - xyz_map[:n, 2]))
+    latitude, longitude, altitude = (float(v[0]) for v in geodetic_from_map(first, shift[None], where)[:3])
+    return MapFrame(latitude, longitude, altitude, transverse_mercator(latitude, longitude)), ""
 
 
 def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:

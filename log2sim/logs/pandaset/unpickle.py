@@ -28,14 +28,11 @@ MAX_TEXTS = 10_000_000
 
 
 def decode_text(kind: str, length: int, start: int, buffers: Sequence[bytes | bytearray | None]) -> NDArray[Any]:
-    """Decode an array of text.
+    """Decode an array of text, (N,) object, with NaN where there is none, as in the text columns of pandas.
 
     `kind` {"string", "large_string"}. `length`, `start`: number of texts, and how many texts of the buffers come before
-    them. `buffers`: one bit a text that says whether it is there (None: all are), offsets, UTF-8 bytes. Returns (N,)
-    object: texts; NaN where there is none, as in the text columns of pandas. Raises `ValueError` when the buffers do
-    not hold what they should.
-
-    Arrow columnar format, "variable-size binary layout"; bits are numbered from the least significant one.
+    them. `buffers`: one bit a text that says whether it is there (None: all are), offsets, UTF-8 bytes; `ValueError` when they do
+    not hold what they should. Arrow columnar format, "variable-size binary layout"; bits are numbered from the least significant.
     """
     if kind not in OFFSETS:
         raise ValueError(f"ArrowStringArray of type '{kind}', expected {' or '.join(OFFSETS)}")
@@ -78,10 +75,9 @@ Columns = dict[str, NDArray[Any]]
 
 
 def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_bytes: int = MAX_TABLE_BYTES) -> Columns:
-    """Read the columns (N,) of a DataFrame from a .pkl or .pkl.gz file.
+    """Read the columns (N,) of a DataFrame from a .pkl or .pkl.gz file of at most `limit_bytes` once unpacked.
 
-    Raises `RecordError` or `error` when the file is missing, larger than `limit_bytes` once unpacked, no table, or
-    names a class that tables do not need.
+    Raises `RecordError` or `error` when the file is missing, too large, no table, or names a class that tables do not need.
     """
     packed = read_file(path, limit_bytes, error, missing="cannot be read: No such file or directory")
     try:

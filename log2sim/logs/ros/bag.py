@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from log2sim.errors import LogError, MissingExtra, RecordError
 from log2sim.files.inputs import open_regular, read_text, require_link_inside
 from log2sim.logs.records import PARSER_ERRORS
-from log2sim.logs.ros.containers import Channel, Container, one_line, printable
+from log2sim.logs.ros.containers import Container, one_line, printable
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
@@ -28,12 +28,12 @@ _SPLIT = re.compile(r"^(?P<name>.*?)(?:_?\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)?_(?P<pa
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording, found by names alone."""
+    """One recording, found by names alone: its file or folder, its files in the order of the parts, and where settings may lie."""
 
     name: str
-    place: Path  # its file or folder
-    files: tuple[Path, ...]  # in the order of the parts
-    settings: tuple[Path, ...]  # where a TOML file for it may lie; the first that exists counts
+    place: Path
+    files: tuple[Path, ...]
+    settings: tuple[Path, ...]  # TOML files; the first that exists counts
 
 
 def find_recordings(path: Path) -> dict[str, Recording]:
@@ -64,7 +64,10 @@ def recorded_files(recording: Recording, notes: list[str]) -> tuple[list[Path], 
             require_link_inside(file, recording.place)
     metadata = recording.place / METADATA
     if not recording.place.is_dir() or not metadata.is_file():
-        _note_missing_parts(recording, notes)
+        numbers = [_part(p) for p in recording.files]
+        lost = sorted(set(range(numbers[-1] + 1)) - set(numbers)) if len(numbers) > 1 else []
+        if lost:
+            notes.append(f"{len(lost)} of {numbers[-1] + 1} files of the recording are missing, first part {lost[0]}")
         return list(recording.files), ""
     require_link_inside(metadata, recording.place)
     try:
@@ -133,16 +136,6 @@ def _part(path: Path) -> int:
     return int(match["part"]) if match else 0
 
 
-def _note_missing_parts(recording: Recording, notes: list[str]) -> None:
-    if len(recording.files) > 1:
-        numbers = [_part(p) for p in recording.files]
-        missing = sorted(set(range(numbers[-1] + 1)) - set(numbers))
-        if missing:
-            notes.append(
-                f"{len(missing)} of {numbers[-1] + 1} files of the recording are missing, first part {missing[0]}"
-            )
-
-
 ENCODINGS = ("ros1", "cdr")
 STAMP = slice(4, 12)
 """Bytes of header.stamp in a message: after the sequence number in ROS 1, after the encapsulation in CDR."""
@@ -156,12 +149,12 @@ NAME_BYTES = 272
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """Messages of one topic; M is their number, i counts them in the order of recording."""
+    """Messages of one topic; M is their number, i counts them in the order of recording; texts as in `containers.Channel`."""
 
-    name: str  # as in `containers.Channel`
-    msgtype: str  # as in `containers.Channel`
-    encoding: str  # as in `containers.Channel`
-    definition: str  # as in `containers.Channel`
+    name: str
+    msgtype: str
+    encoding: str
+    definition: str
     file: NDArray[np.intp]  # (M,): index of the file of each message
     entry: NDArray[np.intp]  # (M,): its number there
     recorded_ns: NDArray[np.int64]  # (M,): when the recorder received it
@@ -172,11 +165,7 @@ class Topic:
 
 
 class Bag:
-    """The files of a recording.
-
-    `place`: file or folder of the recording, for errors. `topics`: sorted by name. `digest`: SHA-256 over names, sizes
-    and indexes of the files.
-    """
+    """The files of a recording: `topics` by name, `digest` over names, sizes and indexes of the files."""
 
     def __init__(self, recording: Recording) -> None:
         self.place, self.notes = recording.place, list[str]()
@@ -194,7 +183,12 @@ class Bag:
             raise LogError(f"{recording.place}: none of its {len(paths)} files can be read")
         self.notes += [note for file in self.files for note in file.notes]
         self.topics = self._join()
-        self.digest = self._digest()
+        value = hashlib.sha256()
+        for container in self.files:
+            value.update(f"{container.path.name} {container.path.stat().st_size}\n".encode())
+            for column in (container.entries.channel, container.entries.t_ns):
+                value.update(np.ascontiguousarray(column).astype("<i8").tobytes())
+        self.digest = value.hexdigest()
 
     def read(self, topic: Topic, i: int, limit_bytes: int | None = None) -> bytes:
         """Read message `i` of a topic, or its first `limit_bytes`; `RecordError` where it is damaged."""
@@ -250,38 +244,26 @@ class Bag:
             for c, channel in enumerate(file.channels):
                 name = "/" + "/".join(part for part in channel.topic.split("/") if part)
                 parts.setdefault((name, channel.msgtype, channel.encoding), []).append((f, c))
+        rows_of = []
+        for file in self.files:  # in one pass: a file may have many channels
+            channels = file.entries.channel
+            order = np.argsort(channels, kind="stable")
+            last = max(len(file.channels), 1)
+            rows_of.append(np.split(order, np.searchsorted(channels[order], np.arange(1, last))))
         topics: dict[str, Topic] = {}
-        rows = [_rows_by_channel(file) for file in self.files]
         for (name, msgtype, encoding), places in sorted(parts.items()):
-            topic = self._topic((name, msgtype, encoding), places, rows)
+            first = self.files[places[0][0]].channels[places[0][1]]
+            columns = []
+            for f in dict.fromkeys(f for f, _ in places):
+                rows = np.sort(np.concatenate([rows_of[f][c] for g, c in places if g == f]))
+                columns.append((np.full(len(rows), f), rows, self.files[f].entries.t_ns[rows]))
+            topic = Topic(name, msgtype, encoding, first.definition, *(np.concatenate(c) for c in zip(*columns)))
             other = topics.get(name)
             if other is not None:
-                kept, left = (topic, other) if len(topic) > len(other) else (other, topic)
+                topic, left = (topic, other) if len(topic) > len(other) else (other, topic)
                 self.notes.append(f"{name}: has two types; {len(left)} messages of {left.msgtype} are left out")
-                topic = kept
             topics[name] = topic
         return topics
-
-    def _topic(
-        self, key: tuple[str, str, str], places: Sequence[tuple[int, int]], by_channel: list[list[NDArray[np.intp]]]
-    ) -> Topic:
-        file, entry, recorded = [], [], []
-        for f in dict.fromkeys(f for f, _ in places):
-            entries = self.files[f].entries
-            rows = np.sort(np.concatenate([by_channel[f][c] for g, c in places if g == f]))
-            file.append(np.full(len(rows), f))
-            entry.append(rows)
-            recorded.append(entries.t_ns[rows])
-        first: Channel = self.files[places[0][0]].channels[places[0][1]]
-        return Topic(*key, first.definition, np.concatenate(file), np.concatenate(entry), np.concatenate(recorded))
-
-    def _digest(self) -> str:
-        value = hashlib.sha256()
-        for file in self.files:
-            value.update(f"{file.path.name} {file.path.stat().st_size}\n".encode())
-            for column in (file.entries.channel, file.entries.t_ns):
-                value.update(np.ascontiguousarray(column).astype("<i8").tobytes())
-        return value.hexdigest()
 
 
 def open_container(path: Path, compression: str = "") -> Container:
@@ -299,13 +281,6 @@ def open_container(path: Path, compression: str = "") -> Container:
     if head == rosbag2.SQLITE_MAGIC:
         return rosbag2.SqliteBag(path, compression)
     raise LogError(f"{path}: neither a ROS 1 bag nor MCAP nor an SQLite database by its first bytes")
-
-
-def _rows_by_channel(file: Container) -> list[NDArray[np.intp]]:
-    """Numbers of the messages of each channel of a file, in one pass: a file may have many channels."""
-    channel = file.entries.channel
-    order = np.argsort(channel, kind="stable")
-    return np.split(order, np.searchsorted(channel[order], np.arange(1, max(len(file.channels), 1))))
 
 
 def stamp_of(head: bytes, encoding: str) -> int:

@@ -249,7 +249,16 @@ class ChunkedFile:
         if chunk in self._damaged:
             raise ValueError(self._damaged[chunk])
         try:
-            data = self._unpack(self.chunks[chunk])
+            c = self.chunks[chunk]
+            self._require_sizes(c)
+            data = self.at(c.position, c.stored_bytes)
+            if c.compression not in ("", "none"):
+                data = unpack_part(decompressor_of(c.compression), data, c.size_bytes + 1)
+            if len(data) != c.size_bytes:
+                found = f"more than {c.size_bytes}" if len(data) > c.size_bytes else f"{len(data)}"
+                raise ValueError(f"unpacks to {found} bytes, expected {c.size_bytes}")
+            if c.crc and zlib.crc32(data) != c.crc:
+                raise ValueError(f"the CRC of the chunk at byte {c.position} is wrong")
         except (ValueError, OSError, EOFError) as problem:
             self._damaged[chunk] = str(problem)
             raise
@@ -258,18 +267,6 @@ class ChunkedFile:
             self._intact.add(chunk)
             while len(self._cache) > 1 and sum(map(len, self._cache.values())) > CACHED_BYTES:
                 self._cache.popitem(last=False)
-        return data
-
-    def _unpack(self, chunk: Chunk) -> bytes:
-        self._require_sizes(chunk)
-        data = self.at(chunk.position, chunk.stored_bytes)
-        if chunk.compression not in ("", "none"):
-            data = unpack_part(decompressor_of(chunk.compression), data, chunk.size_bytes + 1)
-        if len(data) != chunk.size_bytes:
-            found = f"more than {chunk.size_bytes}" if len(data) > chunk.size_bytes else f"{len(data)}"
-            raise ValueError(f"unpacks to {found} bytes, expected {chunk.size_bytes}")
-        if chunk.crc and zlib.crc32(data) != chunk.crc:
-            raise ValueError(f"the CRC of the chunk at byte {chunk.position} is wrong")
         return data
 
     def _require_sizes(self, chunk: Chunk) -> None:
@@ -310,10 +307,9 @@ def decompress_message(data: bytes, method: str, limit_bytes: int | None) -> byt
 def unpack_part(decompressor: Any, data: bytes, limit_bytes: int) -> bytes:
     """Unpack the next part of compressed data into at most `limit_bytes`; `ValueError` where it is damaged."""
     try:
-        unpacked: bytes = decompressor.decompress(data, max_length=limit_bytes)
+        return bytes(decompressor.decompress(data, max_length=limit_bytes))
     except Exception as error:  # the libraries have errors of their own
         raise ValueError(f"damaged compressed data: {error}") from None
-    return unpacked
 
 
 def decompressor_of(method: str) -> Any:

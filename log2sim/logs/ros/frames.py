@@ -41,17 +41,13 @@ class Edge:
 
 
 class FrameTree:
-    """Frames by name; each has at most one parent, which is checked where a frame is used.
-
-    `where`: names the recording in errors.
-    """
+    """Frames by name; each has at most one parent, which is checked where a frame is used; `where` names the recording."""
 
     def __init__(self, where: str) -> None:
         self._where = where
         self._rows: dict[str, dict[str, list[tuple[int, Numbers]]]] = {}
         self._edges: dict[str, dict[str, Edge]] = {}
-        self.refused = 0
-        """Transforms that were left out, since their values are not finite or their quaternions no rotations."""
+        self.refused = 0  # transforms whose values are not finite or whose quaternions are no rotations
 
     def add(self, transforms: Iterable[Any]) -> None:
         """Add transforms of a TFMessage."""
@@ -98,10 +94,7 @@ class FrameTree:
         return list(self._static_ancestors(frame))[-1]
 
     def mount(self, dst: str, src: str) -> Array | None:
-        """Compute dst_T_src (4, 4) of frames that do not move against each other; None when they do or are not connected.
-
-        Raises `LogError` for a frame on the way that has two parents, and for a cycle.
-        """
+        """Compute dst_T_src (4, 4) of frames that do not move against each other; None when they do or are not connected."""
         if dst == src:
             return np.eye(4)
         src_up, dst_up = self._static_ancestors(src), self._static_ancestors(dst)
@@ -111,16 +104,14 @@ class FrameTree:
     def track(self, fixed: str, frame: str) -> PoseTrack | None:
         """Poses of a frame in one of its ancestors, at the stamps of the edge that was sent most often.
 
-        Other edges are interpolated, and held before their first and after their last stamp, as a localization that
-        corrects an odometry now and then is used.
+        Others are interpolated, and held before their first and after their last stamp, as a localization that corrects an
+        odometry now and then is used.
         """
-        edges = []
-        for _, edge in self._path_up(frame):
-            edges.append(edge)
-            if edge.parent == fixed:
-                break
-        else:
+        path = [edge for _, edge in self._path_up(frame)]
+        last = next((k for k, edge in enumerate(path) if edge.parent == fixed), None)
+        if last is None:
             return None
+        edges = path[: last + 1]
         t_ns = np.unique(max((e for e in edges if not e.static), key=lambda e: len(e.t_ns), default=edges[0]).t_ns)
         poses = np.repeat(np.eye(4)[None], len(t_ns), axis=0)
         for edge in edges:
@@ -220,11 +211,7 @@ class EgoFrame:
 def choose_base(
     tree: FrameTree, sensor_frames: list[str], pose_frames: Iterable[str], fixed_frames: tuple[str, ...], given: str
 ) -> tuple[str | None, str]:
-    """Choose the vehicle's frame, and say why.
-
-    `sensor_frames`: frames of the LiDARs, then of the cameras. `pose_frames`: frames whose poses odometry gives.
-    `fixed_frames`: names of frames that do not move. `given`: that of the settings; "" without one.
-    """
+    """Choose the vehicle's frame, that of the settings if they give one, and say why; `pose_frames` are those of odometry."""
     if given:
         return given, "the settings name it"
     pose_frames = list(pose_frames)
@@ -244,24 +231,19 @@ def choose_base(
 
 def place_ego(base: str | None, settings: EgoSettings, tree: FrameTree, camera_frames: Collection[str]) -> EgoFrame:
     """Place the ego in the vehicle's frame by the settings, else by the name of the frame."""
-    notes = []
-    rotation = rotation_from_quaternion(settings.rotation_wxyz)
-    given = settings.model_fields_set
-    if base is not None and base in camera_frames and "rotation_wxyz" not in given:
-        rotation = CAMERA_R_EGO
-    base_T_ego = transform(rotation, settings.origin_m)
-    default = EgoVehicle()
-    offset_m = settings.rear_axle_offset_m
-    vehicle = EgoVehicle(
-        settings.size_m or default.size_m, default.rear_axle_offset_m if offset_m is None else offset_m
-    )
+    notes, given, default = [], settings.model_fields_set, EgoVehicle()
+    offset_m = default.rear_axle_offset_m if settings.rear_axle_offset_m is None else settings.rear_axle_offset_m
+    vehicle = EgoVehicle(settings.size_m or default.size_m, offset_m)
+    ground_m = settings.ground_z_m
     if base is None:
-        return EgoFrame(None, np.eye(4), settings.ground_z_m or 0.0, vehicle, ())
+        return EgoFrame(None, np.eye(4), ground_m or 0.0, vehicle, ())
+    in_image = base in camera_frames and "rotation_wxyz" not in given
+    rotation = CAMERA_R_EGO if in_image else rotation_from_quaternion(settings.rotation_wxyz)
+    base_T_ego = transform(rotation, settings.origin_m)
     if "origin_m" not in given:
         notes.append(f"the frame '{base}' is taken to be at the middle of the rear axle (ego.origin_m in the settings)")
     if settings.size_m is None:
         notes.append("the size of the ego is not known; that of a usual car is taken (ego.size_m)")
-    ground_m = settings.ground_z_m
     if ground_m is None:
         footprint = tree.mount(base, GROUND_FRAME) if GROUND_FRAME in tree.frames and base != GROUND_FRAME else None
         if footprint is not None:

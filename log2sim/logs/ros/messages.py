@@ -299,14 +299,8 @@ def sweep_from_livox(raw: bytes, encoding: str, t_ns: int, settings: LidarTopic,
     offset = points["t"][kept].astype(np.int64)
     if settings.stamp == "end" and len(offset):
         offset -= offset.max()
-    return sweep_of(
-        xyz[kept],
-        t_ns,
-        None if settings.time_field == "none" else offset,
-        "lidar",
-        t_ns if settings.compensated else None,
-        points["r"][kept],
-    )
+    times = None if settings.time_field == "none" else offset
+    return sweep_of(xyz[kept], t_ns, times, "lidar", t_ns if settings.compensated else None, points["r"][kept])
 
 
 _TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
@@ -342,24 +336,18 @@ def find_layout_problem(topic: Topic) -> str | None:
         return f"its messages are encoded as '{topic.encoding}', only ros1 and cdr are read"
     if topic.msgtype in TYPES:
         expected = FIELDS
+    if topic.msgtype in TYPES:
+        expected = FIELDS
     else:
-        expected = [
-            name for name, _ in typestore(topic.encoding).fielddefs[ALIASES.get(topic.msgtype, topic.msgtype)][1]
-        ]
-    found = definition_fields(topic.definition)
+        definitions = typestore(topic.encoding).fielddefs
+        expected = [name for name, _ in definitions[ALIASES.get(topic.msgtype, topic.msgtype)][1]]
+    # Of the first message of a definition text.
+    lines = topic.definition.partition("\n====")[0].splitlines()
+    fields = [match for line in lines if (match := _FIELD.match(line.partition("#")[0])) and not match["constant"]]
+    found = [match["name"] for match in fields]
     if topic.definition and found != expected:
         return f"its definition of {topic.msgtype} has the fields {', '.join(found)}, expected {', '.join(expected)}"
     return None
-
-
-def definition_fields(definition: str) -> list[str]:
-    """Names of the fields of the first message of a definition text."""
-    names = []
-    for line in definition.partition("\n====")[0].splitlines():
-        match = _FIELD.match(line.partition("#")[0])
-        if match and not match["constant"]:
-            names.append(match["name"])
-    return names
 
 
 @cache

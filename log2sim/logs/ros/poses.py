@@ -64,33 +64,37 @@ class PoseSources:
     def find(self) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
         """Find the poses of the first source that has some, and what was considered, as JSON."""
         considered: list[dict[str, Any]] = []
-        found = None
+        found: FoundPoses | None = None
         for source, topic, read in self._candidates():
-            if found is not None:
-                considered.append(
-                    {"source": source, "topic": topic, "used": False, "reason": "a source before it is used"}
-                )
-                continue
-            try:
-                poses = read(topic)
-                if problem := describe_uncovered(poses.t_ns, *self.span_ns):
-                    raise NoPoses(problem)
-                damaged = self.damaged.get(poses.topic, 0)
-                if damaged:
-                    note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
-                    poses = replace(poses, notes=(*poses.notes, note))
-                offset = whole_kilometers(poses.map_T_base[:, :3, 3])
-                if offset.any():
-                    shifted = shift_poses(poses.map_T_base, offset)
-                    x, y, z = offset.tolist()
-                    poses = replace(poses, map_T_base=shifted, map=replace(poses.map, offset_m=(x, y, z)))
-                found = poses
-                reason = f"{len(poses.t_ns)} poses, the first source of the order that has some"
-                reason = reason if self.settings.source == "auto" else f"{len(poses.t_ns)} poses, by the settings"
-                considered.append({"source": source, "topic": topic, "used": True, "reason": reason})
-            except NoPoses as reason_against:
-                considered.append({"source": source, "topic": topic, "used": False, "reason": str(reason_against)})
+            used, reason = False, "a source before it is used"
+            if found is None:
+                try:
+                    found = self._located(read(topic))
+                    used, count = True, f"{len(found.t_ns)} poses, "
+                    reason = count + (
+                        "the first source of the order that has some"
+                        if self.settings.source == "auto"
+                        else "by the settings"
+                    )
+                except NoPoses as reason_against:
+                    reason = str(reason_against)
+            considered.append({"source": source, "topic": topic, "used": used, "reason": reason})
         return found, considered
+
+    def _located(self, poses: FoundPoses) -> FoundPoses:
+        """Move the map's origin near to poses that cover the time of the sensors."""
+        if problem := describe_uncovered(poses.t_ns, *self.span_ns):
+            raise NoPoses(problem)
+        damaged = self.damaged.get(poses.topic, 0)
+        if damaged:
+            note = f"{poses.topic}: {damaged} of {len(self.messages[poses.topic])} messages are damaged and left out"
+            poses = replace(poses, notes=(*poses.notes, note))
+        offset = whole_kilometers(poses.map_T_base[:, :3, 3])
+        if not offset.any():
+            return poses
+        x, y, z = offset.tolist()
+        shifted = shift_poses(poses.map_T_base, offset)
+        return replace(poses, map_T_base=shifted, map=replace(poses.map, offset_m=(x, y, z)))
 
     def _candidates(self) -> list[tuple[str, str, Callable[[str], FoundPoses]]]:
         wanted = self.settings
@@ -107,13 +111,10 @@ class PoseSources:
             for kind, names in self.topics.items()
             if kind in ("odometry", "pose", "gnss")
         }
-        ordered = [
-            *(("tf", frame, self._from_tf) for frame in mapped),
-            *(("odometry", name, self._from_odometry) for name in by_count.get("odometry", ())),
-            *(("pose", name, self._from_poses) for name in by_count.get("pose", ())),
-            *(("gnss", name, self._from_gnss) for name in by_count.get("gnss", ())),
-            *(("tf", frame, self._from_tf) for frame in others),
-        ]
+        ordered: list[tuple[str, str, Callable[[str], FoundPoses]]] = [("tf", frame, self._from_tf) for frame in mapped]
+        for kind, read in (("odometry", self._from_odometry), ("pose", self._from_poses), ("gnss", self._from_gnss)):
+            ordered += [(kind, name, read) for name in by_count.get(kind, ())]
+        ordered += [("tf", frame, self._from_tf) for frame in others]
         if wanted.source != "auto":
             ordered = [c for c in ordered if c[0] == wanted.source]
         return [c for c in ordered if wanted.topic in ("", c[1]) or c[0] == "tf"]
@@ -176,9 +177,8 @@ class PoseSources:
             problems.append(
                 f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or no rotations; dropped"
             )
-        return FoundPoses(
-            stamps[valid][keep], map_T_child[keep] @ child_T_base, self._local_map(), source, name, (*notes, *problems)
-        )
+        base = map_T_child[keep] @ child_T_base
+        return FoundPoses(stamps[valid][keep], base, self._local_map(), source, name, (*notes, *problems))
 
     def _from_gnss(self, name: str) -> FoundPoses:
         from log2sim.logs.stamps import map_frame_of, poses_from_geodetic

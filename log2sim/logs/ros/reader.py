@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -99,11 +99,12 @@ class _Opening:
         self._note_poses(found, considered, base)
         self.notes += frame.notes
 
-        @cache
-        def measured() -> tuple[float, tuple[str, ...]]:
-            return ego.measure_road(frame, lidars, streams)
-
+        measured = cache(partial(ego.measure_road, frame, lidars, streams))
         known_m = frame.ground_z_m
+        place, chosen = self.bag.place, self.roles.cameras
+        places = dict.fromkeys(lidars, f"{place}, transforms")
+        for n in cameras:
+            places[n] = f"{place}, {chosen[n].info}" if chosen[n].intrinsics is None else f"{self.file}"
         return Log(
             name=self.name,
             format=READER.name,
@@ -117,7 +118,7 @@ class _Opening:
             reference_camera=self._reference_camera(cameras, streams),
             digest=self.bag.digest,
             notes=(lambda: (*self.notes, *measured()[1])) if known_m is None else tuple(self.notes),
-            calibrations={n: self._calibration_place(n) for n in streams},
+            calibrations=places,
             details={
                 "settings": None if self.file is None else self.file.name,
                 "files": [container.path.name for container in self.bag.files],
@@ -127,13 +128,6 @@ class _Opening:
                 "frames": self.tree.describe(),
             },
         )
-
-    def _calibration_place(self, name: str) -> str:
-        """Say where the calibration of a sensor is."""
-        camera = self.roles.cameras.get(name)
-        if camera is None:
-            return f"{self.bag.place}, transforms"
-        return f"{self.file}" if camera.intrinsics is not None else f"{self.bag.place}, {camera.info}"
 
     def _sensors(self) -> dict[str, CameraTopic | LidarTopic]:
         return {**self.roles.lidars, **self.roles.cameras}
@@ -151,9 +145,7 @@ class _Opening:
         damaged = 0
         for i, raw in enumerate(self.messages[topic.name]):
             try:
-                if raw is None:
-                    raise RecordError("damaged")
-                self.tree.add(decode_bytes(topic, raw, self.bag.where(topic, i)).transforms)
+                self.tree.add(decode_bytes(topic, raw or b"", self.bag.where(topic, i)).transforms)
             except RecordError:
                 damaged += 1
         if damaged:
@@ -163,19 +155,18 @@ class _Opening:
         """Frames whose poses the odometry topics give."""
         frames = []
         for name in self.roles.topics.get("odometry", ()):
-            topic = self.bag.topics[name]
             raw = next((raw for raw in self.messages[name] if raw is not None), None)
             if raw is not None:
-                frames.append(printable(decode_bytes(topic, raw, name).child_frame_id).lstrip("/"))
+                message = decode_bytes(self.bag.topics[name], raw, name)
+                frames.append(printable(message.child_frame_id).lstrip("/"))
         return [frame for frame in frames if frame]
 
     def _poses(self, base: str | None, span_ns: tuple[int, int]) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
         wanted = self.settings.poses
         if base is None or wanted.source == "none":
             return None, []
-        sources = PoseSources(
-            self.bag, self.roles.topics, self.messages, self.tree, base, wanted, self.settings.map, span_ns
-        )
+        topics, given = self.roles.topics, self.settings.map
+        sources = PoseSources(self.bag, topics, self.messages, self.tree, base, wanted, given, span_ns)
         found, considered = sources.find()
         if found is None and (wanted.source != "auto" or wanted.topic):
             reasons = "; ".join(f"{c['topic']}: {c['reason']}" for c in considered) or "the recording has no such topic"

@@ -42,17 +42,12 @@ MAX_SENSOR_TOPICS = 1000
 
 @dataclass
 class Roles:
-    """What topics are used for.
-
-    `cameras`, `lidars`: by the name of the sensor, with all topics filled in.
-    """
+    """What topics are used for: sensors by their name, with all topics filled in, other topics by kind, and why, by topic."""
 
     cameras: dict[str, CameraTopic] = field(default_factory=dict)
     lidars: dict[str, LidarTopic] = field(default_factory=dict)
-    # Topics by kind: "camera info", "odometry", "pose", "gnss", "imu", "tf"
-    topics: dict[str, list[str]] = field(default_factory=dict)
-    # role and reason by topic
-    reasons: dict[str, tuple[str, str]] = field(default_factory=dict)
+    topics: dict[str, list[str]] = field(default_factory=dict)  # "camera info", "odometry", "pose", "gnss", "imu", "tf"
+    reasons: dict[str, tuple[str, str]] = field(default_factory=dict)  # role and reason
     notes: list[str] = field(default_factory=list)
 
     def table(self, bag: Bag) -> list[dict[str, Any]]:
@@ -69,8 +64,8 @@ class Roles:
 def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
     """Decide what each topic is used for.
 
-    Raises `ConfigError` when the settings name a topic that the recording does not have, or that is of another type;
-    `LogError` for more than `MAX_SENSOR_TOPICS` that no settings choose from.
+    Raises `ConfigError` when the settings name a topic that is not there or of another type, `LogError` for more than
+    `MAX_SENSOR_TOPICS` that no settings choose from.
     """
     roles = Roles()
     usable: dict[str, list[Topic]] = {}
@@ -179,7 +174,13 @@ def _one_per_camera(topics: list[Topic], roles: Roles) -> list[Topic]:
         base = _image_base(topic.name)
         parent, _, last = base.rpartition("/")
         groups.setdefault(parent if last.startswith("image") and parent else base, []).append(topic)
-    return _best_of(groups, _image_rank, "image of the same camera", roles)
+
+    # Rectified before distorted, color before gray, as recorded before compressed, then many messages.
+    def rank(topic: Topic) -> tuple[Any, ...]:
+        name = topic.name.lower()
+        return "rect" not in name, "mono" in name, topic.msgtype == COMPRESSED, -len(topic), name
+
+    return _best_of(groups, rank, "image of the same camera", roles)
 
 
 def _one_per_frame(bag: Bag, topics: list[Topic], roles: Roles) -> list[Topic]:
@@ -215,12 +216,6 @@ def _best_of(groups: Mapping[str, list[Topic]], rank: Callable[[Topic], Any], wh
         for other in others:
             roles.reasons[other.name] = ("unused", f"{what} as {first.name}")
     return sorted(best, key=lambda t: t.name)
-
-
-def _image_rank(topic: Topic) -> tuple[Any, ...]:
-    """Rectified before distorted, color before gray, as recorded before compressed, then many messages."""
-    name = topic.name.lower()
-    return "rect" not in name, "mono" in name, topic.msgtype == COMPRESSED, -len(topic), name
 
 
 def _find_info(bag: Bag, topic: Topic, infos: list[str]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Stream, Sweep
+from log2sim.datatypes.log import camera_of
 from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, inverse, transform
 from log2sim.logs.records import (
@@ -35,21 +36,17 @@ class CalibrationProblem(ValueError):
 
 def camera_from_intrinsics(name: str, given: Intrinsics, mount: Mount, mount_T_cam: Array) -> Camera:
     """Build a camera from the settings."""
-    K = np.array([[given.fx_px, 0.0, given.cx_px], [0.0, given.fy_px, given.cy_px], [0.0, 0.0, 1.0]])
-    size = given.width_px, given.height_px
-    return Camera(name, *size, K, mount, mount_T_cam, given.distortion_model, given.distortion)
+    return camera_of(name, given.model_dump(), mount, mount_T_cam)
 
 
 def camera_from_info(
     name: str, info: Any, pose: tuple[Mount, Array], *, rectified: bool, stereo: bool = False
 ) -> Camera:
-    """Build a camera from a CameraInfo.
+    """Build a camera from a CameraInfo; `pose` is the mount and where the frame of the images is in it.
 
-    `pose` (mount, (4, 4) float64): where the frame of the images is: mount_T_cam. `rectified`: whether the images are
-    rectified: then P is theirs, their axes are turned by R, and there is no distortion. `stereo`: whether another
-    camera has the same frame, as the second of a stereo pair has in ROS: then the last column of P holds its position
-    in it. Raises `CalibrationProblem` when the camera is not calibrated, or its lens model is none of those that
-    `Camera` has.
+    `rectified`: whether the images are: then P is theirs, their axes are turned by R, and there is no distortion. `stereo`: whether
+    another camera has the same frame, as the second of a stereo pair has in ROS: then the last column of P holds its position
+    in it. Raises `CalibrationProblem` when it is not calibrated, or its lens model is none of those that `Camera` has.
     """
     mount, mount_T_cam = pose
     model, distortion = "none", tuple[float, ...]()
@@ -69,7 +66,13 @@ def camera_from_info(
         model, distortion = _lens(info)
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(K).all()):
         raise CalibrationProblem(f"its focal lengths are {K[0, 0]:g} and {K[1, 1]:g} px: the camera is not calibrated")
-    K, (width, height) = _reduced(info, K)
+    # The images may be a region of the sensor, binned; camera matrix and size are given for the whole.
+    binning, roi = np.array([max(1, int(info.binning_x)), max(1, int(info.binning_y))]), info.roi
+    whole = roi if roi.width and roi.height else info
+    width, height = (np.array([int(whole.width), int(whole.height)]) // binning).tolist()
+    K = K.copy()
+    K[:2, 2] -= [int(roi.x_offset), int(roi.y_offset)]
+    K[:2] /= binning[:, None]
     if not (width > 0 and height > 0):
         raise CalibrationProblem(f"its size is {width}x{height} px")
     return Camera(name, width, height, K, mount, mount_T_cam, model, distortion)
@@ -94,30 +97,16 @@ def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
     return "brown", tuple(np.append(values, np.zeros(length - len(values))).tolist())
 
 
-def _reduced(info: Any, K: Array) -> tuple[Array, tuple[int, int]]:
-    """Camera matrix and size of the images, which may be a region of the sensor, binned; both are given for the whole."""
-    binning = np.array([max(1, int(info.binning_x)), max(1, int(info.binning_y))])
-    roi = info.roi
-    size = np.array([int(info.width), int(info.height)])
-    if roi.width and roi.height:
-        size = np.array([int(roi.width), int(roi.height)])
-    K = K.copy()
-    K[:2, 2] -= [int(roi.x_offset), int(roi.y_offset)]
-    K[:2] /= binning[:, None]
-    width, height = (size // binning).tolist()
-    return K, (width, height)
-
-
-def _field(info: Any, name: str) -> Any:
-    """Return D, K, R or P, which ROS 2 writes in lower case."""
-    return getattr(info, name, None) if hasattr(info, name) else getattr(info, name.lower())
-
-
 def _matrix(info: Any, name: str, shape: tuple[int, int]) -> Array:
     values = np.asarray(_field(info, name), dtype=np.float64)
     if values.size != shape[0] * shape[1]:
         raise CalibrationProblem(f"{name} has {values.size} values, expected {shape[0] * shape[1]}")
     return values.reshape(shape)
+
+
+def _field(info: Any, name: str) -> Any:
+    """Return D, K, R or P, which ROS 2 writes in lower case."""
+    return getattr(info, name if hasattr(info, name) else name.lower())
 
 
 # Encodings of sensor_msgs/image_encodings.hpp: channels, bytes of each, conversion of OpenCV to BGR.
@@ -137,11 +126,7 @@ ENCODINGS: dict[str, tuple[int, int, str]] = {
 
 
 def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """Convert a decoded Image to (H, W, 3) uint8 BGR; of 16 bits the upper 8 are kept.
-
-    Raises `RecordError` for an unknown encoding, fewer bytes than width, height and step promise, or a size that is not
-    that of the calibration.
-    """
+    """Convert a decoded Image to (H, W, 3) uint8 BGR; of 16 bits the upper 8 are kept; `RecordError` where that is impossible."""
     import cv2
 
     width, height, step = int(message.width), int(message.height), int(message.step)
@@ -193,42 +178,23 @@ MAX_CLOCK_OFFSET_NS = 60e9
 DEFAULT_PERIOD_NS = 1e8
 
 
-def find_time_field(names: list[str], chosen: str = "") -> str | None:
-    """Find the field of the points' times; None where there is none."""
-    if chosen:
-        return chosen if chosen in names else None
-    return next((name for name in names if name.lower() in TIME_FIELDS), None)
-
-
 def sweep_from(message: Any, t_ns: int, period_ns: float, settings: LidarTopic, where: str) -> Sweep:
-    """Build a sweep from a decoded PointCloud2.
-
-    `t_ns`: its stamp. `period_ns`: time between two sweeps, by which the unit of the times is recognized. `where`:
-    names the message in errors. Raises `RecordError` when fields, sizes and data contradict each other.
-    """
+    """Build a sweep from a decoded PointCloud2; by `period_ns` between two sweeps the unit of the times is recognized."""
     points = point_table(message, where)
-    missing = [name for name in "xyz" if name not in (points.dtype.names or ())]
+    names = points.dtype.names or ()
+    missing = [name for name in "xyz" if name not in names]
     if missing:
-        raise RecordError(
-            f"{where}: the points have no field '{missing[0]}', only {', '.join(points.dtype.names or ())}"
-        )
-    xyz = np.stack(
-        [points[name].astype(np.float64 if points[name].dtype.itemsize == 8 else np.float32) for name in "xyz"], 1
-    )
+        raise RecordError(f"{where}: the points have no field '{missing[0]}', only {', '.join(names)}")
+    kinds = [np.float64 if points[name].dtype.itemsize == 8 else np.float32 for name in "xyz"]
+    xyz = np.stack([points[name].astype(kind) for name, kind in zip("xyz", kinds)], 1)
     # Drivers mark rays without a return by NaN or by zeros.
     kept = np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)
     xyz = xyz[kept]
-    name = find_time_field(list(points.dtype.names or ()), settings.time_field)
-    offset = None if name is None else offsets_ns(points[name][kept], t_ns, period_ns, settings)
+    timed = [n for n in names if (n == settings.time_field if settings.time_field else n.lower() in TIME_FIELDS)]
+    offset = offsets_ns(points[timed[0]][kept], t_ns, period_ns, settings) if timed else None
     strength = find_intensity_field(points.dtype)
-    return sweep_of(
-        xyz,
-        t_ns,
-        offset,
-        "lidar",
-        t_ns if settings.compensated else None,
-        None if strength is None else points[strength][kept],
-    )
+    intensity = None if strength is None else points[strength][kept]
+    return sweep_of(xyz, t_ns, offset, "lidar", t_ns if settings.compensated else None, intensity)
 
 
 def point_table(message: Any, where: str) -> NDArray[Any]:
@@ -281,12 +247,19 @@ def offsets_ns(values: NDArray[Any], t_ns: int, period_ns: float, settings: Lida
         return None if values.ndim != 1 else np.zeros(0, dtype=np.int64)
     low = values.min()
     span = float(values.max()) - float(low) if values.dtype.kind == "f" else float(int(values.max()) - int(low))
-    unit_ns = UNITS_NS.get(settings.time_unit) or _recognized_unit_ns(span, period_ns)
+    unit_ns = UNITS_NS.get(settings.time_unit)
+    if unit_ns is None and span > 0:
+        ratio = {unit: abs(np.log(span * unit / period_ns)) for unit in UNITS_NS.values()}
+        best = min(ratio, key=ratio.__getitem__)
+        unit_ns = best if ratio[best] <= np.log(MAX_SPAN_RATIO) else None
     if unit_ns is None or not np.isfinite(span):
         return None
     # The difference to the first is exact also for large clock values.
     forward: NDArray[np.int64] = np.round((values - low).astype(np.float64) * unit_ns).astype(np.int64)
-    first_ns = _nanoseconds(low, unit_ns)
+    # Whole numbers of any size are converted exactly.
+    whole = int(low)
+    rest = 0 if isinstance(low, np.integer) else round((float(low) - whole) * unit_ns)
+    first_ns = whole * round(unit_ns) + rest
     if settings.stamp != "auto":
         return forward if settings.stamp == "start" else forward - forward.max()
     if abs(first_ns) <= MAX_RELATIVE_NS:
@@ -294,40 +267,24 @@ def offsets_ns(values: NDArray[Any], t_ns: int, period_ns: float, settings: Lida
     return forward + (first_ns - t_ns if abs(first_ns - t_ns) <= MAX_CLOCK_OFFSET_NS else 0)
 
 
-def _recognized_unit_ns(span: float, period_ns: float) -> float | None:
-    if span <= 0:
-        return None
-    ratio = {unit: abs(np.log(span * unit / period_ns)) for unit in UNITS_NS.values()}
-    best = min(ratio, key=ratio.__getitem__)
-    return best if ratio[best] <= np.log(MAX_SPAN_RATIO) else None
-
-
-def _nanoseconds(value: Any, unit_ns: float) -> int:
-    """Convert one value; whole numbers of any size exactly."""
-    if isinstance(value, np.integer):
-        return int(value) * round(unit_ns)
-    whole = int(value)
-    return whole * round(unit_ns) + round((float(value) - whole) * unit_ns)
-
-
 def camera_stream(bag: Bag, chosen: CameraTopic, stamped: Stamped, camera: Camera) -> Stream:
     """Stream of the images of a camera; of compressed ones also as files."""
     topic, size_px = bag.topics[chosen.topic], (camera.width_px, camera.height_px)
     compressed = topic.msgtype == COMPRESSED
 
-    def read(i: int) -> NDArray[np.uint8]:
-        row = int(stamped.row[i])
-        message, where = decode(bag, topic, row), bag.where(topic, row)
-        # The first bytes decide what a compressed one is, as drivers write any text as its format.
-        return (
-            decode_image(encoded_from(message, where), where, size_px)
-            if compressed
-            else image_from(message, where, size_px)
-        )
-
     def encoded(i: int) -> bytes:
         row = int(stamped.row[i])
         return encoded_from(decode(bag, topic, row), bag.where(topic, row))
+
+    def read(i: int) -> NDArray[np.uint8]:
+        row = int(stamped.row[i])
+        where = bag.where(topic, row)
+        # The first bytes decide what a compressed one is, as drivers write any text as its format.
+        return (
+            decode_image(encoded(i), where, size_px)
+            if compressed
+            else image_from(decode(bag, topic, row), where, size_px)
+        )
 
     return Stream(camera.name, stamped.t_ns, read, encoded if compressed else None)
 
@@ -344,15 +301,8 @@ def lidar_stream(bag: Bag, name: str, chosen: LidarTopic, stamped: Stamped) -> S
             sweep = messages.sweep_from_livox(bag.read(topic, row), topic.encoding, t_ns, chosen, where)
         else:
             sweep = sweep_from(decode(bag, topic, row), t_ns, period_ns, chosen, where)
-        return _later(sweep, offset_ns)
+        later_ns = None if sweep.t_ns is None else sweep.t_ns + offset_ns
+        compensated_ns = None if sweep.compensated_ns is None else sweep.compensated_ns + offset_ns
+        return replace(sweep, stamp_ns=sweep.stamp_ns + offset_ns, t_ns=later_ns, compensated_ns=compensated_ns)
 
     return Stream(name, stamped.t_ns, read)
-
-
-def _later(sweep: Sweep, offset_ns: int) -> Sweep:
-    """Move all stamps of a sweep."""
-    if not offset_ns:
-        return sweep
-    t_ns = None if sweep.t_ns is None else sweep.t_ns + offset_ns
-    compensated_ns = None if sweep.compensated_ns is None else sweep.compensated_ns + offset_ns
-    return replace(sweep, stamp_ns=sweep.stamp_ns + offset_ns, t_ns=t_ns, compensated_ns=compensated_ns)

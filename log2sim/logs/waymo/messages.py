@@ -7,7 +7,7 @@ A field is a key (number << 3 | type, a varint) and its value: a varint, 8 or 4 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -30,17 +30,6 @@ class WireError(ValueError):
     """Bytes that are no protocol buffer of the expected form."""
 
 
-class Memory:
-    """A message in memory."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data = data
-
-    def peek(self, begin: int, count: int) -> bytes:
-        """Return up to `count` bytes at an offset."""
-        return self.data[begin : begin + count]
-
-
 class Field(NamedTuple):
     """A field of a message."""
 
@@ -59,14 +48,14 @@ class Field(NamedTuple):
         raise WireError(f"field {self.number} is of wire type {self.kind}, expected a floating-point number")
 
 
-def fields(source: Memory | RecordWindow, begin: int, end: int) -> Iterator[Field]:
-    """Walk the fields of the message in a span; values of type BYTES are skipped.
+def fields(peek: Callable[[int, int], bytes], begin: int, end: int) -> Iterator[Field]:
+    """Walk the fields of the message in a span; `peek` gives up to so many bytes at an offset, values of type BYTES are skipped.
 
     Raises `WireError` when a field leaves the span or is of an unknown wire type, or there are more than `MAX_FIELDS`.
     """
     count = 0
     while begin < end:
-        head = source.peek(begin, min(2 * MAX_VARINT_BYTES, end - begin))
+        head = peek(begin, min(2 * MAX_VARINT_BYTES, end - begin))
         key, used = _varint(head, 0)
         number, kind = key >> 3, key & 7
         value = 0
@@ -93,7 +82,7 @@ def fields(source: Memory | RecordWindow, begin: int, end: int) -> Iterator[Fiel
 
 def fields_of(data: bytes) -> Iterator[Field]:
     """Walk the fields of a message in memory."""
-    return fields(Memory(data), 0, len(data))
+    return fields(lambda begin, count: data[begin : begin + count], 0, len(data))
 
 
 def doubles_by_number(data: bytes) -> list[tuple[int, float]]:
@@ -131,13 +120,11 @@ def varints(data: bytes) -> list[int]:
 
 def text(data: bytes, field: Field) -> str:
     """Return the value of a string field as printable characters; `WireError` when it is too long for a name."""
-    if field.end - field.begin > MAX_TEXT_BYTES:
-        raise WireError(
-            f"field {field.number} is a text of {field.end - field.begin} bytes, expected at most {MAX_TEXT_BYTES}"
-        )
-    return "".join(
-        c if c.isprintable() else "?" for c in data[field.begin : field.end].decode("utf-8", errors="replace")
-    )
+    size = field.end - field.begin
+    if size > MAX_TEXT_BYTES:
+        raise WireError(f"field {field.number} is a text of {size} bytes, expected at most {MAX_TEXT_BYTES}")
+    words = data[field.begin : field.end].decode("utf-8", errors="replace")
+    return "".join(c if c.isprintable() else "?" for c in words)
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
@@ -176,12 +163,10 @@ class FrameIndex:
 
 
 def read_index(window: RecordWindow) -> FrameIndex:
-    """Read offsets and small fields of a Frame; neither images nor range images.
-
-    Raises `WireError` when the record is no Frame.
-    """
+    """Read offsets and small fields of a Frame; neither images nor range images. `WireError` when the record is none."""
     index = FrameIndex()
-    for f in fields(window, 0, window.size):
+    spans = {6: index.labels, 8: index.camera_labels, 9: index.projected_labels}
+    for f in fields(window.peek, 0, window.size):
         if f.kind == VARINT and f.number == 2:
             index.stamp_us = f.value
         if f.kind != BYTES:
@@ -195,20 +180,16 @@ def read_index(window: RecordWindow) -> FrameIndex:
             _add_image(window, span, index)
         elif f.number == 5:
             _add_laser(window, span, index)
-        elif f.number == 6:
-            index.labels.append(span)
+        elif f.number in spans:
+            spans[f.number].append(span)
         elif f.number == 7:
             index.no_label_zones += 1
-        elif f.number == 8:
-            index.camera_labels.append(span)
-        elif f.number == 9:
-            index.projected_labels.append(span)
     return index
 
 
 def _add_image(window: RecordWindow, span: Span, index: FrameIndex) -> None:
     number, jpeg, pose, times = 0, (0, 0), None, {5: 0.0, 6: 0.0, 7: 0.0, 8: 0.0}
-    for f in fields(window, *span):
+    for f in fields(window.peek, *span):
         if f.number == 1:
             number = f.value
         elif f.number == 2:
@@ -223,7 +204,7 @@ def _add_image(window: RecordWindow, span: Span, index: FrameIndex) -> None:
 
 def _add_laser(window: RecordWindow, span: Span, index: FrameIndex) -> None:
     number, filled = 0, False
-    for f in fields(window, *span):
+    for f in fields(window.peek, *span):
         if f.number == 1:
             number = f.value
         elif f.number in (2, 3):
@@ -234,7 +215,7 @@ def _add_laser(window: RecordWindow, span: Span, index: FrameIndex) -> None:
 
 def segment_name(window: RecordWindow, span: Span) -> str:
     """Return the name of the segment from the span of a Context."""
-    for f in fields(window, *span):
+    for f in fields(window.peek, *span):
         if f.number == 1 and f.kind == BYTES:
             value = take_index(window, (f.begin, f.end))
             return text(value, f._replace(begin=0, end=len(value)))
@@ -244,21 +225,16 @@ def segment_name(window: RecordWindow, span: Span) -> str:
 def read_calibration(
     context: bytes,
 ) -> tuple[dict[int, CameraCalibration], dict[int, LaserCalibration], dict[str, str]]:
-    """Read cameras, LiDARs and statistics (time of day, location, weather) of a Context.
-
-    Raises `WireError` for a calibration that is incomplete; names it.
-    """
-    cameras, lasers, stats = {}, {}, {}
+    """Read cameras, LiDARs and statistics (time of day, location, weather) of a Context; `WireError` names what is incomplete."""
+    cameras, lasers, stats = dict[int, CameraCalibration](), dict[int, LaserCalibration](), dict[str, str]()
     for f in fields_of(context):
         if f.kind != BYTES:
             continue
         data = context[f.begin : f.end]
         if f.number == 2:
-            number, camera = _camera(data)
-            cameras[number] = camera
+            number, cameras[number] = _camera(data)
         elif f.number == 3:
-            number, laser = _laser(data)
-            lasers[number] = laser
+            number, lasers[number] = _laser(data)
         elif f.number == 4:
             names = {2: "time_of_day", 3: "location", 4: "weather"}
             stats = {names[s.number]: text(data, s) for s in fields_of(data) if s.number in names}
@@ -292,10 +268,7 @@ def _laser(data: bytes) -> tuple[int, LaserCalibration]:
 
 
 def read_box(data: bytes, dimensions: int) -> tuple[str, int, list[float]] | None:
-    """Read id, type and box (center, size as length, width[, height], heading) of a Label; None when it has no box.
-
-    `dimensions`: 3, or 2 for a box in an image.
-    """
+    """Read id, type and box (center, size as length, width[, height], heading) of a Label; None when it has no box."""
     found = _by_number(data)
     box = _submessage(data, found, 1)
     if box is None:

@@ -9,7 +9,6 @@ images are read row by row.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -66,10 +65,7 @@ CAMERA_BOXES = ("camera_box", "[CameraBoxComponent]")
 
 
 def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
-    """Read stamps in us and poses (4, 4) of the frames, and remarks on those that are none.
-
-    Raises `LogError` when no row has both.
-    """
+    """Read stamps in us and poses (4, 4) of the frames, and remarks on those that are none; `LogError` when no row has both."""
     columns = read_columns(path, {STAMP: "int", POSE: "floats"})
     found = [(int(t), matrix(cell)) for t, cell in zip(columns[STAMP], columns[POSE])]
     usable = [(t, pose) for t, pose in found if pose is not None and 0 < t < MAX_TIME_S * 10**6]
@@ -124,10 +120,8 @@ def read_laser_calibration(path: Path) -> dict[int, LaserCalibration]:
 
 def image_times(columns: Columns, row: int) -> ImageTimes:
     """Return when the image of a row of the component "camera_image" was taken; NaN counts as unknown."""
-    seconds = [
-        float(columns[name][row]) for name in IMAGE_COLUMNS if name not in (STAMP, CAMERA, f"{IMAGE}.pose.transform")
-    ]
-    return ImageTimes(matrix(columns[f"{IMAGE}.pose.transform"][row]), *(s if np.isfinite(s) else 0.0 for s in seconds))
+    pose, *times = (columns[name][row] for name in IMAGE_COLUMNS if name not in (STAMP, CAMERA))
+    return ImageTimes(matrix(pose), *(float(s) if np.isfinite(s) else 0.0 for s in times))
 
 
 def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int]) -> BoxTable:
@@ -175,45 +169,38 @@ def matrix(cell: Any) -> Any:
     return None if cell is None else rigid(np.asarray(cell, dtype=np.float64))
 
 
-@dataclass(eq=False)
 class SensorRows:
     """A component with one row for each frame and sensor; without any where its file is absent.
 
-    `index`: columns to read at once, with the stamp and the sensor. `names`: sensors by number. `frame_of`: index of
-    the frame of a stamp in us.
+    `index`: columns to read at once, with the stamp and the sensor. `names`: sensors by number. `frame_of`: index of the frame of a
+    stamp in us. `kinds`: what columns hold that are large and read row by row; `optional` of them may be absent.
+
+    `rows`: row of a frame by index and sensor by number. `columns`: those of `index`. `note`: what was left out, if anything.
     """
 
-    path: Path
-    index: Mapping[str, Kind]
-    names: Mapping[int, str]
-    frame_of: Mapping[int, int]
-    kinds: Mapping[str, Kind]  # what columns hold that are large and read row by row
-    optional: Collection[str] = ()  # names out of these that may be absent
-    # row of a frame by index and sensor by number
-    rows: dict[tuple[int, int], int] = field(default_factory=dict)
-    columns: Columns = field(default_factory=dict)  # the columns of `index`
-    note: str = ""  # what was left out; empty where nothing was
-
-    def __post_init__(self) -> None:
-        """Read the index."""
+    def __init__(
+        self, path: Path, index: Mapping[str, Kind], names: Mapping[int, str], frame_of: Mapping[int, int],
+        kinds: Mapping[str, Kind], optional: Collection[str] = (),
+    ) -> None:  # fmt: skip
+        self.path, self.note = path, ""
+        self.rows: dict[tuple[int, int], int] = {}
+        self.columns: Columns = {}
         self._files: dict[int, ParquetRows] = {}
-        if not is_present(self.path):
+        if not is_present(path):
             return
-        self.columns = read_columns(self.path, self.index)
-        sensor_column = CAMERA if CAMERA in self.index else next(name for name in self.index if name != STAMP)
-        sensor = numbers_of(self.columns[sensor_column], self.names)
-        frame = np.array([self.frame_of.get(int(t), -1) for t in self.columns[STAMP]], dtype=np.int64)
+        self.columns = read_columns(path, index)
+        sensor = numbers_of(self.columns[CAMERA if CAMERA in index else LASER], names)
+        frame = np.array([frame_of.get(int(t), -1) for t in self.columns[STAMP]], dtype=np.int64)
         known = np.flatnonzero((frame >= 0) & (sensor > 0))
         self.rows = {(int(frame[row]), int(sensor[row])): int(row) for row in known}
         if len(self.rows) < len(frame):
             lost = len(frame) - len(self.rows)
-            self.note = f"{self.path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out"
+            self.note = f"{path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out"
         # Rows can only be read on: a file with one sensor after the other is read from several places at once.
         by_sensor = bool(np.any(np.diff(frame[known]) < 0))
-        shared = ParquetRows(self.path, self.kinds, optional=self.optional)
+        shared = ParquetRows(path, kinds, optional=optional)
         for number in {number for _, number in self.rows}:
-            own = ParquetRows(self.path, self.kinds, optional=self.optional) if by_sensor else shared
-            self._files[number] = own
+            self._files[number] = ParquetRows(path, kinds, optional=optional) if by_sensor else shared
 
     def read(self, frame: int, sensor: int) -> Row | None:
         """Return the record of a frame and sensor; None where there is no row, `RecordError` for one that cannot be read."""
@@ -341,10 +328,8 @@ class _SegmentFolder:
 
 def _matrices(*names: str) -> dict[str, Kind]:
     """Columns of matrices, each with its values and its shape."""
-    return {f"{name}.{part}": kind for name in names for part, kind in _PARTS.items()}
-
-
-_PARTS: dict[str, Kind] = {"values": "floats", "shape": "ints"}
+    parts: dict[str, Kind] = {"values": "floats", "shape": "ints"}
+    return {f"{name}.{part}": kind for name in names for part, kind in parts.items()}
 
 
 def _image_of(row: Row | None, name: str) -> NDArray[np.float32] | None:

@@ -94,14 +94,11 @@ def checked(returns: list[NDArray[np.float32]], poses: NDArray[np.float32] | Non
 def points_of(
     images: RangeImages, laser: LaserCalibration, world_T_vehicle: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Turn the range images of one LiDAR into points.
+    """Turn the range images of one LiDAR into points (N, 3), m, of all returns, in the lidar's frame as it was at `world_T_vehicle`.
 
-    `world_T_vehicle` (4, 4) float64: pose that defines the vehicle's frame. Returns `xyz_m` (N, 3) float32, m, lidar
-    frame: of all returns, in the lidar's frame as it was at `world_T_vehicle`; `turn` (N,) float64: share of the turn,
-    in [0, 1), at which the middle of each point's column was measured.
-
-    After comments of RangeImage in dataset.proto: each pixel is taken to the world by the pose of the vehicle at its own time
-    and back by `world_T_vehicle`. Range images without such poses are made of points in the vehicle's frame already.
+    Also the share (N,) of the turn, in [0, 1), at which the middle of each point's column was measured. After comments of RangeImage
+    in dataset.proto: each pixel is taken to the world by the pose of the vehicle at its own time and back by `world_T_vehicle`,
+    which defines the vehicle's frame. Range images without such poses are made of points in the vehicle's frame already.
     """
     height, width = images.returns[0].shape[:2]
     inclination, azimuth = row_inclinations(laser, height), column_azimuths(laser, width)
@@ -177,15 +174,12 @@ MAX_COORDINATE_M = 1e4
 def labels_of(
     table: BoxTable, times: FrameTimes, map_T_vehicle: Array, top: LaserCalibration | None, notes: list[str]
 ) -> Labels:
-    """Turn 3D boxes in the vehicle's frames into labels in the map.
-
-    `table`: `frame` counts the frames in order. `map_T_vehicle` (F, 4, 4) float64: poses that define the vehicle's
-    frames. `top`: none puts every label at the stamp of its frame's pose. `notes`: takes what was left out.
+    """Turn 3D boxes in the vehicle's frames, whose poses are `map_T_vehicle` (F, 4, 4), into labels in the map.
 
     A box fits the points where they were measured, and the TOP LiDAR scans different directions at different times: the box
-    has the time of its direction. The data set states no times of boxes; where it derives boxes from them (`camera_synced_box`) it calls them boxes at the
-    start of the frame. On its sample the camera's label of a cyclist at 8.5 m/s is 13 px from the box at this time, 24 px
-    from the box at the start; its box is 37 px wide.
+    has the time of its direction, without that LiDAR the stamp of its frame's pose. The data set states no times of boxes; where it
+    derives boxes from them (`camera_synced_box`) it calls them boxes at the start of the frame. On its sample the camera's label of
+    a cyclist at 8.5 m/s is 13 px from the box at this time, 24 px from the box at the start; its box is 37 px wide.
     """
     if table.lost:
         notes.append(f"{table.lost} labels are damaged or of no frame, and left out")
@@ -198,15 +192,9 @@ def labels_of(
     pose = map_T_vehicle[table.frame]
     turned = pose[:, :3, :3] @ rotation_from_rpy(0.0, 0.0, table.heading_rad)
     return Labels(
-        t_ns,
-        table.track_id,
-        _categories(kind),
-        apply(pose, table.center),
-        table.size,
-        yaw_of(turned),
-        kind=kind,
-        labeled_ns=times.pose_ns,
-    )
+        t_ns, table.track_id, _categories(kind), apply(pose, table.center), table.size, yaw_of(turned),
+        kind=kind, labeled_ns=times.pose_ns,
+    )  # fmt: skip
 
 
 def _road_users(table: BoxTable, notes: list[str]) -> tuple[BoxTable, NDArray[np.str_]]:
@@ -225,8 +213,7 @@ def _road_users(table: BoxTable, notes: list[str]) -> tuple[BoxTable, NDArray[np
 def image_labels_of(table: BoxTable, stamps_ns: NDArray[np.int64], size_px: tuple[int, int]) -> ImageLabels:
     """Turn boxes of one camera's images into labels, cut at the border of the image.
 
-    `table`: `frame` counts the frames in order. `stamps_ns` (F,) int64: of the camera's image in each frame; negative
-    where there is none. `size_px` (int, int): width and height.
+    `stamps_ns` (F,): of the camera's image in each frame; negative where there is none.
     """
     kind = np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
     box = np.concatenate([table.center - table.size / 2, table.center + table.size / 2], axis=1)

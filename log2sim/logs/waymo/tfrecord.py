@@ -1,8 +1,5 @@
 """TFRecord files: records by their lengths, with their checksums.
 
-The register of a CRC is linear over GF(2) in the message: it can be cut into lanes whose remainders matrices join, as zlib's
-`crc32_combine` does. Lane k holds the words k, k + LANES, k + 2 LANES, ..., so that one step takes a contiguous row.
-
 A record is its length (uint64, little-endian), the masked CRC-32C of these 8 bytes, the data and their masked CRC-32C
 (https://www.tensorflow.org/tutorials/load_data/tfrecord).
 """
@@ -30,12 +27,6 @@ POLYNOMIAL = 0x82F63B78
 # TFRecord rotates a CRC and adds this, so that the CRC of data which hold CRCs is not degenerate (TensorFlow, crc32c.h).
 MASK_DELTA = 0xA282EAD8
 
-# The fastest of 2048 to 32768 lanes for records of some MB, where the joining of the lanes counts.
-LOG2_LANES = 12
-LANES = 1 << LOG2_LANES
-# Shorter messages are taken byte by byte.
-MIN_LANED_BYTES = 1024
-
 
 def masked_crc32c(data: bytes) -> int:
     """Compute the masked CRC-32C that TFRecord files hold."""
@@ -44,74 +35,52 @@ def masked_crc32c(data: bytes) -> int:
 
 
 def crc32c(data: bytes) -> int:
-    """Compute the CRC-32C (Castagnoli) of a message."""
-    words = len(data) // 4 if len(data) >= MIN_LANED_BYTES else 0
-    register = _laned(np.frombuffer(data, "<u4", words)) if words else 0xFFFFFFFF
+    """Compute the CRC-32C (Castagnoli) of a message.
+
+    The register is linear over GF(2) in the message: the first half of the words, taken past as many zeros as the second half has
+    words, is added to that half, until one word is left (zlib's `crc32_combine` joins CRCs in this way).
+    """
+    words, register = np.frombuffer(data, "<u4", len(data) // 4), 0xFFFFFFFF
+    if len(words):
+        levels = (len(words) - 1).bit_length()
+        # Zeros before the message leave an empty register empty; the first register is added to the first word.
+        state = np.zeros(1 << levels, dtype="<u4")
+        state[-len(words) :] = words
+        state[-len(words)] ^= np.uint32(register)
+        for level in reversed(range(levels)):
+            state = _past_zeros(level, state[: 1 << level]) ^ state[1 << level :]
+        register = int(_past_zeros(0, state)[0])
     table = _byte_table()
-    for byte in data[4 * words :]:
+    for byte in data[4 * len(words) :]:
         register = int(table[(register ^ byte) & 0xFF]) ^ (register >> 8)
     return register ^ 0xFFFFFFFF
 
 
-def _laned(words: Words) -> int:
-    """Return the register after words (n,), from the first register on."""
-    head = len(words) % LANES or min(len(words), LANES)
-    # Zeros before the message leave an empty register empty; the first register is added to the first word.
-    state = np.zeros(LANES, dtype=np.uint32)
-    state[LANES - head :] = words[:head]
-    state[LANES - head] ^= np.uint32(0xFFFFFFFF)
-    low_table, high_table = _row_tables()
-    low, high = np.empty(LANES, np.intp), np.empty(LANES, np.intp)
-    from_low, from_high = np.empty_like(state), np.empty_like(state)
-    for row in words[head:].reshape(-1, LANES):
-        np.bitwise_and(state, np.uint32(0xFFFF), out=low)
-        np.right_shift(state, np.uint32(16), out=high)
-        # With "raise", the default, NumPy would buffer the output; all indices have 16 bits.
-        low_table.take(low, out=from_low, mode="wrap")
-        high_table.take(high, out=from_high, mode="wrap")
-        np.bitwise_xor(from_low, from_high, out=state)
-        state ^= row
-    for level in reversed(range(LOG2_LANES)):
-        half = 1 << level
-        state = _product(_after_words(level), state[:half]) ^ state[half:]
-    return int(_product(_after_words(0), state)[0])
+def _past_zeros(level: int, registers: Words) -> Words:
+    """Return the registers (n,) after 2^level zero words."""
+    of_bytes = registers.view(np.uint8).reshape(-1, 4).T
+    first, second, third, fourth = (table.take(of) for table, of in zip(_word_tables(level), of_bytes))
+    return np.asarray(first ^ second ^ third ^ fourth)
 
 
 @cache
 def _byte_table() -> Words:
     """Register (256,) after one zero byte, by its lowest byte."""
-    table = np.arange(256, dtype=np.uint32)
+    table = np.arange(256, dtype="<u4")
     for _ in range(8):
         table = np.where(table & 1, (table >> 1) ^ np.uint32(POLYNOMIAL), table >> 1)
     return table
 
 
 @cache
-def _after_words(log2_words: int) -> Words:
-    """Matrix over GF(2) that takes a register past 2^k zero words: column b (32,) is the image of bit b."""
-    if log2_words:
-        half = _after_words(log2_words - 1)
-        return _product(half, half)
-    columns = np.uint32(1) << np.arange(32, dtype=np.uint32)
+def _word_tables(level: int) -> Words:
+    """Register (4, 256) after 2^level zero words, by each of its bytes."""
+    registers = np.arange(256, dtype="<u4") << np.array([[0], [8], [16], [24]], dtype="<u4")
+    if level:
+        return _past_zeros(level - 1, _past_zeros(level - 1, registers.ravel())).reshape(4, 256)
     for _ in range(4):
-        columns = _byte_table()[columns & 0xFF] ^ (columns >> 8)
-    return columns
-
-
-@cache
-def _row_tables() -> tuple[Words, Words]:
-    """Return the registers (65536,) after a row of zeros, of the lower and of the upper 16 bits."""
-    bits = np.arange(1 << 16, dtype=np.uint32)
-    return _product(_after_words(LOG2_LANES), bits), _product(_after_words(LOG2_LANES), bits << np.uint32(16))
-
-
-def _product(matrix: Words, registers: Words) -> Words:
-    """Multiply a matrix (32,) and registers (n,) over GF(2)."""
-    out = np.zeros_like(registers)
-    for bit in range(32):
-        # -1 times the bit has all bits set where it is set.
-        out ^= matrix[bit] * ((registers >> np.uint32(bit)) & np.uint32(1))
-    return out
+        registers = np.asarray(_byte_table()[registers & 0xFF] ^ (registers >> 8))
+    return np.asarray(registers)
 
 
 HEADER_BYTES, FOOTER_BYTES = 12, 4
@@ -146,16 +115,26 @@ class RecordFile:
         self._lock = Lock()
 
     def read(self, k: int, what: str) -> bytes:
-        """Return the data of record `k`, checked.
-
-        `what`: names the record in errors. Raises `RecordError` when the file became shorter or the CRC is not that of
-        the data.
-        """
+        """Return the data of record `k`, checked; `what` names it in `RecordError`, if its CRC is wrong or the file became shorter."""
         with self._lock:
             if k in self._kept:
                 self._kept.move_to_end(k)
                 return self._kept[k]
-            data = self._read_checked(k, what)
+            begin, size = self.spans[k]
+            try:
+                with open_regular(self.path) as file:
+                    file.seek(begin)
+                    data, footer = file.read(size), file.read(FOOTER_BYTES)
+            except OSError as error:
+                raise RecordError(f"{self.path} ({what}): cannot be read: {error.strerror}") from None
+            if len(footer) < FOOTER_BYTES:
+                raise RecordError(f"{self.path} ({what}): truncated, expected {size} bytes at offset {begin}")
+            stored, computed = struct.unpack("<I", footer)[0], masked_crc32c(data)
+            if stored != computed:
+                raise RecordError(
+                    f"{self.path} ({what}): damaged: the CRC of its {size} bytes at offset {begin} is {computed:#010x}, the file says "
+                    f"{stored:#010x}"
+                )
             self._kept[k] = data
             if len(self._kept) > MAX_KEPT_RECORDS:
                 self._kept.popitem(last=False)
@@ -164,24 +143,6 @@ class RecordFile:
     def window(self, k: int) -> RecordWindow:
         """Open record `k` to read parts of it, without its CRC; to be closed."""
         return RecordWindow(self.path, *self.spans[k])
-
-    def _read_checked(self, k: int, what: str) -> bytes:
-        begin, size = self.spans[k]
-        try:
-            with open_regular(self.path) as file:
-                file.seek(begin)
-                data, footer = file.read(size), file.read(FOOTER_BYTES)
-        except OSError as error:
-            raise RecordError(f"{self.path} ({what}): cannot be read: {error.strerror}") from None
-        if len(footer) < FOOTER_BYTES:
-            raise RecordError(f"{self.path} ({what}): truncated, expected {size} bytes at offset {begin}")
-        stored, computed = struct.unpack("<I", footer)[0], masked_crc32c(data)
-        if stored != computed:
-            raise RecordError(
-                f"{self.path} ({what}): damaged: the CRC of its {size} bytes at offset {begin} is {computed:#010x}, the file says "
-                f"{stored:#010x}"
-            )
-        return data
 
     def _walk(self) -> list[tuple[int, int]]:
         """Find offset and size of the data of all whole records by their lengths."""
