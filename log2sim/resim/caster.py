@@ -143,7 +143,7 @@ def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floa
         t = np.where(rough, along, plane / slope)
     # From the middle of the disc to where the ray meets its plane.
     off2 = t * (t - 2 * along) + away2
-    weight = 1 - off2 / (radius * radius).take(disc)
+    weight = np.asarray(1 - off2 / (radius * radius).take(disc), np.float32)
     facing = np.where(rough, np.float32(1), np.abs(slope))
     met = np.flatnonzero((weight > 0) & (t > MIN_RANGE_M) & (facing > MIN_FACING))
     surfel = (own.take(disc.take(met)) + first).astype(np.int32)
@@ -164,7 +164,8 @@ def _expanded(
 def _along(turn: Floats, axis: int, vector: Floats) -> Floats:
     """Return a coordinate (N,) of vectors (N, 3) that rows (N, 12) of poses turn."""
     first = 4 * axis
-    return turn[:, first] * vector[:, 0] + turn[:, first + 1] * vector[:, 1] + turn[:, first + 2] * vector[:, 2]
+    out: Floats = turn[:, first] * vector[:, 0] + turn[:, first + 1] * vector[:, 1] + turn[:, first + 2] * vector[:, 2]
+    return out
 
 
 @dataclass(frozen=True, eq=False)
