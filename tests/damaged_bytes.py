@@ -25,10 +25,10 @@ def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
 
 
 def result_or_refusal(parse: Callable[[], Any], error: type[Exception], where: str) -> Any:
-    """What a parser returns; None for an error that says where, while any other error passes on."""
+    """What a parser returns; None for an error of one line that says where, while any other error passes on."""
     try:
         return parse()
     except error as problem:
-        if where not in str(problem):
-            raise AssertionError(f"'{problem}' does not say {where}") from problem
+        if where not in str(problem) or "\n" in str(problem):
+            raise AssertionError(f"'{problem}' does not say {where} in one line") from problem
         return None

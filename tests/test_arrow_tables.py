@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from log2sim.errors import LogError, MissingExtra, RecordError
-from log2sim.logs import arrow
 from log2sim.logs.arrow import ParquetRows, read_columns
 
 pa = pytest.importorskip("pyarrow")
@@ -84,12 +82,6 @@ def test_every_kind_of_column_comes_back(tmp_path: Path, name: str, options: dic
     assert [i.tolist() for i in columns["ids"]] == [[], [0], [0, 1], [], [0]]
 
 
-def test_lists_of_a_slice_are_those_of_its_rows(tmp_path: Path) -> None:
-    columns = read_columns(write(tmp_path / "a.feather", table(9).slice(4, 3)), KINDS)
-    assert [len(s) for s in columns["scan"]] == [4, 5, 6]
-    np.testing.assert_allclose(columns["pose"], np.arange(16, 28).reshape(3, 4) / 7)
-
-
 @pytest.mark.parametrize("name", ["a.feather", "a.parquet"])
 @pytest.mark.parametrize(
     ("column", "kind", "words"),
@@ -150,24 +142,3 @@ def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
         read_columns(tmp_path / "a.feather", {"x": "float"})
     with pytest.raises(MissingExtra, match="parquet"):
         ParquetRows(tmp_path / "a.parquet", {"x": "float"}).read(0)
-
-
-@pytest.mark.parametrize("group", [7, 1000])
-def test_rows_in_any_order_are_those_of_the_columns(
-    tmp_path: Path, group: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(arrow, "MAX_KEPT_BYTES", 5_000)
-    path = write(tmp_path / "a.parquet", table(40), row_group_size=group)
-    columns, rows = read_columns(path, KINDS), ParquetRows(path, {**KINDS, "x": "int"}, optional=("x",))
-    assert len(rows) == 40
-
-    def check(k: int) -> None:
-        row = rows.read(k)
-        assert list(row) == list(KINDS)
-        for name, value in row.items():
-            np.testing.assert_array_equal(value, columns[name][k])
-
-    for k in [0, 1, 39, 3, 3, 2, *range(40)]:
-        check(k)
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(check, np.random.default_rng(0).permutation(40).tolist()))

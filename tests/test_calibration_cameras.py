@@ -14,7 +14,6 @@ import pytest
 from log2sim import Config, open_log, pipeline
 from log2sim.datatypes import Finding, Log
 from log2sim.geometry import (
-    Array,
     Camera,
     PoseTrack,
     RollingShutter,
@@ -31,7 +30,6 @@ from log2sim.localization.edges import (
     EdgeView,
     YawEstimate,
     estimate_yaw,
-    find_depth_edges,
     points_in_mount,
     score_angles,
 )
@@ -49,26 +47,6 @@ def yawed(camera: Camera, degrees: float) -> Camera:
 
 
 # Edges of scans
-
-
-def scan(panel_rad: tuple[float, float], panel_m: float, wall_m: float) -> Array:
-    """Points of eight lasers on a round wall and, between two azimuths, on a panel before it."""
-    azimuth, elevation = np.meshgrid(np.radians(np.arange(-30.0, 30.0, 0.2)), np.radians(np.arange(-7.9, 0.0)))
-    azimuth, elevation = azimuth.ravel(), elevation.ravel()
-    near = (azimuth > panel_rad[0]) & (azimuth < panel_rad[1])
-    flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=1) * np.cos(elevation)[:, None]
-    return np.asarray(flat * np.where(near, panel_m, wall_m)[:, None])
-
-
-def test_edges_are_where_a_panel_before_a_wall_ends() -> None:
-    points = scan((np.radians(-2.05), np.radians(3.05)), 10.0, 20.0)
-    index, left = find_depth_edges(points[np.random.default_rng(0).permutation(len(points))])
-    points = points[np.random.default_rng(0).permutation(len(points))][index]
-    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-    assert len(index) == 16
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 10.0)
-    np.testing.assert_allclose(azimuth[left], 3.0, atol=1e-9)
-    np.testing.assert_allclose(azimuth[~left], -2.0, atol=1e-9)
 
 
 # Alignment in a world of posts

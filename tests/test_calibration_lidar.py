@@ -11,10 +11,10 @@ from localization_worlds import HOUSES, drive
 
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log, Stream
-from log2sim.geometry import NS_PER_S, PoseTrack, apply, inverse, rotation_from_rpy
+from log2sim.geometry import NS_PER_S, PoseTrack, inverse, rotation_from_rpy
 from log2sim.localization.clocks import OFFSET, PITCH, YAW, check_lidars, fit_clock_and_mount, turn_mount
 from log2sim.localization.replaced import shift_stream
-from log2sim.localization.surfaces import MAX_SWEEPS, SweepPairs, adjoint_of, choose_sweeps, exp_of, log_of, pair_sweeps
+from log2sim.localization.surfaces import MAX_SWEEPS, SweepPairs, choose_sweeps, exp_of, log_of, pair_sweeps
 from log2sim.plan import Sensors
 
 TOP = "top"
@@ -200,15 +200,3 @@ def test_of_a_long_log_a_few_sweeps_are_looked_at_where_the_ego_turns() -> None:
     assert len(rows) <= MAX_SWEEPS
     assert np.sum((t_s[rows] > 399) & (t_s[rows] < 404)) >= 5
     assert len(choose_sweeps(PoseTrack(t_ns, poses), t_ns, (0, 5 * NS_PER_S))) == MAX_SWEEPS
-
-
-# --- twists
-
-
-def test_twists_are_carried_over_by_the_adjoint() -> None:
-    rng = np.random.default_rng(0)
-    a_T_b, twist = exp_of(rng.normal(0, [5, 5, 5, 1, 1, 1])), 1e-6 * rng.normal(size=6)
-    assert log_of(exp_of(twist)) == pytest.approx(twist, rel=1e-6)
-    moved = a_T_b @ exp_of(twist) @ inverse(a_T_b)
-    assert log_of(moved) == pytest.approx(adjoint_of(a_T_b) @ twist, abs=1e-10)
-    assert apply(moved, np.zeros((1, 3)))[0] == pytest.approx(log_of(moved)[:3])

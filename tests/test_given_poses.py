@@ -14,7 +14,6 @@ from log2sim.agents.estimate import with_pose_errors
 from log2sim.datatypes import Agent, Finding, Log, Stream, Waypoints
 from log2sim.geometry import Array, PoseTrack, rotation_from_rpy, transform, wrap_angle, yaw_of
 from log2sim.localization.given_poses import MAX_SIGMA_M, CheckedPoses, check_poses, list_faults
-from log2sim.localization.path import POSITION_PRIOR, YAW_PRIOR, fit_path
 
 NS = 1_000_000_000
 
@@ -256,32 +255,6 @@ def test_a_gap_that_is_too_long_is_told_with_its_start_and_length() -> None:
 
 
 # --- the fit
-
-
-def test_the_fit_reproduces_a_parabola_and_extrapolates_it() -> None:
-    t = np.linspace(0, 2, 30)
-    asked = np.array([0.5, 1.77, 2.3])
-
-    def path(t: Array) -> Array:
-        return np.stack([3 + 8 * t - t**2, 0.5 * t], axis=1)
-
-    found = fit_path(t, path(t), 1e-3, asked, POSITION_PRIOR)
-    np.testing.assert_allclose(found.value, path(asked), atol=5e-3)
-    assert found.sigma[2] > 5 * found.sigma[0]
-
-
-def test_sigmas_of_the_fit_are_those_of_paths_drawn_from_its_prior() -> None:
-    rng, dt = np.random.default_rng(0), 0.02
-    t = np.arange(0, 4, dt)
-    seen = (t < 1.2) | (t > 2.6)
-    ratios = []
-    for _ in range(60):
-        jerk = rng.normal(0, np.sqrt(YAW_PRIOR.density / dt), len(t))
-        yaw = np.cumsum(np.cumsum(np.cumsum(jerk) * dt) * dt) * dt
-        measured = yaw[seen] + rng.normal(0, 0.002, seen.sum())
-        found = fit_path(t[seen][::3], measured[::3, None], 0.002, t[~seen][::5], YAW_PRIOR)
-        ratios.append((found.value[:, 0] - yaw[~seen][::5]) / found.sigma)
-    assert np.std(ratios) == pytest.approx(1.0, abs=0.3)
 
 
 # --- what is placed by the poses

@@ -1,10 +1,11 @@
-"""Logs of other kinds than the sample: slow and fast sensors, left-hand traffic, long trucks."""
+"""Logs of other kinds than the sample: slow and fast sensors, a minibus at the curb."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from plain_settings import AGENTS_ALONE
 from worlds import tiny_log
@@ -65,3 +66,16 @@ def test_everybody_is_found_at_any_rate(world_at_20_hz: tuple[Log, Scenario], ra
     assert found["precision"] >= 0.9
     assert found["position_median_m"] < 0.3
     assert found["id_switches"] == 0
+
+
+def test_a_minibus_at_the_curb_neither_slides_nor_turns_nor_grows() -> None:
+    size = (7.5, 2.3, 2.9)
+    parked = {"id": "minibus", "category": "bus", "size_m": list(size), "pose": [11.75, -3.55, 0.0]}
+    ego = {"waypoints": [[0.0, 0.0, 8.0], [60.0, 0.0, 8.0]], "poses": "poses"}
+    log, _ = tiny_log([parked], duration_s=2.6, ego=ego, **sensors())
+    (found,) = reconstruct(log, LABELS).scenario.others
+    assert found.static
+    assert found.size_m[:2] == pytest.approx(size[:2], abs=0.5)
+    w = found.waypoints
+    assert np.hypot(w.x_m - 11.75, w.y_m + 3.55).max() < 0.3
+    assert np.degrees(np.abs(np.sin(w.yaw_rad))).max() < 3.0

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from command_line import run
-from log_encoders import argoverse, kitti, kitti_object, native, pandaset, ros, waymo_parquet
+from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
 from log_encoders.world import world_log
 
 from log2sim.datatypes import Log
@@ -54,6 +54,11 @@ def test_symbolic_links_may_stay_inside_but_not_leave(log_folder: Path) -> None:
             inside(log_folder, relative, "log.json")
 
 
+def db3(log: Log, folder: Path) -> Path:
+    return ros.encode_as(log, folder, ros.Style(container="db3"))
+
+
+# How a log is written, and which of its files becomes a link.
 FORMATS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "log2sim": (native.encode, "front/*.jpg"),
     "kitti": (kitti.encode_raw, "*/*/image_02/data/*"),
@@ -63,6 +68,13 @@ FORMATS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "argoverse2": (argoverse.encode, "sensors/lidar/*.feather"),
     "waymo-parquet": (waymo_parquet.encode, "vehicle_pose/*.parquet"),
     "ros": (lambda log, folder: ros.encode_as(log, folder, ros.Style("bag")).parent, "*.bag"),
+    "ros metadata": (db3, "metadata.yaml"),
+    "ros database": (db3, "*.db3"),
+    "nuscenes log": (nuscenes.encode_world, "v1.0-mini/log.json"),
+    "nuscenes scenes": (nuscenes.encode_world, "v1.0-mini/scene.json"),
+    "nuscenes poses": (nuscenes.encode_world, "v1.0-mini/ego_pose.json"),
+    "waymo": (lambda log, folder: waymo.encode(log, folder).parent, "*.tfrecord"),
+    "log2sim manifest": (native.encode, "log.json"),
 }
 
 
@@ -76,14 +88,14 @@ def test_a_link_to_another_file_needs_the_option_in_every_format(tmp_path: Path,
     os.replace(file, secret)
     file.symlink_to(secret)
     with pytest.raises(LogError, match=r"leaves the log folder.*pass --follow-links"):
-        open_log(path, format=name)
-    assert open_log(path, format=name, follow_links=True).streams
+        open_log(path)
+    assert open_log(path, follow_links=True).streams
     alias = tmp_path / "alias" / path.name
     alias.parent.mkdir()
     alias.symlink_to(path)
     file.unlink()
     os.replace(secret, file)
-    assert open_log(alias, format=name).streams
+    assert open_log(alias).streams
 
 
 def test_the_option_of_the_command_line(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
-from log_encoders.world import RED, labels_at, world_log
+from log_encoders.world import labels_at, world_log
 
 from log2sim.datatypes import CATEGORIES, Labels, Log, Stream, Sweep
 from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError
@@ -511,8 +511,3 @@ def test_other_folders_and_files_are_refused_in_one_line(name: str, case: Encode
         with pytest.raises(Log2SimError) as refused:
             open_log(file, format=name)
         assert "\n" not in str(refused.value)
-
-
-def test_the_red_of_the_world_is_what_the_test_calls_red() -> None:
-    image = np.full((4, 4, 3), RED[::-1], np.uint8)
-    assert is_red(image, np.array([[1.0, 1.0]])).all()

@@ -13,14 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from log_encoders.world import world_log
-from test_logs_contract import ENCODERS
 
 from log2sim.datatypes import Log, Stream
-from log2sim.errors import LogError, RecordError
-from log2sim.logs.opening import open_log
+from log2sim.errors import RecordError
 from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, list_numbered_files, read_sweep
 from log2sim.logs.stamps import (
     compute_turn_share,
@@ -59,64 +55,6 @@ def test_whatever_a_parser_raises_is_a_record_error_of_one_line(problem: Excepti
             read(2)
         assert "\n" not in str(found.value)
         assert found.value.__cause__ is problem
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
-    """Folder and path of the world in each format, written when first asked for."""
-    return {name: (base := tmp_path_factory.mktemp(f"flip-{name}") / "base", base) for name in ENCODERS}
-
-
-SUPPRESSED = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-
-
-@pytest.mark.matrix
-@pytest.mark.parametrize("name", ENCODERS)
-@settings(max_examples=4, deadline=None, suppress_health_check=SUPPRESSED)
-@given(data=st.data())
-def test_flipped_bytes_of_any_file_end_no_reading(
-    written: dict[str, tuple[Path, Path]], name: str, data: st.DataObject
-) -> None:
-    read_damaged(written, name, data)
-
-
-def read_damaged(written: dict[str, tuple[Path, Path]], name: str, data: st.DataObject) -> None:
-    base, path = written[name]
-    if not base.exists():
-        path = ENCODERS[name].encode(world_log(), base)
-        written[name] = base, path
-    files = sorted(f for f in base.rglob("*") if f.is_file())
-    file = data.draw(st.sampled_from(files), label="file")
-    sound = file.read_bytes()
-    damaged = bytearray(sound)
-    for _ in range(data.draw(st.integers(1, 3))):
-        # Headers are at the beginning.
-        k = data.draw(st.integers(0, len(damaged) - 1) | st.integers(0, min(len(damaged) - 1, 300)))
-        damaged[k] = data.draw(st.integers(0, 255))
-    file.write_bytes(damaged)
-    try:
-        read_all(path, name)
-    finally:
-        file.write_bytes(sound)
-
-
-def read_all(path: Path, name: str) -> None:
-    """Open a log and read all of it; a `LogError` refuses the log, a `RecordError` one record."""
-    try:
-        log = open_log(path, format=name)
-        _ = log.labels, log.notes
-    except LogError as problem:
-        return require_one_line(problem)
-    for stream in log.streams.values():
-        for i in (0, len(stream.t_ns) - 1):
-            try:
-                stream.read(i)
-            except RecordError as problem:
-                require_one_line(problem)
-
-
-def require_one_line(problem: LogError) -> None:
-    assert "\n" not in str(problem)
 
 
 def npz(method: int = zipfile.ZIP_DEFLATED, **members: bytes) -> bytearray:

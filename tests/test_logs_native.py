@@ -93,6 +93,7 @@ def edit_line(file: Path, line: int, text: str) -> None:
 
 
 def test_what_is_written_reads_back(folder: Path) -> None:
+    """What the random logs of test_logs_properties.py do not have."""
     log, back = make_log(), open_log(folder)
     assert (back.name, back.format, back.reference_camera, back.ground_z_ego_m) == ("small", "log2sim", "front", -0.3)
     assert back.ego_vehicle == log.ego_vehicle
@@ -100,21 +101,9 @@ def test_what_is_written_reads_back(folder: Path) -> None:
     np.testing.assert_array_equal(back.ego.t_ns, log.ego.t_ns)
     np.testing.assert_allclose(back.ego.map_T_ego, log.ego.map_T_ego, atol=1e-12)
     for name, camera in log.cameras.items():
-        assert (back.cameras[name].mount, back.cameras[name].distortion) == (camera.mount, camera.distortion)
-        np.testing.assert_allclose(back.cameras[name].mount_T_cam, camera.mount_T_cam, atol=1e-12)
+        assert back.cameras[name].distortion == camera.distortion
         np.testing.assert_array_equal(back.cameras[name].K, camera.K)
-        np.testing.assert_array_equal(back.streams[name].t_ns, log.streams[name].t_ns)
-        difference = back.streams[name].read(3).astype(int) - log.streams[name].read(3)
-        assert np.abs(difference).mean() < 3  # JPEG
-    for name in log.lidars:
-        ours, theirs = log.streams[name].read(2), back.streams[name].read(2)
-        assert (theirs.frame, theirs.stamp_ns) == (ours.frame, ours.stamp_ns)
-        np.testing.assert_allclose(theirs.xyz_m, ours.xyz_m, atol=6e-4)
-    np.testing.assert_array_equal(back.streams["top"].read(2).t_ns, log.streams["top"].read(2).t_ns)
-    assert back.streams["world"].read(2).t_ns is None
-    for field in ("t_ns", "track_id", "category", "center_m", "size_m", "yaw_rad", "visible"):
-        np.testing.assert_array_equal(getattr(back.labels, field), getattr(log.labels, field))
-    assert back.labels.never_labeled == log.labels.never_labeled
+    np.testing.assert_array_equal(back.labels.visible, log.labels.visible)
     np.testing.assert_array_equal(back.image_labels["front"].box_px, log.image_labels["front"].box_px)
     assert validate_log(folder) == []
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_encoders import kitti, kitti_object, native, nuscenes, pandaset, ros, waymo
+from log_encoders import kitti, kitti_object, nuscenes, pandaset
 from log_encoders.world import make_world
 
 from log2sim.datatypes import Log
@@ -35,40 +34,8 @@ def encoded(tmp_path: Path) -> Callable[[Encode], Path]:
     return lambda encode: encode(short_world(), tmp_path / "log")
 
 
-def encode_db3(log: Log, folder: Path) -> Path:
-    return ros.encode_as(log, folder, ros.Style(container="db3"))
-
-
 def encode_nuscenes(log: Log, folder: Path) -> Path:
     return nuscenes.encode_world(replace(log), folder)
-
-
-@pytest.mark.matrix
-@pytest.mark.parametrize(
-    ("encode", "name"),
-    [
-        (encode_db3, "metadata.yaml"),
-        (encode_db3, "*.db3"),
-        (encode_nuscenes, "v1.0-mini/log.json"),
-        (encode_nuscenes, "v1.0-mini/scene.json"),
-        (encode_nuscenes, "v1.0-mini/ego_pose.json"),
-        (waymo.encode, "*.tfrecord"),
-        (native.encode, "log.json"),
-    ],
-    ids=["metadata", "database", "small table", "scenes", "large table", "tfrecord", "manifest"],
-)
-def test_a_file_that_links_out_of_the_log_is_refused(
-    encoded: Callable[[Encode], Path], tmp_path: Path, encode: Encode, name: str
-) -> None:
-    log = encoded(encode)
-    root = log.parent if log.is_file() else log
-    file = next(root.glob(name))
-    target = tmp_path / f"secret{file.suffix}"
-    shutil.move(file, target)
-    file.symlink_to(target)
-    with pytest.raises(LogError, match=r"is a link that leaves the log folder, to .*; pass --follow-links"):
-        open_log(root)
-    assert open_log(root, follow_links=True).streams
 
 
 @pytest.mark.parametrize(

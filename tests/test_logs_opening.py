@@ -1,21 +1,17 @@
-"""Opening a log reads its index, calibration and poses; images and sweeps are read on request."""
+"""Boxes of a file, in any of the formats that are read, as labels of any log."""
 
 from __future__ import annotations
 
 import json
 import re
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from worlds import tiny_log
 
 from log2sim.datatypes import Labels, Log
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.geometry import (
@@ -26,86 +22,7 @@ from log2sim.geometry import (
     transform,
     wrap_angle,
 )
-from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-
-SWEEP_SUFFIXES = (".bin", ".npz", ".npy", ".pcd", ".gz")
-_listeners: list[list[str]] = []
-
-
-def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    if event == "open" and isinstance(arguments[0], str):
-        for listener in _listeners:
-            listener.append(arguments[0])
-
-
-sys.addaudithook(_hook)
-
-
-@contextmanager
-def opened_files() -> Iterator[list[str]]:
-    """Names of the files that are opened within the block, by any library."""
-    names: list[str] = []
-    _listeners.append(names)
-    try:
-        yield names
-    finally:
-        _listeners.remove(names)
-
-
-def pandaset(root: Path) -> Path:
-    """A sequence of two sweeps whose files hold no table."""
-    import simplejpeg
-
-    pose = {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "heading": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
-    for folder in ("lidar", "camera/front_camera", "annotations/cuboids"):
-        (root / folder).mkdir(parents=True)
-    for folder in ("lidar", "camera/front_camera"):
-        (root / folder / "poses.json").write_text(json.dumps([pose] * 2))
-        (root / folder / "timestamps.json").write_text(json.dumps([1.5e9, 1.5e9 + 0.1]))
-    (root / "camera/front_camera/intrinsics.json").write_text(json.dumps({"fx": 50, "fy": 50, "cx": 30, "cy": 20}))
-    for k in range(2):
-        image = simplejpeg.encode_jpeg(np.zeros((40, 60, 3), np.uint8))
-        (root / f"camera/front_camera/{k:02d}.jpg").write_bytes(image)
-        (root / f"lidar/{k:02d}.pkl.gz").write_bytes(b"no table")
-        (root / f"annotations/cuboids/{k:02d}.pkl.gz").write_bytes(b"no table")
-    return root
-
-
-def test_a_native_log_opens_without_its_images_and_sweeps(tmp_path: Path) -> None:
-    write_log(tiny_log(observe=False, duration_s=0.3)[0], tmp_path / "log")
-    with opened_files() as names:
-        log = open_log(tmp_path / "log")
-    assert any(name.endswith("index.csv") for name in names)
-    assert not [name for name in names if name.endswith((*SWEEP_SUFFIXES, ".jpg", ".png"))]
-    with opened_files() as names:
-        log.streams["top"].read(1)
-    assert [Path(name).name for name in names if name.endswith(SWEEP_SUFFIXES)] == ["000001.npz"]
-
-
-def test_a_pandaset_sequence_opens_without_sweeps_and_cuboids_and_names_a_bad_one_when_it_is_used(
-    tmp_path: Path,
-) -> None:
-    root = pandaset(tmp_path / "007")
-    with opened_files() as names:
-        log = open_log(root)
-    assert any(name.endswith("poses.json") for name in names)
-    assert not [name for name in names if name.endswith(".gz")]
-    # Without readable points the PandarGT has the stamps of the other LiDAR.
-    np.testing.assert_array_equal(log.streams["pandargt"].t_ns, log.streams["pandar64"].t_ns)
-    with pytest.raises(RecordError, match=r"lidar/00\.pkl\.gz"):
-        log.streams["pandar64"].read(0)
-    with pytest.raises(LogError, match=r"cuboids/00\.pkl\.gz"):
-        _ = log.labels
-
-
-@pytest.mark.real
-@pytest.mark.parametrize("path", ["kitti_raw", "pandaset/002"])
-def test_a_recorded_log_opens_without_its_sweeps(real_data: Path, path: str) -> None:
-    with opened_files() as names:
-        open_log(real_data / path)
-    assert names
-    assert not [name for name in names if name.endswith(SWEEP_SUFFIXES)]
 
 
 def _in_frame(labels: Labels, frame_T_map: Any) -> Any:

@@ -117,32 +117,6 @@ def test_two_lidars_with_their_own_times(sequence: Path) -> None:
     assert np.abs(middle).max() < 1e6
 
 
-@pytest.mark.real
-def test_faults_of_a_sequence_are_named(sequence: Path, tmp_path: Path) -> None:
-    broken = tmp_path / "003"
-    for folder in ("lidar", "camera/front_camera", "meta", "annotations/cuboids"):
-        (broken / folder).mkdir(parents=True)
-        for file in (sequence / folder).iterdir():
-            if not file.name[:2].isdigit() or int(file.name[:2]) < 3:
-                (broken / folder / file.name).symlink_to(file.resolve())
-    cloud = broken / "lidar" / "01.pkl.gz"
-    cut = cloud.read_bytes()[:10_000]
-    cloud.unlink()
-    cloud.write_bytes(cut)
-    log = open_log(broken)
-    assert len(log.streams["pandar64"].t_ns) == 3
-    with pytest.raises(RecordError, match=r"01.pkl.gz.*truncated"):
-        log.streams["pandar64"].read(1)
-    log.streams["pandar64"].read(2)
-    poses = broken / "lidar" / "poses.json"
-    records = json.loads(poses.read_text())
-    records[4]["heading"]["w"] = 3.0
-    poses.unlink()
-    poses.write_text(json.dumps(records))
-    with pytest.raises(LogError, match=r"lidar/poses.json: record 4.*unit quaternion"):
-        open_log(broken)
-
-
 def linked_part(sequence: Path, folder: Path, count: int = 5) -> Path:
     """The first records of two cameras and of the LiDARs, as links."""
     for name in ("lidar", "camera/front_camera", "camera/back_camera", "meta", "annotations/cuboids"):
@@ -191,6 +165,19 @@ def changed(world: Path, tmp_path: Path, name: str, change: Callable[[Any], None
     change(document)
     (path / name).write_text(json.dumps(document))
     return path
+
+
+def test_sweeps_and_cuboids_are_read_when_they_are_used(world: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(world, tmp_path / "copy"))
+    for file in root.glob("**/*.pkl.gz"):
+        file.write_bytes(b"no table")
+    log = open_log(root)
+    # Without readable points the PandarGT has the stamps of the other LiDAR.
+    np.testing.assert_array_equal(log.streams["pandargt"].t_ns, log.streams["pandar64"].t_ns)
+    with pytest.raises(RecordError, match=r"lidar/00\.pkl\.gz"):
+        log.streams["pandar64"].read(0)
+    with pytest.raises(LogError, match=r"cuboids/00\.pkl\.gz"):
+        _ = log.labels
 
 
 DIGITS_40, DIGITS_400 = int("9" * 40), int("9" * 400)

@@ -20,13 +20,10 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import Camera, PoseTrack, RollingShutter, rotation_from_rpy, transform
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
 from log2sim.logs.kitti.labels import parse_oxts
-from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.records import read_sweep
-
-COLUMNS = {"t_ns": "int", "x_m": "float", "name": "str", "flag": "bool"}
 
 
 def npy(array: np.ndarray) -> bytes:
@@ -67,29 +64,6 @@ def test_a_damaged_sweep_is_a_record_error_or_a_sweep(tmp_path: Path, suffix: st
         assert sweep.t_ns is None or sweep.t_ns.shape == (len(sweep.xyz_m),)
 
 
-@quick
-@given(
-    rows=st.lists(
-        st.tuples(
-            st.integers(-(2**63), 2**63 - 1),
-            st.floats(-1e8, 1e8),
-            st.text(st.characters(categories=["L", "N", "P"]), max_size=6),
-            st.booleans(),
-        ),
-        max_size=8,
-    )
-)
-def test_a_written_table_reads_back(tmp_path: Path, rows: list[tuple[int, float, str, bool]]) -> None:
-    import csv
-
-    path = tmp_path / "table.csv"
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        csv.writer(stream).writerows([list(COLUMNS), *rows])
-    table = read_csv_table(path, COLUMNS)
-    back = list(zip(*(table[name].tolist() for name in COLUMNS), strict=True))
-    assert back == [(t, x, name.strip(), flag) for t, x, name, flag in rows]
-
-
 def sound_pickle() -> bytes:
     pandas = pytest.importorskip("pandas")
     return pickle.dumps(pandas.DataFrame({"x": np.arange(3.0), "d": np.arange(3), "word": ["a", "b", "c"]}))
@@ -115,19 +89,6 @@ ANY_TEXT = st.text(max_size=200) | st.lists(WORDS, max_size=60).map(" ".join)
 def test_any_text_is_a_log_error_or_rows_of_oxts(text: str) -> None:
     rows = result_or_refusal(lambda: parse_oxts(text, "file"), LogError, "file, line")
     assert rows is None or (rows.shape[1] == 30 and np.isfinite(rows).all())
-
-
-@quick
-@given(data=st.data())
-def test_a_damaged_manifest_is_a_log_error_or_a_log(tiny_folder: Path, data: st.DataObject) -> None:
-    manifest = tiny_folder / "log.json"
-    sound = manifest.read_bytes()
-    try:
-        manifest.write_bytes(data.draw(damaged(sound)))
-        log = result_or_refusal(lambda: open_log(tiny_folder), LogError, str(tiny_folder))
-        assert log is None or log.streams
-    finally:
-        manifest.write_bytes(sound)
 
 
 coordinate = st.floats(-500.0, 500.0).map(lambda v: round(v, 3))

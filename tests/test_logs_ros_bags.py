@@ -122,35 +122,6 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_is_damaged(container: str, tm
         file.message(0)
 
 
-@pytest.mark.matrix
-@pytest.mark.parametrize(
-    "style",
-    [Style("bag"), Style("bag", "lz4"), Style("mcap", "storage"), Style("db3")],
-    ids=lambda s: f"{s.container}-{s.compression}",
-)
-def test_any_damage_is_told_in_one_line(style: Style, tmp_path: Path) -> None:
-    """Random bytes at random places, most of them where headers and indexes are."""
-    rng = np.random.default_rng(7)
-    path = bag_of(tmp_path, style)
-    file = file_of(path)
-    data = np.frombuffer(file.read_bytes(), np.uint8)
-    for _ in range(12):
-        places = np.concatenate([rng.integers(0, len(data), 8), rng.integers(0, 6000, 4), -rng.integers(1, 6000, 4)])
-        damaged = data.copy()
-        damaged[places] = rng.integers(0, 256, len(places))
-        file.write_bytes(damaged.tobytes())
-        try:
-            log = open_log(path)
-        except LogError as error:
-            lines = str(error).splitlines()
-        else:
-            lines = [""]
-            assert all("\n" not in note for note in log.notes)
-            for stream in log.streams.values():
-                readable(stream)
-        assert len(lines) == 1
-
-
 def test_files_that_are_no_bags_are_refused_in_one_line(tmp_path: Path) -> None:
     import sqlite3
 

@@ -18,7 +18,7 @@ from log2sim.datatypes import Log, Stream
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import apply, box_iou, inverse, project, project_boxes, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.waymo import reader, tfrecord
+from log2sim.logs.waymo import reader
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.reader import camera_of
 from log2sim.logs.waymo.segment import CameraCalibration
@@ -173,24 +173,6 @@ def test_rolling_shutters_are_read_as_the_schema_says(
     assert (shutter and shutter.direction) == direction
     if shutter:
         assert shutter.readout_s == pytest.approx(2 * waymo.HALF_EXPOSED_S - waymo.SHUTTER_S, abs=1e-6)
-
-
-def test_opening_reads_neither_pictures_nor_points(
-    segment: waymo.Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    big = waymo.Ranges([np.random.default_rng(0).normal(size=(64, 200, 4)).astype(np.float32)])
-    path = write(changed(segment, lambda f: f.lasers.update({1: big}), *range(10)), tmp_path / "a.tfrecord")
-    read: list[int] = []
-    read_at = tfrecord.read_at
-    monkeypatch.setattr(tfrecord, "read_at", lambda file, at, size: read.append(size) or read_at(file, at, size))
-    monkeypatch.setattr(tfrecord.RecordFile, "read", None)
-    log = open_log(path)
-    assert len(log.streams["LIDAR_TOP"].t_ns) == 10
-    assert sum(read) < 10 * 30_000 < path.stat().st_size
-    before = len(read)
-    assert log.labels is not None
-    assert len(log.image_labels["FRONT"].t_ns)
-    assert len(read) > before
 
 
 def test_a_damaged_frame_loses_its_own_records_only(path: Path, tmp_path: Path) -> None:

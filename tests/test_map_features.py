@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,47 +72,24 @@ def test_they_move_with_the_map_and_the_time() -> None:
     np.testing.assert_allclose(moved.signals[0].t_s, [2.0, 4.5])
 
 
-def double_id(document: dict[str, Any]) -> None:
-    document["map_features"]["borders"][0]["id"] = "m1"
+# Where something is changed in the document, and what the refusal names.
+DAMAGE: list[tuple[tuple[Any, ...], Callable[[Any], Any], str]] = [
+    (("map_features", "borders", 0, "id"), lambda _: "m1", "'m1'"),
+    (("map_features", "lanes", 0, "successors"), lambda _: ["l9"], "'l9'"),
+    (("map_features", "lanes", 0, "left"), lambda _: "m9", "'m9'"),
+    (("map_features", "lanes", 1, "width_m"), lambda widths: widths[:-1], "lane 'l2'"),
+    (("map_features", "markings", 0, "kind"), lambda _: "zigzag", "markings"),
+    (("signals", 0, "state"), lambda states: states[:-1], "signal 's1'"),
+    (("signals", 0, "t_s"), lambda _: [1.0, 1.0], "signal 's1'"),
+    (("signals",), lambda signals: signals * 2, "signal 's1'"),
+]
 
 
-def unknown_lane(document: dict[str, Any]) -> None:
-    document["map_features"]["lanes"][0]["successors"] = ["l9"]
-
-
-def unknown_side(document: dict[str, Any]) -> None:
-    document["map_features"]["lanes"][0]["left"] = "m9"
-
-
-def few_widths(document: dict[str, Any]) -> None:
-    document["map_features"]["lanes"][1]["width_m"].pop()
-
-
-def unknown_kind(document: dict[str, Any]) -> None:
-    document["map_features"]["markings"][0]["kind"] = "zigzag"
-
-
-def few_states(document: dict[str, Any]) -> None:
-    document["signals"][0]["state"].pop()
-
-
-def times_fall(document: dict[str, Any]) -> None:
-    document["signals"][0]["t_s"] = [1.0, 1.0]
-
-
-def same_signal(document: dict[str, Any]) -> None:
-    document["signals"] *= 2
-
-
-@pytest.mark.parametrize(
-    ("damage", "named"),
-    [
-        (double_id, "'m1'"), (unknown_lane, "'l9'"), (unknown_side, "'m9'"), (few_widths, "lane 'l2'"),
-        (unknown_kind, "markings"), (few_states, "signal 's1'"), (times_fall, "signal 's1'"), (same_signal, "signal 's1'"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_is_refused_by_name(damage: Any, named: str) -> None:
-    document = scenario().to_dict()
-    damage(document)
+@pytest.mark.parametrize(("place", "change", "named"), DAMAGE)
+def test_what_cannot_be_is_refused_by_name(place: tuple[Any, ...], change: Callable[[Any], Any], named: str) -> None:
+    holder = document = scenario().to_dict()
+    for step in place[:-1]:
+        holder = holder[step]
+    holder[place[-1]] = change(holder[place[-1]])
     with pytest.raises(ScenarioError, match=named):
         Scenario.from_dict(document)

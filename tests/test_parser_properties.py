@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,13 @@ import pytest
 from damaged_bytes import damaged, quick, result_or_refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_encoders import argoverse, kitti, nuscenes, pandaset, ros, waymo, waymo_parquet
+from log_encoders import argoverse, kitti, kitti_object, native, nuscenes, pandaset, ros, waymo, waymo_parquet
 from log_encoders.world import make_world
 from worlds import tiny_toml
 
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
-from log2sim.errors import ConfigError, Log2SimError, LogError, ScenarioError
+from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError, ScenarioError
 from log2sim.evaluation.detection.boxes import DetectedBoxes
 from log2sim.export.exporters import Options, export
 from log2sim.export.openscenario.read import load
@@ -125,9 +125,11 @@ CONTAINERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "waymo v2": (waymo_parquet.encode, "*/*.parquet"),
     "argoverse 2": (argoverse.encode, "*/*.feather"),
     "nuscenes": (nuscenes.encode_world, "*/*.json"),
-    "pandaset": (pandaset.encode, "*/*/*.json"),
+    "pandaset": (pandaset.encode, "*/**/*.*"),
     "kitti raw": (kitti.encode_raw, "**/*.txt"),
     "kitti tracking": (kitti.encode_tracking, "**/*.txt"),
+    "kitti object": (kitti_object.encode, "**/*.*"),
+    "log2sim": (native.encode, "**/*.*"),
 }
 
 
@@ -140,14 +142,14 @@ def container(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
 
 
 def read_all(path: Path) -> None:
-    """Open a log and read all that a run may read; records may be refused one by one."""
+    """Open a log and read all that a run may read; records may be refused one by one, each in one line."""
     log = open_log(path)
     assert log.streams
     for stream in log.streams.values():
         for i in range(len(stream.t_ns)):
-            with contextlib.suppress(Log2SimError):
-                stream.read(i)
-    assert log.notes is not None
+            result_or_refusal(partial(stream.read, i), RecordError, "")
+    assert all("\n" not in note for note in log.notes)
+    _ = log.labels
 
 
 @pytest.mark.matrix

@@ -20,7 +20,7 @@ from plain_settings import AGENTS_ALONE
 from test_first_pass import STAMPS, TICKS, Truth, driving_log, with_records
 from worlds import tiny_log
 
-from log2sim import Config, open_log, reconstruct
+from log2sim import Config, reconstruct
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError, PluginError, RecordError
 from log2sim.files.processes import in_background, map_in_processes
@@ -132,7 +132,7 @@ def test_results_come_in_order_and_tasks_are_made_when_they_are_needed() -> None
 
 def test_errors_come_back_as_what_they_are_and_no_process_is_left() -> None:
     def fail(k: int) -> int:
-        if k == 3:
+        if k == 8:
             raise PluginError("detector 'mine': broken")
         return os.getpid()
 
@@ -202,15 +202,3 @@ def test_a_script_without_a_guard_may_use_processes(tmp_path: Path) -> None:
     ran = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, cwd=ROOT)
     assert (ran.returncode, ran.stderr) == (0, "")
     assert int(ran.stdout) > 1
-
-
-@pytest.fixture(scope="module")
-def sample() -> Log:
-    return open_log(ROOT / "samples" / "crossing")
-
-
-@pytest.mark.slow
-def test_the_sample_is_the_same_by_one_two_and_three_processes(sample: Log) -> None:
-    config = Config.load(detect={"name": "lidar:vehicle"}, stop_s=1.0)
-    found = [content(observe_log(start(sample, config, jobs=jobs, cache=False))) for jobs in (1, 2, 3)]
-    assert found[0] == found[1] == found[2]

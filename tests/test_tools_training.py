@@ -161,3 +161,28 @@ def test_two_streams_learn_one_pair_are_exported_and_find_its_objects(tmp_path: 
     row = two_stream.compare({"toy": search}, [pair])["toy"]
     assert row["car"]["IoU BEV > 0.5"] == 1.0
     assert row["car"]["truths"] == 2
+
+
+def test_a_toy_learns_to_name_colors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chance names one of ten right."""
+    import train_colors
+
+    monkeypatch.setattr("sys.argv", ["train_colors", "--out", str(tmp_path), "--worlds", "300", "--steps", "120"])
+    monkeypatch.setattr(train_colors, "TRACKS", 60)
+    train_colors.main()
+    card = json.loads((tmp_path / "colors.json").read_text())
+    assert card["simulated"]["top1"] > 0.25
+    assert (tmp_path / "colors.onnx").stat().st_size < 160_000
+
+
+def test_a_white_surface_in_even_light_is_as_bright_as_the_light() -> None:
+    """By spherical harmonics of second order, whichever way it faces; under half a sky it has the share that it sees of it."""
+    from color_training.pictures import AREA, COSINE, HARMONICS, ROWS, _harmonics
+
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    even = np.einsum("rc,rck->k", AREA, HARMONICS) * COSINE
+    np.testing.assert_allclose(_harmonics(normals) @ even, 1.0, atol=0.02)
+    above = np.einsum("rc,rck->k", AREA[ROWS // 2 :], HARMONICS[ROWS // 2 :]) * COSINE
+    np.testing.assert_allclose(_harmonics(normals) @ above, (1 + normals[:, 2]) / 2, atol=0.06)

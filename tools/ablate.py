@@ -121,7 +121,6 @@ class Case:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command."""
     parser = parser_of(__doc__)
     parser.add_argument("logs", nargs="*", help="log folders and scene files")
     parser.add_argument("--out", type=Path, required=True, help="JSON lines, appended to")

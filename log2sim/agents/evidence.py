@@ -5,8 +5,10 @@ What the weights of `agents/weights.py` make of a column is a log-likelihood rat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,7 @@ from log2sim.datatypes import (
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
-from log2sim.perception.boxes import LIMIT_SIGMAS
+from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
 from log2sim.perception.lidar.measure import logit
 from log2sim.perception.sync import Schedule
 
@@ -58,7 +60,7 @@ class Recording:
 SIGNS = {
     "sweep": 1, "weak_sweep": 1, "image": 1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "through_gaps": -1, "continued": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "continued": -1, "remains": -1, "thin": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
@@ -81,6 +83,8 @@ SIGNS = {
   people and bicycles have: all others go on behind it; 0 with few.
 - continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
   fences go on there, vehicles end.
+- remains: mean share of the points of what moves that are also where it is not yet or no more: what stays is no mover.
+- thin: logarithm of the typical width of a person over the widest extent of its points, where positive: poles are thinner.
 - missing: nats against it by the images that show its place well and in which it is not detected.
 - moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
 """
@@ -95,15 +99,21 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int
     """Gather the evidence for and against each of C candidates, which so many processes share."""
     if not candidates:
         return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
-    rows = [_own_columns(c, recording.timeline) for c in candidates]
-    most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(rows) // jobs)) or 1
-    shares = [candidates[k : k + most] for k in range(0, len(rows), most)]
-    columns = map_in_processes(lambda k: _sensed_columns(shares[k], recording), range(len(shares)), jobs)
-    parts = list(columns)
-    table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    table |= {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(candidates) // jobs)) or 1
+    shares = [candidates[k : k + most] for k in range(0, len(candidates), most)]
+
+    def columns_of(share: int) -> Table:
+        rows = [_own_columns(c, recording.timeline) for c in shares[share]]
+        own = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        return own | _sensed_columns(shares[share], recording)
+
+    parts = list(map_in_processes(columns_of, range(len(shares)), jobs))
+    table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     table["no_image"] *= table["no_image"].min() == 0
-    return table | {"missing": missing_nats(table["shown_ticks"], table["image_ticks"]), "bias": np.ones(len(rows))}
+    return table | {
+        "missing": missing_nats(table["shown_ticks"], table["image_ticks"]),
+        "bias": np.ones(len(candidates)),
+    }
 
 
 # Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
@@ -141,6 +151,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "unlikely_size": float(not candidate.geometry.is_likely),
         "odd_size": _odd_size(agent),
         "odd_height": _odd_height(candidate),
+        "thin": _thin(candidate) if group == "pedestrian" else 0.0,
         "heading": float(log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), 0.01, 0.99))),
         "other_category": float((m.category != agent.category).mean()),
         "impossible": float(any(d.kind != "heading_ambiguous" for d in agent.doubts)),
@@ -153,6 +164,20 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "pedestrian": float(group == "pedestrian"),
     }
     return columns | {name: float(np.clip(columns[name], low, high)) for name, (low, high) in LIMITS.items()}
+
+
+# Fewer points may lie on one side of a person.
+MIN_WIDE_POINTS = 5
+
+
+def _thin(candidate: AgentCandidate) -> float:
+    """Return the logarithm of the typical width over the median of the widest extents of the points, 0 where these are wide or few."""
+    m = candidate.track.measurements
+    widest = (m.high_m - m.low_m).max(axis=1)[m.points >= MIN_WIDE_POINTS]
+    widest = widest[np.isfinite(widest)]
+    if not len(widest):
+        return 0.0
+    return max(float(np.log(TYPICAL_SIZE_M[candidate.agent.category][1] / (np.median(widest) + 0.05))), 0.0)
 
 
 def _odd_size(agent: Agent) -> float:
@@ -249,7 +274,7 @@ MAX_CELLS = 400_000
 # Rays toward a place before it is said that the LiDAR looks there, and at a tick before they say anything.
 MIN_LOOKING_RAYS, MIN_TICK_RAYS = 30, 8
 # One ray of thirty ends in anything by chance.
-MAX_GONE_NATS = float(np.log(30.0))
+MAX_THROUGH_NATS = float(np.log(30.0))
 # Rays of fewer ticks may all have gone through a window or past a corner.
 MIN_SEEN_TICKS = 3
 
@@ -267,12 +292,13 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
-    gone = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_GONE_NATS)
+    went_on = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_THROUGH_NATS)
     solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
     return {
-        "through": np.where(solid, gone, 0.0),
-        "through_gaps": np.where(solid, 0.0, gone),
+        "through": np.where(solid, went_on, 0.0),
+        "through_gaps": np.where(solid, 0.0, went_on),
         "continued": continued(boxes, recording.clouds) * solid,
+        "remains": remaining(boxes, recording.clouds) * [not agent.static for agent in agents],
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
         "shown_ticks": shown.sum(axis=1).astype(np.float64),
         "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
@@ -290,28 +316,89 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     Only where the points inside are, which is where rays arrive: beyond a side of a vehicle whose end they show is nothing.
     """
     inside, beyond = np.zeros((len(boxes.present), 5)), np.zeros((len(boxes.present), 5))
-    recorded = np.array([cloud is not None for cloud in clouds], dtype=bool)
-    for k, present in enumerate(boxes.present):
-        ticks = np.flatnonzero(present & recorded)
-        for tick in ticks[:: -(-len(ticks) // SIDE_TICKS) or 1].tolist():
-            cloud, center, half = clouds[tick], boxes.center_m[k, tick], boxes.size_m[k] / 2
-            assert cloud is not None
-            near = cloud.xyz[cloud.near(center[:2], float(np.hypot(*half[:2])) + SIDE_M)] - (center - cloud.origin)
-            c, s = np.cos(boxes.yaw_rad[k, tick]), np.sin(boxes.yaw_rad[k, tick])
-            local = np.stack([c * near[:, 0] + s * near[:, 1], c * near[:, 1] - s * near[:, 0], near[:, 2]], axis=1)
-            local = local[local[:, 2] > ABOVE_FLOOR_M - half[2]]
-            within = np.abs(local) < half + SIDE_ERROR_M / 2
-            for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
-                depth, across = sign * local[:, axis] - half[axis], [a for a in range(3) if a != axis]
-                own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[:, across].all(axis=1)
-                if own.sum() < MIN_SIDE_POINTS:
-                    continue
-                low, high = np.quantile(local[own][:, across], (0.1, 0.9), axis=0)
-                level = ((local[:, across] > low - SIDE_ERROR_M) & (local[:, across] < high + SIDE_ERROR_M)).all(axis=1)
-                inside[k, side] += (own & level).sum()
-                beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
+    visits = [(tick, k, tick) for k, ticks in enumerate(_recorded(boxes, clouds)) for tick in _some(ticks, SIDE_TICKS)]
+    for cloud, (tick, k, _) in _with_clouds(visits, clouds):
+        half, points = boxes.size_m[k] / 2, _points_at(boxes, k, tick, cloud, SIDE_M)
+        local = np.column_stack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]), points[:, 2]])
+        within = np.abs(local) < half + SIDE_ERROR_M / 2
+        for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
+            depth, across = sign * local[:, axis] - half[axis], [a for a in range(3) if a != axis]
+            own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[:, across].all(axis=1)
+            if own.sum() < MIN_SIDE_POINTS:
+                continue
+            ordered = np.sort(local[own][:, across], axis=0)
+            low, high = ordered[len(ordered) // 10], ordered[-1 - len(ordered) // 10]  # but for stray points
+            level = ((local[:, across] > low - SIDE_ERROR_M) & (local[:, across] < high + SIDE_ERROR_M)).all(axis=1)
+            inside[k, side] += (own & level).sum()
+            beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
     share = np.minimum(beyond / np.maximum(inside, 1), 1)
     return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
+
+
+# An agent that moved so far, m, left its place by more than the errors of boxes. So many moments of each agent suffice.
+LEFT_M, LEFT_MOMENTS = 1.5, 4
+
+
+def remaining(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
+    """Return the mean shares (A,) of the points of agents that are there also when these have left, or have not come yet.
+
+    Compared are pairs of ticks between which an agent moves by `LEFT_M`, in the part of its box at one that is outside of its box at
+    the other, by as many points as a surface shows at the other distance. 0 for what stands.
+    """
+    pairs = []
+    for k, ticks in enumerate(_recorded(boxes, clouds)):
+        way = boxes.center_m[k, ticks, :2]
+        for first in _some(np.arange(len(ticks)), LEFT_MOMENTS):
+            gone = np.flatnonzero(np.hypot(*(way[first:] - way[first]).T) >= LEFT_M)
+            for last in gone[:1].tolist():
+                pair = int(ticks[first]), int(ticks[first + last])
+                pairs += [(k, *pair), (k, *pair[::-1])]
+    points, spread_m2 = np.zeros((len(pairs), 2)), np.ones((len(pairs), 2))
+    visits = [(pair[1 + at], n, at) for n, pair in enumerate(pairs) for at in range(2)]
+    for cloud, (_, n, at) in _with_clouds(visits, clouds):
+        (k, place, other), center = pairs[n], boxes.center_m[pairs[n][0]]
+        half = boxes.size_m[k, :2] / 2
+        near = _points_at(boxes, k, place, cloud, SIDE_ERROR_M)
+        xy = near[near[:, 2] <= boxes.size_m[k, 2] / 2 + SIDE_ERROR_M, :2]
+        own = rotate(xy, -boxes.yaw_rad[k, place])
+        elsewhere = rotate(xy + (center[place] - center[other])[:2], -boxes.yaw_rad[k, other])
+        left = (np.abs(own) <= half + SIDE_ERROR_M).all(axis=1) & (np.abs(elsewhere) > half + SIDE_M / 2).any(axis=1)
+        points[n, at] = left.sum()
+        spread_m2[n, at] = np.sum((center[place] - cloud.origin - cloud.sensor)[:2] ** 2)
+    known = points[:, 0] >= MIN_SIDE_POINTS
+    share = np.minimum(points[:, 1] * spread_m2[:, 1] / np.maximum(points[:, 0] * spread_m2[:, 0], 1e-9), 1.0)[known]
+    agent = np.array([k for k, *_ in pairs], dtype=np.intp)[known]
+    count = np.bincount(agent, minlength=len(boxes.present))
+    return np.asarray(np.bincount(agent, share, len(count)) / np.maximum(count, 1))
+
+
+def _recorded(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> list[NDArray[np.intp]]:
+    """Return for each of A agents the ticks at which it is there and a LiDAR recorded."""
+    recorded = np.array([cloud is not None for cloud in clouds], dtype=bool)
+    return [np.flatnonzero(present & recorded) for present in boxes.present]
+
+
+def _some(ticks: NDArray[np.intp], most: int) -> list[int]:
+    """Return at most so many ticks, evenly spaced."""
+    return [int(tick) for tick in ticks[:: -(-len(ticks) // most) or 1]]
+
+
+def _with_clouds(
+    visits: list[tuple[int, int, int]], clouds: Sequence[Obstacles | None]
+) -> Iterator[tuple[Obstacles, tuple[int, int, int]]]:
+    """Yield visits in the order of their ticks, which come first, with the cloud of the tick, which is read once."""
+    for tick, same in groupby(sorted(visits), itemgetter(0)):
+        cloud = clouds[tick]
+        assert cloud is not None
+        for visit in same:
+            yield cloud, visit
+
+
+def _points_at(boxes: AgentTable, k: int, tick: int, cloud: Obstacles, margin_m: float) -> Array:
+    """Return the points (n, 3) of a cloud around an agent's place at a tick, from its center, without those near its floor."""
+    center, half_m = boxes.center_m[k, tick], boxes.size_m[k] / 2
+    near = cloud.xyz[cloud.near(center[:2], float(np.hypot(*half_m[:2])) + margin_m)] - (center - cloud.origin)
+    return np.asarray(near[near[:, 2] > ABOVE_FLOOR_M - half_m[2]], dtype=np.float64)
 
 
 # Smaller objects are "small" in COCO (Lin et al., ECCV 2014), where detectors find less than half of them.

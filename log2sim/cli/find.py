@@ -37,9 +37,7 @@ def find(
     open_: Annotated[
         int | None, opt.option("Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)
     ] = None,
-    probability: Annotated[
-        float, opt.option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
-    ] = 0.3,
+    probability: opt.LeastProbability = 0.3,
     fields: Annotated[bool, opt.option("List the fields of these scenarios' tags.", None, "--fields")] = False,
     fresh: Annotated[
         bool, opt.option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")

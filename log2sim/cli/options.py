@@ -62,6 +62,15 @@ def complete_detectors(incomplete: str) -> list[str]:
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="Folder or file of a log.")]
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario.json.")]
 Overwrite = Annotated[bool, option("Replace files that exist.", None, "--overwrite", "-f", envvar="LOG2SIM_OVERWRITE")]
+OverwriteFolder = Annotated[bool, option("Replace the folder of an earlier run.", None, "--overwrite", "-f")]
+ScenarioFolder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch.")]
+Condition = Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")]
+LeastProbability = Annotated[
+    float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
+]
+PageLog = Annotated[
+    Path | None, option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")
+]
 DropDoubtful = Annotated[
     bool, option("Leave out agents that the scenario itself doubts; the ego stays.", None, "--drop-doubtful")
 ]

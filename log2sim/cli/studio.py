@@ -13,10 +13,7 @@ from log2sim.cli import options as opt
 
 def studio(
     scenario: opt.ScenarioPath,
-    log: Annotated[
-        Path | None,
-        opt.option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG"),
-    ] = None,
+    log: opt.PageLog = None,
     corrections: Annotated[
         Path | None,
         opt.option(

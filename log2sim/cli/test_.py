@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 def run_test(
     policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy for the ego, as replay --ego takes it.")],
-    path: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch.")],
-    condition: Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")],
+    path: opt.ScenarioFolder,
+    condition: opt.Condition,
     out: Annotated[Path, opt.write_to("DIR", "Folder for the report and the worst runs.")],
     runs: Annotated[int, opt.option("Runs in all.", "N", min=40, max=100_000)] = 400,
     limit: Annotated[
@@ -34,7 +34,7 @@ def run_test(
     worst: Annotated[int, opt.option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
     seed: Annotated[int, opt.option("Seed of all draws.", min=0)] = 0,
     jobs: Annotated[int | None, opt.option("Processes.", "N", min=1, default="one for each core")] = None,
-    overwrite: Annotated[bool, opt.option("Replace the folder of an earlier run.", None, "--overwrite", "-f")] = False,
+    overwrite: opt.OverwriteFolder = False,
     quiet: opt.Quiet = False,
 ) -> None:
     """Test a policy in variations of a situation: where it fails, how critical, how likely.

@@ -5,27 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
 
 
 def vary(
-    path: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch.")],
-    condition: Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")],
+    path: opt.ScenarioFolder,
+    condition: opt.Condition,
     out: Annotated[Path, opt.write_to("DIR", "Folder for the concrete scenarios, their table and the distribution.")],
     count: Annotated[int, opt.option("Concrete scenarios to draw.", "N", min=1, max=100_000)] = 64,
     sampler: Annotated[str, opt.choose("--sampler", "sobol|lhs|random", "How parameters are drawn.")] = "sobol",
     seed: Annotated[int, opt.option("Seed of the draw.", min=0)] = 0,
-    probability: Annotated[
-        float, opt.option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
-    ] = 0.3,
+    probability: opt.LeastProbability = 0.3,
     keep: Annotated[bool, opt.option("Write those, too, that something speaks against.", None, "--keep")] = False,
     openscenario: Annotated[
         bool, opt.option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")
     ] = False,
-    overwrite: Annotated[bool, opt.option("Replace the folder of an earlier run.", None, "--overwrite", "-f")] = False,
+    overwrite: opt.OverwriteFolder = False,
     quiet: opt.Quiet = False,
 ) -> None:
     """Vary a situation: fit the distribution of its parameters over all that are found, and draw concrete scenarios.

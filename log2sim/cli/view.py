@@ -11,10 +11,7 @@ from log2sim.cli import options as opt
 def view(
     scenario: opt.ScenarioPath,
     out: Annotated[Path, opt.write_to("FILE.html", "Page to write.")],
-    log: Annotated[
-        Path | None,
-        opt.option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG"),
-    ] = None,
+    log: opt.PageLog = None,
     max_mb: Annotated[
         float | None,
         opt.option(

@@ -1,12 +1,10 @@
-"""Names of colors: regions of CIELAB, and how probable each name is of a color that is only roughly known.
+"""Names of colors: regions of CIELAB.
 
 The names are those of `COLOR_NAMES`, into which all colors are sorted: purple is blue, pink and magenta are red, beige is
 brown, turquoise is green or blue by its hue.
 """
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,11 +25,6 @@ BLACK_CHROMA_PER_L, WHITE_L, WHITE_CHROMA, CREAM_CHROMA = 0.5, 86.0, 17.0, 27.0
 RED_FROM, RED_TO, ORANGE_TO, YELLOW_TO, GREEN_TO = 318.0, 45.0, 74.0, 111.0, 190.0
 # Orange and yellow that are dark (orange below the first lightness, yellow below the second) or dull are brown, red only where it is dull; dark yellow next to green is olive.
 BROWN_L, BROWN_CHROMA, BROWN_FROM, DULL_RED_CHROMA, LIGHT_L, OLIVE_FROM = (42.0, 55.0), 42.0, 20.0, 30.0, 66.0, 99.0
-# Three of four vehicles are black, white, gray or silver (Axalta, 2023), which are a small part of all colors: of a color next to the
-# border between gray and a hue, gray is the likelier.
-ACHROMATIC, ACHROMATIC_ODDS = ("black", "white", "gray", "silver"), 2.0
-# Sure of the sampling of `name_probabilities`: the error of a probability is below 0.03 with so many samples.
-SAMPLES, SEED = 512, 0
 
 
 def to_lab(rgb: ArrayLike) -> Array:
@@ -79,29 +72,3 @@ def name_indices(lab: Array) -> NDArray[np.intp]:
     out[achromatic] = grays[gray[achromatic]]
     out[(chroma < GRAY_CHROMA + BLACK_CHROMA_PER_L * (BLACK_L - L)) & (L < BLACK_L)] = index["black"]
     return np.asarray(out, np.intp)
-
-
-def name_probabilities(lab: Array, sigma: Array) -> Array:
-    """Compute how probable each name is of a color that is known up to errors with a normal distribution.
-
-    `lab` (3,): in CIELAB. `sigma` (3,): standard deviations of lightness, of chroma, and across the chroma, in units of CIELAB.
-    Returns (len(COLOR_NAMES),) float64 that sum to 1: a name's share of a fixed sample, times how frequent it is.
-    """
-    chroma = float(np.hypot(lab[1], lab[2]))
-    along = np.array([lab[1], lab[2]]) / chroma if chroma > 0 else np.array([1.0, 0.0])
-    errors = _samples() * sigma
-    samples = np.empty_like(errors)
-    samples[:, 0] = np.clip(lab[0] + errors[:, 0], 0, 100)
-    samples[:, 1:] = lab[1:] + errors[:, 1:2] * along + errors[:, 2:] * [-along[1], along[0]]
-    votes = np.bincount(name_indices(samples), minlength=len(COLOR_NAMES)) * odds_of_names()
-    return np.asarray(votes / votes.sum())
-
-
-def odds_of_names() -> Array:
-    """Return how much more frequent each of `COLOR_NAMES` (K,) is among vehicles than its part of the colors."""
-    return np.array([ACHROMATIC_ODDS if name in ACHROMATIC else 1.0 for name in COLOR_NAMES])
-
-
-@lru_cache(maxsize=1)
-def _samples() -> Array:
-    return np.random.default_rng(SEED).standard_normal((SAMPLES, 3))

@@ -131,6 +131,10 @@ class Edited:
 def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     """Apply edits in the order given.
 
+    Raises `ConfigError` for no edits, an unknown or removed agent, the same edit twice, no agent left, or an impossible
+    edit: the speed of a static agent, a path shifted beyond its center of curvature, a trajectory without waypoints
+    left.
+
     Parameters
     ----------
     edits : sequence of Only, Remove, DropDoubtful, Replace, Add, Speed, Lateral, CutIn, Shift
@@ -141,12 +145,6 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     Edited
         The scenario, longer where an agent now lives beyond its end, with the edits and the digest of the source appended to
         `provenance["edits"]`; and warnings of new collisions and infeasible motion.
-
-    Raises
-    ------
-    ConfigError
-        For no edits, an unknown or removed agent, the same edit twice, no agent left, or an impossible edit: the speed of a
-        static agent, a path shifted beyond its center of curvature, a trajectory without waypoints left.
     """
     if not edits:
         raise ConfigError("no edits; say what to change, such as a shift of one agent")

@@ -69,10 +69,7 @@ class Corrected:
 def load_corrections(path: Path | str) -> dict[str, Any]:
     """Read a file of corrections.
 
-    Raises
-    ------
-    ScenarioError
-        When it is no JSON, of another version, or a correction lacks what its kind needs.
+    Raises `ScenarioError` when it is no JSON, of another version, or a correction lacks what its kind needs.
     """
     document = read_json(path, ScenarioError)
     try:
@@ -85,6 +82,10 @@ def load_corrections(path: Path | str) -> dict[str, Any]:
 def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     """Apply corrections in the order of the file.
 
+    Raises `ConfigError` when two corrections contradict each other, or one cannot be: a split outside of the life of an
+    agent. Raises `ScenarioError` when they are of another log: its name differs, and none of them finds what it is
+    about.
+
     Parameters
     ----------
     corrections : mapping
@@ -94,13 +95,6 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     -------
     Corrected
         The scenario, with the corrections that were applied and the digest of its source appended to `provenance["corrections"]`.
-
-    Raises
-    ------
-    ConfigError
-        When two corrections contradict each other, or one cannot be: a split outside of the life of an agent.
-    ScenarioError
-        When they are of another log: its name differs, and none of them finds what it is about.
     """
     draft = _Draft(scenario, corrections.get("map_offset_m"))
     unmatched, applied = [], []

@@ -273,14 +273,9 @@ class Exporter(Protocol):
     def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
         """Write files into an empty folder that exists.
 
-        Raises
-        ------
-        ConfigError
-            When the value of an option cannot be used.
-        MissingExtra
-            When what the format needs is not installed.
-        ScenarioError
-            When the format cannot hold the scenario at all; names the agent and the reason.
+        Raises `ConfigError` when the value of an option cannot be used. Raises `MissingExtra` when what the format
+        needs is not installed. Raises `ScenarioError` when the format cannot hold the scenario at all; names the agent
+        and the reason.
         """
         ...
 
@@ -303,12 +298,9 @@ def export(
 
     Agents whose confidence is too low (`Agent.quarantined`) are left out unless `quarantined` says otherwise.
 
-    Raises
-    ------
-    ConfigError
-        For an unknown format, an option that it does not understand, or files that exist and may not be replaced.
-    ScenarioError
-        When the scenario breaks what players of the formats rely on; see `log2sim.export.checks`.
+    Raises `ConfigError` for an unknown format, an option that it does not understand, or files that exist and may not
+    be replaced. Raises `ScenarioError` when the scenario breaks what players of the formats rely on; see
+    `log2sim.export.checks`.
     """
     exporter: Exporter = plugins.load("export", to)
     chosen = options or Options()

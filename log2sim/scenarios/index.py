@@ -44,24 +44,13 @@ class Indexed:
 
 @dataclass(frozen=True)
 class Index:
-    """Tags of scenarios.
+    """Tags of scenarios."""
 
-    Attributes
-    ----------
-    folder : Path
-        That `file` of each row is relative to.
-    table : pyarrow.Table
-        A row for each tag, with `TEXTS`, `NUMBERS`, quantities, and ROLE.FIELD for the states of agents at `t_s`.
-    scenarios : int
-        How many files were read.
-    problems : tuple of str
-        Files that could not be, and why.
-    """
-
-    folder: Path
+    folder: Path  # that `file` of each row is relative to
+    # A row for each tag, with `TEXTS`, `NUMBERS`, quantities, and ROLE.FIELD for the states of agents at `t_s`.
     table: Any
-    scenarios: int
-    problems: tuple[str, ...] = ()
+    scenarios: int  # how many files were read
+    problems: tuple[str, ...] = ()  # files that could not be, and why
 
 
 def rows_of(scenario: Scenario, file: str) -> list[Row]:
@@ -146,6 +135,8 @@ def open_index(
 ) -> Index:
     """Open the index of a folder, after files that are new, changed or gone were brought up to date in it; of one file it is only made.
 
+    Raises `ScenarioError` where there is no scenario. Raises `MissingExtra` without pyarrow.
+
     Parameters
     ----------
     path : Path
@@ -156,13 +147,6 @@ def open_index(
         Processes that tag; by default one for each core.
     map_files : callable, optional
         Applies a function to the names of files in another place, such as the workers of a cluster.
-
-    Raises
-    ------
-    ScenarioError
-        Where there is no scenario.
-    MissingExtra
-        Without pyarrow.
     """
     import_arrow()
     if path.is_file():

@@ -60,18 +60,10 @@ TIMING: Mapping[str, Timing | None] = {
 
 @dataclass(frozen=True, eq=False)
 class Logical:
-    """Parameters of a logical scenario with their joint distribution: a Gaussian copula over kernel densities.
+    """Parameters of a logical scenario with their joint distribution: a Gaussian copula over kernel densities."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of D parameters, with units.
-    values : (N, D) float64
-        That were found.
-    """
-
-    names: tuple[str, ...]
-    values: Array
+    names: tuple[str, ...]  # of D parameters, with units
+    values: Array  # (N, D): that were found
 
     @cached_property
     def _logarithmic(self) -> Array:
@@ -169,10 +161,7 @@ def _normal(u: Array) -> Array:
 def fit(rows: Sequence[Row]) -> Logical:
     """Fit the distribution of the parameters of a situation over the hits of `ask`, all of one tag.
 
-    Raises
-    ------
-    ConfigError
-        For several tags, one that cannot be varied, or fewer than `MIN_HITS` hits with all parameters.
+    Raises `ConfigError` for several tags, one that cannot be varied, or fewer than `MIN_HITS` hits with all parameters.
     """
     tags = sorted({row["tag"] for row in rows})
     if len(tags) != 1 or tags[0] not in TIMING:
@@ -194,30 +183,17 @@ def fit(rows: Sequence[Row]) -> Logical:
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A concrete situation that others are made of: its agents, continued beyond, in times of its own.
+    """A concrete situation that others are made of: its agents, continued beyond, in times of its own."""
 
-    Attributes
-    ----------
-    scenario : Scenario
-        With these agents alone, from `-PAD_S` to `PAD_S` after `duration_s`.
-    moment_s : mapping of str to float
-        When each agent is where the parameters are of.
-    row : mapping
-        The hit.
-    """
-
-    scenario: Scenario
-    moment_s: Mapping[str, float]
-    row: Row
+    scenario: Scenario  # with these agents alone, from `-PAD_S` to `PAD_S` after `duration_s`
+    moment_s: Mapping[str, float]  # when each agent is where the parameters are of
+    row: Row  # the hit
 
     @classmethod
     def of(cls, scenario: Scenario, row: Row) -> Base:
         """Cut a hit out of its scenario.
 
-        Raises
-        ------
-        ConfigError
-            Where its agents are not in the scenario.
+        Raises `ConfigError` where its agents are not in the scenario.
         """
         ids = [id for id in (row["agent"], row.get("other")) if id is not None]
         begin_s = row["t_s"] - float(np.clip(row["t_s"] - row["start_s"] + 1.0, *BEFORE_S))

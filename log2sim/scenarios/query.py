@@ -30,21 +30,11 @@ JOIN = """LEFT JOIN tags AS {j} ON {j}.file = e.file AND {j}.tag = ? AND {j}.sta
 
 @dataclass(frozen=True)
 class Found:
-    """What came of a query.
+    """What came of a query."""
 
-    Attributes
-    ----------
-    rows : tuple of dict
-        Tags that fulfil the condition, the most probable first.
-    main : tuple of str
-        The tags that the rows are of.
-    closest : tuple of str
-        Where there are none: sentences that say what was closest.
-    """
-
-    rows: tuple[Row, ...]
-    main: tuple[str, ...]
-    closest: tuple[str, ...] = ()
+    rows: tuple[Row, ...]  # tags that fulfil the condition, the most probable first
+    main: tuple[str, ...]  # the tags that the rows are of
+    closest: tuple[str, ...] = ()  # where there are none: sentences that say what was closest
 
 
 @dataclass
@@ -222,6 +212,9 @@ def _main_tags(node: ast.expr) -> list[str]:
 def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
     """Find the tags of an index that fulfil a condition.
 
+    Raises `ConfigError` for a condition that is not understood, or that has unknown names. Raises `MissingExtra`
+    without DuckDB.
+
     Parameters
     ----------
     text : str
@@ -229,13 +222,6 @@ def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
         user and a time with the first, whose fields then are "hard_braking.deceleration_mps2". What is not known fulfils no comparison.
     min_probability : float
         Of the tags, unless the condition says something of `probability`.
-
-    Raises
-    ------
-    ConfigError
-        For a condition that is not understood, or that has unknown names.
-    MissingExtra
-        Without DuckDB.
     """
     try:
         import duckdb

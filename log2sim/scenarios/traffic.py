@@ -61,30 +61,14 @@ SAME_WAY_RAD = np.pi / 4
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Where all agents (A, T) are relative to a reference agent R and the path that it drives.
+    """Where all agents (A, T) are relative to a reference agent R and the path that it drives."""
 
-    Attributes
-    ----------
-    ahead_m : (A, T) float64, m
-        Of R's center along its path; NaN where either is absent or they are out of reach.
-    aside_m : (A, T) float64, m
-        To the left of R's path.
-    turn_rad : (A, T) float64, rad
-        Course of the agent minus that of the path at its place.
-    gap_m : (A, T) float64, m
-        Between the nearest bumpers along the path; negative side by side.
-    sigma_m : (A, T) float64, m
-        Standard deviation of the offset, of both agents and of where the path leads.
-    half_m : float, m
-        Half the width of R's lane.
-    """
-
-    ahead_m: Array
-    aside_m: Array
-    turn_rad: Array
-    gap_m: Array
-    sigma_m: Array
-    half_m: float
+    ahead_m: Array  # (A, T), m: of R's center along its path; NaN where either is absent or they are out of reach
+    aside_m: Array  # (A, T), m: to the left of R's path
+    turn_rad: Array  # (A, T), rad: course of the agent minus that of the path at its place
+    gap_m: Array  # (A, T), m: between the nearest bumpers along the path; negative side by side
+    sigma_m: Array  # (A, T), m: standard deviation of the offset, of both agents and of where the path leads
+    half_m: float  # m: half the width of R's lane
 
     @cached_property
     def in_lane(self) -> Mask:
@@ -122,19 +106,11 @@ class Continued(NamedTuple):
 
 
 class Path(NamedTuple):
-    """The path of an agent, continued at both ends.
-
-    Attributes
-    ----------
-    station_m : (T,) float64, m
-        Of the agent on it; NaN where it is elsewhere.
-    begin_m, end_m : float, m
-        Between these stations it is known where it leads.
-    """
+    """The path of an agent, continued at both ends."""
 
     line: Polyline
-    station_m: Array
-    begin_m: float
+    station_m: Array  # (T,), m: of the agent on it; NaN where it is elsewhere
+    begin_m: float  # m: between these stations it is known where it leads; likewise `end_m`
     end_m: float
 
 

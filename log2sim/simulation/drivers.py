@@ -67,17 +67,14 @@ def roll_out(
 ) -> Motions:
     """Simulate all agents that are there at a time, `count` times.
 
+    Raises `ConfigError` for an unknown model.
+
     Parameters
     ----------
     model : str
         One of `MODELS`; all but "drivers" do the same in each rollout.
     horizon_s : float, s
         For which they are simulated; what they did in the `HISTORY_S` before comes first.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown model.
     """
     if model not in MODELS:
         raise ConfigError(f"model '{model}'{nearest(model, list(MODELS))}: expected one of {', '.join(MODELS)}")

@@ -40,36 +40,20 @@ class WarningSettings:
 
     With the defaults a vehicle at 30 km/h stands after 12.7 m, 8.3 m of which it drives before it brakes.
 
-    Attributes
-    ----------
-    ends : {"both", "vehicle", "road"}
-        Whose observations count.
-    horizon_s : float, s
-        Collisions are predicted for so long: from 200 km/h, a vehicle stands after 4.5 s.
-    min_probability : float
-        Of a predicted collision, from which on it is warned of when the ego has to react at once to stand before it.
-    early_probability : float
-        The same up to `margin_s` earlier: while there is time to wait, a doubtful prediction is waited for to become clear.
-    margin_s : float, s
-        Still earlier, there is no warning: who walks or drives toward the ego's path then usually stops before it.
-    reaction_s : float, s
-        From the warning until the brakes work.
-    brake_mps2 : float, m/s2
-        Deceleration: of a dry road, less what brakes need to build up.
-
-    Raises
-    ------
-    ConfigError
-        For a value out of its range.
+    Raises `ConfigError` for a value out of its range.
     """
 
-    ends: str = "both"
-    horizon_s: float = 5.0
+    ends: str = "both"  # one of "both", "vehicle", "road": whose observations count
+    horizon_s: float = 5.0  # s: collisions are predicted for so long: from 200 km/h, a vehicle stands after 4.5 s
+    # Of a predicted collision, from which on it is warned of when the ego has to react at once to stand before it.
     min_probability: float = 0.5
+    # The same up to `margin_s` earlier: while there is time to wait, a doubtful prediction is waited for to become
+    # clear.
     early_probability: float = 0.8
+    # s: still earlier, there is no warning: who walks or drives toward the ego's path then usually stops before it.
     margin_s: float = 1.0
-    reaction_s: float = 1.0
-    brake_mps2: float = 8.0
+    reaction_s: float = 1.0  # s: from the warning until the brakes work
+    brake_mps2: float = 8.0  # m/s2: deceleration: of a dry road, less what brakes need to build up
 
     def __post_init__(self) -> None:
         """Check all values."""

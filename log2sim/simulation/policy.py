@@ -34,21 +34,11 @@ PATH_AHEAD_M = 100.0
 
 @dataclass(frozen=True)
 class Controls:
-    """What a policy returns: the commands until its next call.
+    """What a policy returns: the commands until its next call."""
 
-    Attributes
-    ----------
-    accel_mps2 : float
-        Positive throttle, negative brake; braking ends at standstill.
-    steer_rad : float
-        At the road wheels, positive left.
-    reverse : bool
-        Engages at standstill; throttle then drives backward.
-    """
-
-    accel_mps2: float
-    steer_rad: float
-    reverse: bool = False
+    accel_mps2: float  # positive throttle, negative brake; braking ends at standstill
+    steer_rad: float  # at the road wheels, positive left
+    reverse: bool = False  # engages at standstill; throttle then drives backward
 
 
 @dataclass(frozen=True)
@@ -56,58 +46,39 @@ class EgoState:
     """Pose, motion, actuators and size of the ego.
 
     A curvature c takes a steering angle of atan(wheelbase c (1 + understeer speed^2)).
-
-    Attributes
-    ----------
-    x_m, y_m, z_m, yaw_rad : float
-        Box center and heading, map frame.
-    accel_mps2, steer_rad : float
-        Present state of the actuators: along the heading; at the road wheels.
-    wheelbase_m : float
-        From the rear to the front axle.
-    rear_axle_offset_m : float
-        From the rear axle, about which a vehicle turns, forward to the box center.
     """
 
-    x_m: float
+    x_m: float  # box center and heading, map frame; likewise `y_m`, `z_m`, `yaw_rad`
     y_m: float
     z_m: float
     yaw_rad: float
     speed_mps: float
-    accel_mps2: float
+    accel_mps2: float  # present state of the actuators: along the heading; at the road wheels; likewise `steer_rad`
     steer_rad: float
     length_m: float
     width_m: float
     height_m: float
-    wheelbase_m: float
-    rear_axle_offset_m: float
+    wheelbase_m: float  # from the rear to the front axle
+    rear_axle_offset_m: float  # from the rear axle, about which a vehicle turns, forward to the box center
     understeer_s2pm2: float
 
 
 @dataclass(frozen=True, eq=False)
 class Others:
-    """Other agents whose box center is within range, nearest first, as columns (A,); static ones too.
+    """Other agents whose box center is within range, nearest first, as columns (A,); static ones too."""
 
-    Attributes
-    ----------
-    id, category : (A,) str
-    x_m, y_m, z_m, yaw_rad, speed_mps : (A,) float64
-        An agent on another level, by `z_m` and `height_m`, is no obstacle.
-    velocity_x_mps, velocity_y_mps : (A,) float64, m/s
-        On the axes of the map.
-    length_m, width_m, height_m : (A,) float64
-    """
-
-    id: NDArray[Any]
+    id: NDArray[Any]  # (A,); likewise `category`
     category: NDArray[Any]
+    # (A,): an agent on another level, by `z_m` and `height_m`, is no obstacle; likewise `y_m`, `z_m`, `yaw_rad`,
+    # `speed_mps`.
     x_m: Array
     y_m: Array
     z_m: Array
     yaw_rad: Array
     speed_mps: Array
-    velocity_x_mps: Array
+    velocity_x_mps: Array  # (A,), m/s: on the axes of the map; likewise `velocity_y_mps`
     velocity_y_mps: Array
-    length_m: Array
+    length_m: Array  # (A,); likewise `width_m`, `height_m`
     width_m: Array
     height_m: Array
 
@@ -118,14 +89,9 @@ class Others:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """States of the scenario's ego during the next 10 s, as columns (T,) every 0.1 s until the end of the scenario.
+    """States of the scenario's ego during the next 10 s, as columns (T,) every 0.1 s until the end of the scenario."""
 
-    Attributes
-    ----------
-    t_s, x_m, y_m, yaw_rad, speed_mps : (T,) float64
-    """
-
-    t_s: Array
+    t_s: Array  # (T,); likewise `x_m`, `y_m`, `yaw_rad`, `speed_mps`
     x_m: Array
     y_m: Array
     yaw_rad: Array
@@ -137,58 +103,35 @@ class PathAhead:
     """The path of the scenario's ego ahead of the ego, whenever it was there, as columns (P,): 100 m, one row a meter.
 
     Beyond the end of the scenario the path goes straight on at the last speed.
-
-    Attributes
-    ----------
-    progress_m : float
-        Distance along the path up to the first row, which is the one nearest to the ego.
-    distance_m : (P,) float64
-        From the first row.
-    x_m, y_m : (P,) float64
-    yaw_rad : (P,) float64
-        Direction of travel.
-    speed_mps : (P,) float64
-        Speed of the scenario at this place.
-    t_s : (P,) float64
-        When the scenario was there; NaN beyond its end.
     """
 
-    progress_m: float
-    distance_m: Array
-    x_m: Array
+    progress_m: float  # distance along the path up to the first row, which is the one nearest to the ego
+    distance_m: Array  # (P,): from the first row
+    x_m: Array  # (P,); likewise `y_m`
     y_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    t_s: Array
+    yaw_rad: Array  # (P,): direction of travel
+    speed_mps: Array  # (P,): speed of the scenario at this place
+    t_s: Array  # (P,): when the scenario was there; NaN beyond its end
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What a policy observes at one time.
-
-    Attributes
-    ----------
-    dt_s : float
-        The returned controls hold for this long.
-    look : callable or None
-        What `sweep` and `image` call; None where no sensors are simulated.
-    """
+    """What a policy observes at one time."""
 
     t_s: float
-    dt_s: float
+    dt_s: float  # the returned controls hold for this long
     ego: EgoState
     others: Others
     route: Route
     path: PathAhead
+    # What `sweep` and `image` call; None where no sensors are simulated.
     look: Callable[[Observation, Literal["sweep", "image"], str], Any] | None = None
 
     def sweep(self, name: str) -> Sweep:
         """Return the sweep of a LiDAR that ends now, its points in the LiDAR's frame at their own times; it is cast when asked for.
 
-        Raises
-        ------
-        ConfigError
-            Where no sensors are simulated (`log2sim.resim.simulate.with_sensors` does), or for a LiDAR that is not simulated.
+        Raises `ConfigError` where no sensors are simulated (`log2sim.resim.simulate.with_sensors` does), or for a LiDAR
+        that is not simulated.
         """
         sweep: Sweep = self._looked("sweep", name)
         return sweep
@@ -196,10 +139,7 @@ class Observation:
     def image(self, name: str) -> NDArray[np.uint8]:
         """Return the picture (H, W, 3), BGR, that a camera takes now; it is made when asked for.
 
-        Raises
-        ------
-        ConfigError
-            As of `sweep`; and where the ego is too far off the recorded path.
+        Raises `ConfigError` as of `sweep`; and where the ego is too far off the recorded path.
         """
         image: NDArray[np.uint8] = self._looked("image", name)
         return image
@@ -258,10 +198,7 @@ def load_policy(name: str) -> Policy:
     A module is looked up in the current folder first, as `python -m` does; a file can import from its own folder. A class is
     instantiated without arguments.
 
-    Raises
-    ------
-    ConfigError
-        When the name has another form, or cannot be imported, instantiated or called.
+    Raises `ConfigError` when the name has another form, or cannot be imported, instantiated or called.
     """
     source, colon, attribute = name.rpartition(":")
     if not colon and name:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,44 +23,19 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """Agents (A,) at the moment from which they are simulated, as their own last second tells.
-
-    Attributes
-    ----------
-    place_m : (A,) complex128
-    course_rad, yaw_rad : (A,) float64
-        Direction of travel and of the box.
-    speed_mps, accel_mps2, turn_radps : (A,) float64
-        Along the course.
-    moves : (A,) bool
-        False for those that are static.
-    jitter : (3, A) float64
-        What the log jitters by along, across, in m, and in heading, in rad: one standard deviation.
-    """
+    """Agents (A,) at the moment from which they are simulated, as their own last second tells."""
 
     agents: tuple[Agent, ...]
-    place_m: Complex
-    course_rad: Array
+    place_m: Complex  # (A,), complex
+    course_rad: Array  # (A,): direction of travel and of the box; likewise `yaw_rad`
     yaw_rad: Array
-    speed_mps: Array
+    speed_mps: Array  # (A,): along the course; likewise `accel_mps2`, `turn_radps`
     accel_mps2: Array
     turn_radps: Array
-    moves: Mask
-    jitter: Array
-
-    @property
-    def size_m(self) -> Array:
-        """Length and width (A, 2)."""
-        return sizes_of(self.agents)
-
-    @property
-    def group(self) -> NDArray[np.str_]:
-        """Groups of categories (A,)."""
-        return _groups_of(self.agents)
-
-
-def _groups_of(agents: Sequence[Agent]) -> NDArray[np.str_]:
-    return np.array([GROUP_OF.get(a.category, "other") for a in agents], dtype="<U16")
+    moves: Mask  # (A,): False for those that are static
+    jitter: Array  # (3, A): what the log jitters by along, across, in m, and in heading, in rad: one standard deviation
+    size_m: Array  # (A, 2), m: length and width
+    group: NDArray[np.str_]  # (A,): of categories
 
 
 def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]:
@@ -133,11 +107,11 @@ def observe(scenario: Scenario, now_s: float) -> Present:
         accel[k] = 2 * fits[0][0]
         rest = [c - np.polyval(fit, t) for c, fit in zip((way.real, way.imag), fits)]
         jitter[:, k] = [_jitter(c) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
-    group = _groups_of(known)
+    group = np.array([GROUP_OF.get(a.category, "other") for a in known], dtype="<U16")
     return Present(
         tuple(known), place, wrap_angle(course), yaw, np.where(slow, 0.0, speed), np.clip(accel, -4.0, 3.0),
         np.where(slow, 0.0, smooth.turn_radps[row, last]), np.array([not a.static for a in known], dtype=bool),
-        np.stack([_drawn_to_group(c, group) for c in jitter]),
+        np.stack([_drawn_to_group(c, group) for c in jitter]), sizes_of(known), group,
     )  # fmt: skip
 
 

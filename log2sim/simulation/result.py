@@ -121,54 +121,27 @@ class Commands:
 
 @dataclass(frozen=True, eq=False)
 class AgentReplay:
-    """States of one agent during its lifetime.
-
-    Attributes
-    ----------
-    size_m : (3,) tuple of float, m
-        Length, width, height.
-    driver : str
-        "static" (one pose, two rows), "exact" (placed on its trajectory), "pid", "reactive" or "policy".
-    model : str
-        "none", "point", "kinematic", "dynamic", "single-track" or the name of an external simulator.
-    t_s : (S,) float64, s
-    x_m, y_m, z_m : (S,) float64, m
-        Box center, map frame.
-    yaw_rad : (S,) float64
-    speed_mps : (S,) float64, m/s
-        Along the heading.
-    steer_rad : (S,) float64
-        At the road wheels; 0 for agents that do not steer.
-    accel_mps2 : (S,) float64, m/s2
-        Along the heading.
-    flags : tuple of str
-        What in the scenario cannot be driven.
-    model_reason : str
-        Why this model was chosen.
-    commands : Commands or None
-        None without a vehicle model.
-    cross_track_m, along_track_m : (S,) float64 or None, m
-        Distance from the scenario, left and ahead positive; None for static agents.
-    """
+    """States of one agent during its lifetime."""
 
     __repr__ = short_repr
 
     id: str
     category: str
-    size_m: tuple[float, float, float]
-    driver: str
-    model: str
-    t_s: Array
-    x_m: Array
+    size_m: tuple[float, float, float]  # (3,), m: length, width, height
+    driver: str  # "static" (one pose, two rows), "exact" (placed on its trajectory), "pid", "reactive" or "policy"
+    model: str  # "none", "point", "kinematic", "dynamic", "single-track" or the name of an external simulator
+    t_s: Array  # (S,), s
+    x_m: Array  # (S,), m: box center, map frame; likewise `y_m`, `z_m`
     y_m: Array
     z_m: Array
-    yaw_rad: Array
-    speed_mps: Array
-    steer_rad: Array
-    accel_mps2: Array
-    flags: tuple[str, ...] = ()
-    model_reason: str = ""
-    commands: Commands | None = None
+    yaw_rad: Array  # (S,)
+    speed_mps: Array  # (S,), m/s: along the heading
+    steer_rad: Array  # (S,): at the road wheels; 0 for agents that do not steer
+    accel_mps2: Array  # (S,), m/s2: along the heading
+    flags: tuple[str, ...] = ()  # what in the scenario cannot be driven
+    model_reason: str = ""  # why this model was chosen
+    commands: Commands | None = None  # None without a vehicle model
+    # (S,), m: distance from the scenario, left and ahead positive; None for static agents; likewise `along_track_m`.
     cross_track_m: Array | None = None
     along_track_m: Array | None = None
 
@@ -182,38 +155,19 @@ class AgentReplay:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A replayed scenario.
+    """A replayed scenario."""
 
-    Attributes
-    ----------
-    scenario : str
-        Name of the scenario.
-    scenario_digest : str
-        SHA-256 of its document.
-    mode, model : str
-        As requested.
-    dt_s : float, s
-        Simulation step.
-    store_dt_s : float, s
-        Spacing of the stored states.
-    metrics : mapping
-        As in `schemas/replay-1.json`.
-    left_out : mapping
-        Agents of the scenario's file that were left out before it was replayed: id and why.
-    warnings : Warnings or None
-        Who was on a collision course with the ego, if that was asked for.
-    """
-
-    scenario: str
-    scenario_digest: str
-    mode: str
+    scenario: str  # name of the scenario
+    scenario_digest: str  # SHA-256 of its document
+    mode: str  # as requested; likewise `model`
     model: str
-    dt_s: float
-    store_dt_s: float
+    dt_s: float  # s: simulation step
+    store_dt_s: float  # s: spacing of the stored states
     agents: tuple[AgentReplay, ...]
-    metrics: Mapping[str, Any] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)  # as in `schemas/replay-1.json`
+    # Agents of the scenario's file that were left out before it was replayed: id and why.
     left_out: Mapping[str, str] = field(default_factory=dict)
-    warnings: Warnings | None = None
+    warnings: Warnings | None = None  # who was on a collision course with the ego, if that was asked for
 
     def __repr__(self) -> str:
         """Return scenario, mode, model and agents in one line."""

@@ -323,6 +323,10 @@ def replay(
 ) -> Replay:
     """Replay a scenario and compare the replay with it.
 
+    Raises `ConfigError` when an argument is out of its range, or a policy is given for a scenario without an ego on
+    wheels. Raises `ScenarioError` when an agent has no waypoints, or waypoints that are not finite or not in the order
+    of time.
+
     Parameters
     ----------
     mode : {"pid", "exact"}
@@ -352,13 +356,6 @@ def replay(
         Whether agents whose confidence is too low, see `Agent.quarantined`, are there too.
     progress : callable, optional
         Called now and then with the number of steps done and of all steps.
-
-    Raises
-    ------
-    ConfigError
-        When an argument is out of its range, or a policy is given for a scenario without an ego on wheels.
-    ScenarioError
-        When an agent has no waypoints, or waypoints that are not finite or not in the order of time.
 
     Notes
     -----

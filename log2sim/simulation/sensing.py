@@ -18,19 +18,13 @@ CORRELATION_S = 0.5
 
 @dataclass(frozen=True)
 class Sensing:
-    """What lies between others and a policy.
+    """What lies between others and a policy."""
 
-    Attributes
-    ----------
-    latency_s, latency_sigma_s : float, s
-        Of each observation, normal and never negative; what comes late is passed over where a newer one is there already.
-    noise_m : float, m
-        Standard deviation of the places of others on both axes, correlated over `CORRELATION_S`.
-    """
-
+    # s: of each observation, normal and never negative; what comes late is passed over where a newer one is there
+    # already; likewise `latency_sigma_s`.
     latency_s: float = 0.0
     latency_sigma_s: float = 0.0
-    noise_m: float = 0.0
+    noise_m: float = 0.0  # m: standard deviation of the places of others on both axes, correlated over `CORRELATION_S`
 
     def __bool__(self) -> bool:
         """Whether anything is late or off."""

@@ -229,6 +229,8 @@ def warn(
 ) -> Warnings:
     """Find the agents on a collision course with the ego, or without one with any vehicle: since when they are known, and when they are warned of.
 
+    Raises `ConfigError` for a scenario without an ego and without vehicles that move, or unknown ends.
+
     Parameters
     ----------
     scenario : Scenario
@@ -239,11 +241,6 @@ def warn(
         Whose observations count.
     settings : WarningSettings, optional
         Its `ends` are replaced by those above.
-
-    Raises
-    ------
-    ConfigError
-        For a scenario without an ego and without vehicles that move, or unknown ends.
 
     Notes
     -----

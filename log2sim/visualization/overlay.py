@@ -23,11 +23,8 @@ from log2sim.geometry import (
     Array,
     Camera,
     PoseTrack,
-    apply,
-    box_corners,
     box_corners_bev,
     box_lines,
-    line_time_s,
     project_moving,
 )
 from log2sim.perception.detect.detectors import MAX_AGE_S, boxes_of_labels, interpolate_pairs, window_ns
@@ -37,7 +34,7 @@ from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule, synchronize
 from log2sim.visualization.plot.drawing import add_lines
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, new_figure, printable_label, save_png
-from log2sim.visualization.recording import require_cameras
+from log2sim.visualization.recording import corners_in_view, require_cameras
 
 # Stamps of labels and frames of one moment differ by rounding in some logs.
 STAMP_TOLERANCE_NS = 1_000_000
@@ -216,17 +213,14 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
 def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str], ...]:
     """Project the edges of the labels at a stamp; each box takes the pose of the line that shows its center."""
     boxes = labels_at(log.labels, t_ns)
-    cam_T_map_at = poses_around(log, camera.name, t_ns)
     view = view_of(log, camera.name, t_ns)
     if view is None:
         return ()
-    projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
+    shown = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
     out = []
-    for i in np.flatnonzero(projected.valid):
-        middle_px = projected.box_px[i].reshape(2, 2).mean(axis=0)[None]
-        cam_T_map = cam_T_map_at(line_time_s(camera, middle_px))[0]
-        corners = box_corners(boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])[0]
-        out.append((box_lines(camera, apply(cam_T_map, corners)), str(boxes.category[i])))
+    for i in np.flatnonzero(shown.valid):
+        corners = corners_in_view(view, shown.box_px[i], boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])
+        out.append((box_lines(camera, corners), str(boxes.category[i])))
     return tuple(out)
 
 

@@ -143,9 +143,8 @@ class OutlineProjector:
         out = []
         for i in shown[np.argsort(-found.range_m[shown], kind="stable")]:
             row = int(rows[i])
-            corners = box_corners(center[row], table.size_m[row], yaw[row])[0]
-            middle_px = found.box_px[i].reshape(2, 2).mean(axis=0)[None]
-            kind, coordinates = ground_outline(view.camera, apply(_cam_T_map(view, middle_px), corners))
+            corners = corners_in_view(view, found.box_px[i], center[row], table.size_m[row], yaw[row])
+            kind, coordinates = ground_outline(view.camera, corners)
             if len(coordinates):
                 out.append([row, kind, *np.rint(coordinates).astype(np.int64).ravel().tolist()])
         return out
@@ -170,11 +169,13 @@ def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
     return SEGMENTS, box_lines(camera, corners_cam)
 
 
-def _cam_T_map(view: View, middle_px: Array) -> Array:
-    """Return the transform (4, 4) at the time of the line that shows the middle of a box."""
+def corners_in_view(view: View, box_px: Array, center_m: Array, size_m: Array, yaw_rad: float) -> Array:
+    """Return the corners (8, 3), m, cam frame, of a box that is shown as `box_px` (4,), when the line of its middle is taken."""
     if view.cam_T_map_at is None:
-        return inverse(view.map_T_cam)
-    return np.asarray(view.cam_T_map_at(line_time_s(view.camera, middle_px))[0])
+        cam_T_map = inverse(view.map_T_cam)
+    else:
+        cam_T_map = view.cam_T_map_at(line_time_s(view.camera, box_px.reshape(2, 2).mean(axis=0)[None]))[0]
+    return apply(cam_T_map, box_corners(center_m, size_m, yaw_rad)[0])
 
 
 QUALITY = 72  # of JPEGs, of 100: at the sizes of a page, blocks are hardly seen

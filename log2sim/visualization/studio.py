@@ -45,12 +45,8 @@ class Studio:
     ) -> None:
         """Open a scenario; `path` holds its corrections, earlier ones are gone on with.
 
-        Raises
-        ------
-        ScenarioError, ConfigError
-            When the file is none of corrections, or they contradict each other.
-        OSError
-            When the port is taken.
+        Raises `ScenarioError` or `ConfigError` when the file is none of corrections, or they contradict each other.
+        Raises `OSError` when the port is taken.
         """
         self.scenario, self.path, self.recorded, self.background = scenario, path, recorded, background
         empty = {"format": "log2sim-corrections", "version": 1, "log": scenario.name, "corrections": []}

@@ -21,11 +21,12 @@ from log2sim.geometry import (
     rotation_from_rpy,
     transform,
 )
-from log2sim.logs.kitti.labels import EARTH_RADIUS_M, EGO_T_IMU
+from log2sim.logs.kitti.labels import EGO_T_IMU
 from log_encoders.world import labels_at
 
 CAMERA, LIDAR = "front", "top"
 LATITUDE_DEG, LONGITUDE_DEG = 49.0, 8.4
+EARTH_RADIUS_M = 6378137.0
 HALF_TURN_NS = 50_000_000
 # Of camera 2 from the rectified camera 0, and of the axes of the cameras before and after rectification.
 CAM_T_RECT = transform(np.eye(3), [0.06, -0.002, 0.003])

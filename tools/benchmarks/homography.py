@@ -347,5 +347,4 @@ def sections(*, quick: bool) -> tuple[str, str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command."""
     print_section("homography", sections, arguments)

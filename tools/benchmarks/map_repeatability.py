@@ -189,7 +189,6 @@ def quantile_text(values_m: Array) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print the figures."""
     parser = parser_of(__doc__)
     parser.add_argument("log", type=Path)
     parser.add_argument("--sequence")

@@ -182,5 +182,4 @@ def sections(*, quick: bool) -> tuple[str, str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command."""
     print_section("projection", sections, arguments)

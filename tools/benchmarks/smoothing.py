@@ -369,5 +369,4 @@ def by_bound(seeds: int) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command."""
     print_section("smoothing", sections, arguments)

@@ -234,7 +234,6 @@ class Stage:
         return s
 
     def world(self, name: str, events: Sequence[Event], tags: tuple[str, ...], **parts: object) -> World:
-        """Return the world."""
         side = "left" if self.mirrored else "right"
         label = f"{name}, {self.rate_hz:g} Hz, {side}"
         return World(Scenario(label, 0, self.duration_s, tuple(self.agents), **parts), list(events), tags)

@@ -72,12 +72,12 @@ def agents_of(case: Case, log: str) -> list[Rated]:
     gathered: list[tuple[Any, Table]] = []
     judged: list[Any] = []
 
-    def keep_table(candidates: Sequence[Any], recording: Any) -> Table:
-        gathered.append((list(candidates), gather(candidates, recording)))
+    def keep_table(candidates: Sequence[Any], recording: Any, jobs: int) -> Table:
+        gathered.append((list(candidates), gather(candidates, recording, jobs)))
         return gathered[-1][1] | {"confirmed": np.ones(len(candidates))}
 
-    def keep_candidates(*arguments: Any) -> Any:
-        judged.extend(judging.judge(*arguments))
+    def keep_candidates(*arguments: Any, jobs: int) -> Any:
+        judged.extend(judging.judge(*arguments, jobs=jobs))
         return judged
 
     with (

@@ -73,10 +73,15 @@ TAKEN_FOR = {
 }  # fmt: skip
 
 
-# Pieces of fronts and things as large as a vehicle in which a detector in sweeps sees vehicles for the whole log, by category;
-# the share of them, which varies by log; log-odds of a box, of each thing and of each sweep; and how far sizes vary.
-SEEN_IN_SWEEPS = {"building": ("car", "truck", "bus"), "fence": ("car", "truck"), "container": ("car", "truck"), "shelter": ("car", "truck"), "bush": ("car",), "stall": ("car",)}  # fmt: skip
-SEEN_SHARE, SEEN_ODDS, SWEEP_ODDS, SEEN_SIZE_SIGMA, MIN_SEEN_IN_BOX = 0.06, (0.2, 0.8), 0.5, 0.2, 15
+# Pieces of fronts and things in which a detector in sweeps sees road users for the whole log, by category; the share of them,
+# which varies by log; log-odds of a box, of each thing and of each sweep; and how far sizes vary. On half of the fronts and fences the
+# box is where most rays arrive, and slides along as the sensor passes.
+SEEN_IN_SWEEPS = {
+    "building": ("car", "truck", "bus"), "fence": ("car", "truck"), "container": ("car", "truck"), "shelter": ("car", "truck"),
+    "bush": ("car", "pedestrian"), "stall": ("car",), "pole": ("pedestrian",), "tree": ("pedestrian",), "bin": ("pedestrian",),
+}  # fmt: skip
+SLIDING, SLIDING_SHARE = ("building", "fence"), 0.5
+SEEN_SHARE, SEEN_ODDS, SWEEP_ODDS, SEEN_SIZE_SIGMA, MIN_SEEN_IN_BOX = 0.06, (0.2, 0.8), 0.5, 0.2, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +222,7 @@ class SimulatedDetector:
 
 
 class MistakenDetector:
-    """Adds boxes of vehicles on what is none to those of a detector in sweeps; every box depends on the seed and its sweep alone."""
+    """Adds boxes of road users on what is none to those of a detector in sweeps; every box depends on the seed and its sweep alone."""
 
     def __init__(self, detector: LidarDetector, scene: TrafficScene, seed: int) -> None:
         self._detector, self._seed, self.name = detector, seed, detector.name
@@ -236,13 +241,19 @@ class MistakenDetector:
             )
             c, s = np.cos(thing.yaw_rad), np.sin(thing.yaw_rad)
             at = thing.position_m + np.array([c * along - s * depth, s * along + c * depth, size[2] / 2])
-            self._seen.append((at, size, thing.yaw_rad + rng.normal(0, 0.04), categories, rng.normal(*SEEN_ODDS)))
+            slides = thing.kind in SLIDING and rng.random() < SLIDING_SHARE
+            reach_m = max(thing.size_m[0] - size[0], 0.0) / 2 if slides else 0.0
+            yaw = thing.yaw_rad + rng.normal(0, 0.04)
+            self._seen.append((at, size, yaw, categories, rng.normal(*SEEN_ODDS), reach_m, along))
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         found = self._detector.detect(cloud, earlier)
         rng, rows = np.random.default_rng([self._seed, 5, cloud.stamp_ns // 1_000_000]), []
-        for at, size, yaw, categories, odds in self._seen:
+        for at, size, yaw, categories, odds, reach_m, along in self._seen:
             forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+            if reach_m:  # level with the sensor, as far as the front reaches to both sides of its middle
+                level_m = float(forward @ (cloud.origin + cloud.sensor - at))
+                at = at + float(np.clip(level_m, -reach_m - along, reach_m - along)) * forward
             center, own = at + rng.normal(0, 0.25) * forward, size * np.exp(rng.normal(0, 0.06, 3))
             turned, score = (
                 yaw + np.pi * rng.integers(2) + rng.normal(0, 0.03),

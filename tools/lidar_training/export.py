@@ -136,14 +136,14 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
     return network
 
 
-def describe(path: Path, info: dict[str, Any]) -> None:
+def describe(path: Path, info: dict[str, Any], key: str = METADATA_KEY) -> None:
     """Write the description of a network into its file."""
     import onnx
 
     model = onnx.load(path)
     del model.metadata_props[:]
     entry = model.metadata_props.add()
-    entry.key, entry.value = METADATA_KEY, json.dumps(info)
+    entry.key, entry.value = key, json.dumps(info)
     onnx.save(model, path)
 
 

@@ -61,7 +61,7 @@ def smooth_track(
     correlated over time and have heavier tails than Gaussian ones. `at_s`: (T,): times of the result, by default `t_s`.
     `motion`: by default a vehicle whose most likely jerk densities along and across the path are estimated.
 
-    Raises `ValueError`: For stamps that do not increase, shapes that do not fit or no valid row.
+    Raises `ValueError` for stamps that do not increase, shapes that do not fit, or no valid row.
     """
     motion = MotionModel() if motion is None else motion
     t, xy = np.asarray(t_s, dtype=np.float64), np.asarray(xy_m, dtype=np.float64)

@@ -223,6 +223,9 @@ def bench(
 
     Of a log with LiDARs on the vehicle and at the road, the ends alone and all levels of their fusion are compared, too.
 
+    Raises `LogError` or `ConfigError` or `MissingExtra` for a log that cannot be read or has neither a camera nor
+    LiDARs at both ends, invalid settings, or a detector whose package is missing.
+
     Parameters
     ----------
     log : Log
@@ -237,12 +240,6 @@ def bench(
         Detectors to compare with that of `config`.
     progress : callable, optional
         Called as `progress(what, done, total)`.
-
-    Raises
-    ------
-    LogError, ConfigError, MissingExtra
-        For a log that cannot be read or has neither a camera nor LiDARs at both ends, invalid settings, or a detector whose
-        package is missing.
     """
     report = progress or (lambda what, done, total: None)
     config = config or Config()

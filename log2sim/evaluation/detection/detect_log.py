@@ -78,6 +78,9 @@ def detect_log(
 ) -> LogDetections:
     """Detect road users in the sweeps of a log; the boxes of those that move point where they go.
 
+    Raises `ConfigError` for a detector that is none for LiDARs, or when no sweep is left. Raises `LogError` for a log
+    without LiDAR, or when no sweep can be searched.
+
     Parameters
     ----------
     config : Config, optional
@@ -85,13 +88,6 @@ def detect_log(
         road are joined as tracks, their boxes are joined as boxes.
     progress : callable, optional
         Called with (sweeps done, all sweeps).
-
-    Raises
-    ------
-    ConfigError
-        For a detector that is none for LiDARs, or when no sweep is left.
-    LogError
-        For a log without LiDAR, or when no sweep can be searched.
     """
     config = config or Config(detect="lidar:vehicle")
     if config.detect.in_images or not config.detect.in_sweeps:

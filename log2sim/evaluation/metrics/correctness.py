@@ -245,7 +245,6 @@ def _matrix(counts: NDArray[np.int64], names: NDArray[np.str_]) -> dict[str, dic
 
 
 def _agent_rows(j: JudgedAgents, truth: StateTable) -> list[dict[str, Any]]:
-    """Make one row for each judged agent."""
     v, rows = j.verdicts, []
     for k in np.flatnonzero(v.judged.any(axis=1)):
         ticks = v.judged[k]

@@ -334,6 +334,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measure a scenario against its truth.
 
+    Raises `ConfigError` for an unknown category, a range that is not positive, or a range without an ego to measure it
+    from. Raises `LogError` when the log has no labels. Raises `ScenarioError` when the two do not overlap in time.
+
     Parameters
     ----------
     scenario : Scenario, Result, Path or str
@@ -351,15 +354,6 @@ def evaluate(
     dict
         The document of `schemas/metrics-1.json`. Keys carry the unit: `_m` meters, `_mps` m/s, `_deg` degrees, `_s` seconds;
         recall, precision, MOTA and HOTA are fractions. A figure that cannot be computed is None.
-
-    Raises
-    ------
-    ConfigError
-        For an unknown category, a range that is not positive, or a range without an ego to measure it from.
-    LogError
-        When the log has no labels.
-    ScenarioError
-        When the two do not overlap in time.
 
     Notes
     -----

@@ -104,11 +104,8 @@ EGO_NAMES = ("ego", "hero")
 def load(path: Path | str) -> Scenario:
     """Read an OpenSCENARIO XML file of revision 1.0 to 1.3.
 
-    Raises
-    ------
-    ScenarioError
-        When the file is no such file, or moves its entities in another way than by trajectories with times; names the
-        entity and what was found.
+    Raises `ScenarioError` when the file is no such file, or moves its entities in another way than by trajectories with
+    times; names the entity and what was found.
     """
     path = Path(path)
     root = read(path)

@@ -53,9 +53,8 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
         raise RecordError(f"{path} (stamp {t_ns}): {points} points, more than {MAX_SWEEP_POINTS}")
     rows = np.frombuffer(data, "<f4").reshape(-1, 5)
     xyz, offset_ns = rows[:, :3], firing_offset_ns(rows[:, 4])
-    sensor: Array = np.zeros(
-        3
-    )  # where it was at the time of each point, in its frame at the stamp, where that is known
+    # Where it was at the time of each point, in its frame at the stamp, where that is known.
+    sensor: Array = np.zeros(3)
     if offset_ns is not None:
         first = int(offset_ns.min())
         map_T_lidar, known = poses(np.array([t_ns + first, t_ns]))
@@ -178,7 +177,6 @@ class Scene:
     @cached_property
     def ego(self) -> PoseTrack:
         """Ego poses at the stamps of all sensors, without an offset; those of one stamp are the same."""
-        path = self.tables.path("ego_pose")
         path, where = self.tables.path("ego_pose"), self.tables.path(DATA)
         records = list(
             self.tables.by_token("ego_pose", {text_of(r, "ego_pose_token", where) for r in self.data}).values()

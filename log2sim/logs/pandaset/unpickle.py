@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,82 +99,48 @@ def read_pickled_table(path: Path, error: type[LogError] = RecordError, limit_by
 
 
 class _Part:
-    """Placeholder for an object of pandas or NumPy: its arguments and its state."""
+    """Placeholder for an object of pandas, NumPy or pyarrow: what it is, its arguments and its state."""
 
-    __slots__ = ("args", "state")
+    __slots__ = ("args", "kind", "state")
 
-    def __init__(self, *args: Any) -> None:
-        self.args = args
+    def __init__(self, kind: str, *args: Any) -> None:
+        self.kind, self.args = kind, args
         self.state: Any = None
 
 
-class _Frame(_Part): ...
-
-
-class _Blocks(_Part): ...
-
-
-class _Index(_Part): ...
-
-
-class _Strings(_Part): ...
-
-
-class _ArrowStrings(_Part): ...
-
-
-class _ArrowArray(_Part): ...
-
-
-class _ArrowType(_Part): ...
-
-
-class _Bytes(_Part): ...
-
-
-class _Dtype(_Part): ...
-
-
-class _Array(_Part): ...
-
-
-class _Buffer(_Part): ...
-
-
 class _Allowed:
-    """A name that a pickle may refer to; a call only makes a placeholder."""
+    """A name that a pickle may refer to; a call only makes a placeholder of a kind."""
 
-    __slots__ = ("make",)
+    __slots__ = ("kind",)
 
-    def __init__(self, make: Callable[..., Any]) -> None:
-        self.make = make
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
 
 
 _ALLOWED: dict[str, _Allowed] = {
-    name: _Allowed(make)
-    for make, names in (
-        (_Frame, ("pandas.DataFrame", "pandas.core.frame.DataFrame")),
-        (_Blocks, ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")),
-        (_Part, ("pandas._libs.internals._unpickle_block",)),
-        (_Part, ("pandas.core.internals.blocks.new_block",)),
-        (_Index, ("pandas.core.indexes.base._new_Index", "pandas.indexes.base._new_Index")),
-        (_Index, ("pandas.Index", "pandas.core.indexes.base.Index", "pandas.indexes.base.Index")),
-        (_Index, ("pandas.RangeIndex", "pandas.core.indexes.range.RangeIndex", "pandas.indexes.range.RangeIndex")),
-        (_Index, ("pandas.core.indexes.numeric.Int64Index", "pandas.indexes.numeric.Int64Index")),
-        (_Strings, ("pandas._libs.arrays.__pyx_unpickle_NDArrayBacked",)),
-        (_Part, ("pandas.arrays.StringArray", "pandas.core.arrays.string_.StringArray")),
-        (_Part, ("pandas.NA", "pandas._libs.missing.NA")),
-        (_Part, ("pandas.StringDtype", "pandas.core.arrays.string_.StringDtype")),
-        (_ArrowStrings, ("pandas.arrays.ArrowStringArray", "pandas.core.arrays.string_arrow.ArrowStringArray")),
-        (_ArrowStrings, ("pandas.core.arrays.string_arrow.ArrowStringArrayNumpySemantics",)),
-        (_ArrowArray, ("pyarrow.lib._restore_array",)),
-        (_ArrowType, ("pyarrow.lib.type_for_alias",)),
-        (_Bytes, ("pyarrow.lib.py_buffer", "builtins.bytearray", "__builtin__.bytearray")),
-        (_Array, ("numpy._core.multiarray._reconstruct", "numpy.core.multiarray._reconstruct")),
-        (_Buffer, ("numpy._core.numeric._frombuffer", "numpy.core.numeric._frombuffer")),
-        (_Part, ("numpy.ndarray",)),
-        (_Dtype, ("numpy.dtype",)),
-        (slice, ("builtins.slice", "__builtin__.slice")),
+    name: _Allowed(kind)
+    for kind, *names in (
+        ("Frame", "pandas.DataFrame", "pandas.core.frame.DataFrame"),
+        ("Blocks", "pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager"),
+        ("Part", "pandas._libs.internals._unpickle_block", "pandas.core.internals.blocks.new_block"),
+        ("Index", "pandas.core.indexes.base._new_Index", "pandas.indexes.base._new_Index"),
+        ("Index", "pandas.Index", "pandas.core.indexes.base.Index", "pandas.indexes.base.Index"),
+        ("Index", "pandas.RangeIndex", "pandas.core.indexes.range.RangeIndex", "pandas.indexes.range.RangeIndex"),
+        ("Index", "pandas.core.indexes.numeric.Int64Index", "pandas.indexes.numeric.Int64Index"),
+        ("Strings", "pandas._libs.arrays.__pyx_unpickle_NDArrayBacked"),
+        ("Part", "pandas.arrays.StringArray", "pandas.core.arrays.string_.StringArray"),
+        ("Part", "pandas.NA", "pandas._libs.missing.NA"),
+        ("Part", "pandas.StringDtype", "pandas.core.arrays.string_.StringDtype"),
+        ("ArrowStrings", "pandas.arrays.ArrowStringArray", "pandas.core.arrays.string_arrow.ArrowStringArray"),
+        ("ArrowStrings", "pandas.core.arrays.string_arrow.ArrowStringArrayNumpySemantics"),
+        ("ArrowArray", "pyarrow.lib._restore_array"),
+        ("ArrowType", "pyarrow.lib.type_for_alias"),
+        ("Bytes", "pyarrow.lib.py_buffer", "builtins.bytearray", "__builtin__.bytearray"),
+        ("Array", "numpy._core.multiarray._reconstruct", "numpy.core.multiarray._reconstruct"),
+        ("Buffer", "numpy._core.numeric._frombuffer", "numpy.core.numeric._frombuffer"),
+        ("Part", "numpy.ndarray"),
+        ("Dtype", "numpy.dtype"),
+        ("slice", "builtins.slice", "__builtin__.slice"),
     )
     for name in names
 }
@@ -198,7 +164,7 @@ class _TableUnpickler(pickle._Unpickler):
         known = self.stack.pop()
         if not isinstance(known, _Allowed) or not isinstance(args, tuple):
             raise pickle.UnpicklingError("it calls something that is not a class of tables")
-        self.stack.append(known.make(*args))
+        self.stack.append(slice(*args) if known.kind == "slice" else _Part(known.kind, *args))
 
     def load_state(self) -> None:
         state = self.stack.pop()
@@ -226,11 +192,15 @@ class _TableUnpickler(pickle._Unpickler):
         dispatch[getattr(pickle, _code)[0]] = load_refused
 
 
+def _kind_of(part: Any) -> str:
+    return part.kind if isinstance(part, _Part) else type(part).__name__.strip("_")
+
+
 def _columns(table: Any) -> Columns:
-    if not isinstance(table, _Frame) or not isinstance(table.state, dict):
-        raise ValueError(f"holds a {type(table).__name__.strip('_')}, expected a DataFrame")
+    if _kind_of(table) != "Frame" or not isinstance(table.state, dict):
+        raise ValueError(f"holds a {_kind_of(table)}, expected a DataFrame")
     manager = table.state.get("_mgr", table.state.get("_data"))
-    if not isinstance(manager, _Blocks):
+    if _kind_of(manager) != "Blocks":
         raise ValueError("its DataFrame has no blocks")
     axes, blocks = _layout(manager)
     names = [str(n) for n in _values(axes[0]).tolist()]
@@ -248,7 +218,7 @@ def _columns(table: Any) -> Columns:
     return columns
 
 
-def _layout(manager: _Blocks) -> tuple[list[Any], list[tuple[Any, Any]]]:
+def _layout(manager: Any) -> tuple[list[Any], list[tuple[Any, Any]]]:
     """Axes, and values and column positions of each block, of managers as written before and since pandas 1.3."""
     if manager.args:
         blocks, axes = manager.args
@@ -267,37 +237,38 @@ def _column_indices(place: Any, count: int) -> list[int]:
 
 def _values(part: Any) -> NDArray[Any]:
     """Array that a placeholder stands for."""
-    if isinstance(part, _Index):
+    kind = _kind_of(part)
+    if kind == "Index":
         return _values(part.args[1]["data"])
-    if isinstance(part, _Strings):
-        return _values(next(p for p in part.state if isinstance(p, (_Array, _Buffer))))
-    if isinstance(part, _ArrowStrings):
+    if kind == "Strings":
+        return _values(next(p for p in part.state if _kind_of(p) in ("Array", "Buffer")))
+    if kind == "ArrowStrings":
         return _arrow_values(part.state.get("_pa_array", part.state.get("_data")))
-    if isinstance(part, _Buffer):
-        data, dtype, shape, order = part.args
-        return _from_bytes(data, _dtype(dtype), shape, order)
-    if not isinstance(part, _Array):
-        raise ValueError(f"a {type(part).__name__.strip('_')} where an array was expected")
+    if kind == "Buffer":
+        return _from_bytes(part.args[0], _dtype(part.args[1]), *part.args[2:])
+    if kind != "Array":
+        raise ValueError(f"a {kind} where an array was expected")
     _, shape, dtype, fortran, data = part.state
+    order: Literal["F", "C"] = "F" if fortran else "C"
     if isinstance(data, list):
         cells = np.empty(len(data), dtype=object)
         cells[:] = data
-        return cells.reshape(shape, order="F" if fortran else "C")
-    return _from_bytes(data, _dtype(dtype), shape, "F" if fortran else "C")
+        return cells.reshape(shape, order=order)
+    return _from_bytes(data, _dtype(dtype), shape, order)
 
 
 def _arrow_values(part: Any) -> NDArray[Any]:
     """Texts of an Arrow array."""
-    if not isinstance(part, _ArrowArray):
-        raise ValueError(f"a {type(part).__name__.strip('_')} where the text of an ArrowStringArray was expected")
+    if _kind_of(part) != "ArrowArray":
+        raise ValueError(f"a {_kind_of(part)} where the text of an ArrowStringArray was expected")
     kind, length, _, start, buffers, *_ = part.args[0]
-    name = kind.args[0] if isinstance(kind, _ArrowType) else str(kind)
+    name = kind.args[0] if _kind_of(kind) == "ArrowType" else str(kind)
     return decode_text(name, length, start, [_arrow_bytes(buffer) for buffer in buffers])
 
 
 def _arrow_bytes(part: Any) -> bytes | bytearray | None:
     """Return the bytes of a buffer; a length, for which `bytearray` would make so many zeros, is refused."""
-    while isinstance(part, _Bytes):
+    while _kind_of(part) == "Bytes":
         (part,) = part.args
     if part is not None and not isinstance(part, (bytes, bytearray)):
         raise ValueError("a buffer of an ArrowStringArray has no data")
@@ -311,7 +282,7 @@ def _from_bytes(data: Any, dtype: np.dtype[Any], shape: Any, order: Any) -> NDAr
 
 
 def _dtype(part: Any) -> np.dtype[Any]:
-    code = part.args[0] if isinstance(part, _Dtype) else None
+    code = part.args[0] if _kind_of(part) == "Dtype" else None
     if not isinstance(code, str) or not re.fullmatch(r"b1|[iu][1248]|f[48]", code):
         raise ValueError(f"an array of type {code!r}, expected plain numbers")
     order = part.state[1] if part.state else "="

@@ -60,19 +60,12 @@ def sizes_of(agents: Sequence[Agent]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """R rollouts of A agents at T ticks, `tick_s` apart; NaN where an agent is absent.
-
-    Attributes
-    ----------
-    position_m : (R, A, T) complex128, m
-        Box centers x + iy.
-    yaw_rad : (R, A, T) float64
-    """
+    """R rollouts of A agents at T ticks, `tick_s` apart; NaN where an agent is absent."""
 
     agents: tuple[Agent, ...]
     tick_s: float
-    position_m: Complex
-    yaw_rad: Array
+    position_m: Complex  # (R, A, T), complex, m: box centers x + iy
+    yaw_rad: Array  # (R, A, T)
 
     @property
     def size_m(self) -> Array:

@@ -46,7 +46,6 @@ class Columns:
 class VehicleState(Columns):
     """State of vehicles: rear axle and actuators."""
 
-    # x_m, y_m: (A,)
     x_m: Array
     y_m: Array
     yaw_rad: Array  # (A,) not wrapped
@@ -83,11 +82,9 @@ class VehicleParameters(Columns):
 
     wheelbase_m: Array  # (A,)
     rear_axle_offset_m: Array  # (A,) from the rear axle forward to the box center
-    # max_steer_rad, max_steer_rate_radps, steer_lag_s: (A,)
     max_steer_rad: Array
     max_steer_rate_radps: Array
     steer_lag_s: Array
-    # max_throttle_mps2, max_brake_mps2, max_jerk_mps3, pedal_lag_s: (A,)
     max_throttle_mps2: Array
     max_brake_mps2: Array
     max_jerk_mps3: Array
@@ -123,7 +120,6 @@ class VehicleParameters(Columns):
 class PointState(Columns):
     """Centers of point masses and their velocities on map axes."""
 
-    # x_m, y_m, velocity_x_mps, velocity_y_mps: (A,)
     x_m: Array
     y_m: Array
     velocity_x_mps: Array

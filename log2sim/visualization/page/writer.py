@@ -67,6 +67,10 @@ def write_page(
 ) -> tuple[str, ...]:
     """Write a self-contained page that plays a scenario in a browser and loads nothing over the network.
 
+    Raises `ConfigError` when the name ends in something else than .html, the file exists and `overwrite` is False, it
+    cannot be written, or there are more waypoints than a page can hold, for a horizon that predictions do not have, or
+    when the size is too small for what is to be shown. Raises `LogError` when no record of the log can be read.
+
     Parameters
     ----------
     truth : Scenario or None
@@ -86,15 +90,6 @@ def write_page(
     -------
     tuple of str
         What was taken of the log, in sentences; empty without one.
-
-    Raises
-    ------
-    ConfigError
-        When the name ends in something else than .html, the file exists and `overwrite` is False, it cannot be written, or
-        there are more waypoints than a page can hold, for a horizon that predictions do not have, or when the size is too
-        small for what is to be shown.
-    LogError
-        When no record of the log can be read.
     """
     out_path = Path(out_path)
     if out_path.suffix.lower() not in SUFFIXES:

@@ -211,6 +211,8 @@ def plot(
 ) -> Axes:
     """Draw a scenario from above.
 
+    Raises `ScenarioError` when the truth's map has another projection.
+
     Parameters
     ----------
     ax : matplotlib.axes.Axes, optional
@@ -227,11 +229,6 @@ def plot(
     Returns
     -------
     matplotlib.axes.Axes
-
-    Raises
-    ------
-    ScenarioError
-        When the truth's map has another projection.
     """
     aligned = None if truth is None else truth.aligned_to(scenario)
     new = ax is None

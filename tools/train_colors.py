@@ -1,0 +1,188 @@
+"""Train the network that names the colors of vehicles on rendered pictures: draw, fit, calibrate, report, in one command that resumes.
+
+pip install 'log2sim[train]'
+python tools/train_colors.py --out DIR                                # everything, with the settings of the shipped weights
+python tools/train_colors.py --out DIR --worlds 2000 --steps 500      # a toy
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from color_training.pictures import draw_shape, draw_view, draw_world
+from entry import parser_of
+from lidar_training import fitting
+from lidar_training.export import describe, export_checked
+from lidar_training.fitting import FitPlan
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from log2sim.datatypes import COLOR_NAMES
+from log2sim.road.color_network import LAB_SCALE, METADATA_KEY, SIDE_PX, ColorNetwork, open_color_network
+
+WORLDS, STEPS, BATCH, RATE = 20_000, 4_500, 64, 3e-3
+PER_FILE, SHAPES_PER_FILE = 2_000, 150
+TRACKS, VIEWS = 600, 4  # to calibrate with, and as many to report
+LAB_WEIGHT = 0.5
+PARTS = {"train": 0, "tune": 1, "report": 2}  # parts of the seed: other shapes, paints and lights in each
+
+
+def draw(out: Path, part: str, number: int, worlds: int, views: int, seed: int) -> Path:
+    """Draw pictures of worlds into a file, which is kept."""
+    path = out / f"{part}-{seed}-{number:03d}.npz"
+    if path.exists():
+        return path
+    rng, begun = np.random.default_rng([seed, PARTS[part], number]), time.process_time()
+    shapes = [draw_shape(rng) for _ in range(SHAPES_PER_FILE)]
+    pictures, names, labs, lights = [], [], [], []
+    for _ in range(worlds):
+        world = draw_world(rng)
+        pictures.append([draw_view(world, shapes[int(rng.integers(len(shapes)))], rng) for _ in range(views)])
+        names.append(COLOR_NAMES.index(world.name))
+        labs.append(world.lab)
+        lights.append(world.light)
+    temporary = path.with_suffix(".part.npz")
+    np.savez(temporary, picture=np.array(pictures), name=np.array(names), lab=np.array(labs), light=np.array(lights))
+    temporary.replace(path)
+    print(f"{path.name}: {(time.process_time() - begun) / (worlds * views) * 1e3:.1f} ms of CPU a picture", flush=True)
+    return path
+
+
+class Names(nn.Module):
+    """Logits of the names and the color in CIELAB (B, 13) of pictures (B, 3, 48, 48), RGB from 0 to 1; where to look is learned too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+
+        def layer(inner: int, outer: int, size: int, stride: int = 1) -> nn.Sequential:
+            conv = nn.Conv2d(inner, outer, size, stride, size // 2, bias=False)
+            return nn.Sequential(conv, nn.BatchNorm2d(outer), nn.ReLU())
+
+        self.body = nn.Sequential(
+            layer(3, 24, 3, 2),
+            layer(24, 24, 1),
+            layer(24, 40, 3, 2),
+            layer(40, 40, 1),
+            layer(40, 52, 3, 2),
+            layer(52, 52, 3),
+        )
+        self.where = nn.Conv2d(52, 1, 1)
+        self.mixed = nn.Conv2d(3 * 52, 64, 1)
+        self.head = nn.Conv2d(64, len(COLOR_NAMES) + 3, 1)
+
+    def forward(self, picture: Tensor) -> Tensor:
+        features = self.body(picture * 2 - 1)
+        share = torch.softmax(self.where(features).flatten(2), dim=2)
+        seen = (features.flatten(2) * share).sum(dim=2)
+        pooled = torch.cat([seen, features.mean(dim=(2, 3)), features.amax(dim=(2, 3))], dim=1)[..., None, None]
+        return self.head(torch.relu(self.mixed(pooled))).flatten(1)
+
+
+def fit(paths: list[Path], out: Path, steps: int, seed: int) -> nn.Module:
+    """Fit the network to the pictures of some files, or go on from its checkpoint."""
+    files = [np.load(path) for path in paths]
+    pictures = np.concatenate([f["picture"].reshape(-1, SIDE_PX, SIDE_PX, 3) for f in files])
+    name, lab = np.concatenate([f["name"] for f in files]), np.concatenate([f["lab"] for f in files])
+    torch.manual_seed(seed)
+    network = Names().to(memory_format=torch.channels_last)
+
+    def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        rows = rng.integers(0, len(pictures), BATCH)
+        x = pictures[rows][..., ::-1].astype(np.float32) / 255
+        flip = rng.random(BATCH) < 0.5
+        x[flip] = x[flip, :, ::-1]
+        shift = rng.integers(-3, 4, 2)
+        x = np.roll(x, shift, axis=(1, 2)) * np.exp(rng.normal(0, 0.03, (BATCH, 1, 1, 3))).astype(np.float32)
+        out = network(torch.from_numpy(np.ascontiguousarray(np.clip(x, 0, 1).transpose(0, 3, 1, 2), np.float32)))
+        truth = torch.from_numpy(name[rows])
+        named = nn.functional.cross_entropy(out[:, : len(COLOR_NAMES)], truth)
+        away = nn.functional.smooth_l1_loss(
+            out[:, len(COLOR_NAMES) :], torch.from_numpy((lab[rows] / LAB_SCALE).astype(np.float32))
+        )
+        right = (out[:, : len(COLOR_NAMES)].argmax(dim=1) == truth).float().mean()
+        return named + LAB_WEIGHT * away, {"names": named.item(), "lab": away.item(), "right": right.item()}
+
+    mean = fitting.fit(network, step_loss, FitPlan(steps, seed, RATE, out / "colors.pt", 100))
+    network.load_state_dict(mean)
+    return network.eval()
+
+
+def calibrate(network: ColorNetwork, path: Path) -> tuple[float, float]:
+    """Return what logits of a picture are multiplied by, and the power of their number that the sum over pictures is divided by, by
+    the likelihood of the names."""
+    data = np.load(path)
+    logits = np.stack([network.raw(list(track))[:, : len(COLOR_NAMES)] for track in data["picture"]])
+
+    def loss(scale: float, power: float, views: int) -> float:
+        joined = scale * logits[:, :views].sum(axis=1) / views**power
+        joined -= joined.max(axis=1, keepdims=True)
+        log = joined - np.log(np.exp(joined).sum(axis=1, keepdims=True))
+        return float(-log[np.arange(len(log)), data["name"]].mean())
+
+    scale = min(np.arange(0.4, 1.6, 0.05), key=lambda s: loss(s, 1.0, 1))
+    power = min(np.arange(0.0, 1.01, 0.1), key=lambda p: loss(scale, p, VIEWS))
+    return round(float(scale), 2), round(float(power), 1)
+
+
+def report(network: ColorNetwork, path: Path) -> dict[str, object]:
+    """Measure names on pictures, by light, and on tracks."""
+    data = np.load(path)
+    single = np.array([network.probabilities([track[0]]) for track in data["picture"]])
+    joined = np.array([network.probabilities(list(track)) for track in data["picture"]])
+    rank = (single > np.take_along_axis(single, data["name"][:, None], 1)).sum(axis=1)
+    sure, right = single.max(axis=1), rank == 0
+    bins = np.minimum((sure * 10).astype(int), 9)
+    gap = sum(abs(right[bins == b].mean() - sure[bins == b].mean()) * (bins == b).mean() for b in np.unique(bins))
+    return {
+        "pictures": len(rank), "top1": share(right), "top2": share(rank < 2),
+        "top1_by_light": {str(k): share(right[data["light"] == k]) for k in np.unique(data["light"])},
+        "top1_by_name": {k: share(right[data["name"] == i]) for i, k in enumerate(COLOR_NAMES)},
+        f"top1_of_{VIEWS}_views": share(joined.argmax(axis=1) == data["name"]), "calibration_error": round(float(gap), 4),
+    }  # fmt: skip
+
+
+def share(right: NDArray[np.bool_]) -> float:
+    """Return the share of right names, rounded."""
+    return round(float(right.mean()), 4)
+
+
+def main() -> None:
+    """Run the steps."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of pictures, checkpoint and results")
+    parser.add_argument("--worlds", type=int, default=WORLDS)
+    parser.add_argument("--steps", type=int, default=STEPS)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", choices=("draw",), help="with --first: the files from there on alone")
+    parser.add_argument("--first", type=int, default=0)
+    options = parser.parse_args()
+    out, seed = options.out, options.seed
+    out.mkdir(parents=True, exist_ok=True)
+    each = min(PER_FILE, options.worlds)
+    paths = [draw(out, "train", k, each, 1, seed) for k in range(options.first, options.worlds // each)]
+    if options.only:
+        return
+    tune, test = (draw(out, part, 0, min(TRACKS, each), VIEWS, seed) for part in ("tune", "report"))
+    begun = time.process_time()
+    network, path = fit(paths, out, options.steps, seed), out / "colors.onnx"
+    inputs = {"picture": torch.rand((2, 3, SIDE_PX, SIDE_PX), generator=torch.Generator().manual_seed(0))}
+    axes = {"picture": {0: "batch"}, "names": {0: "batch"}}
+    export_checked(network, path, inputs, ("names",), axes, halved=True)
+    info = {"version": 1, "scale": 1.0, "power": 1.0}
+    describe(path, info, METADATA_KEY)
+    info["scale"], info["power"] = calibrate(open_color_network(path), tune)
+    describe(path, info, METADATA_KEY)
+    card = {
+        "seed": seed, "worlds": options.worlds, "steps": options.steps, "batch": BATCH, "rate": RATE, "torch": torch.__version__,
+        "cpu_s": round(time.process_time() - begun), "calibration": info, "simulated": report(open_color_network(path), test),
+    }  # fmt: skip
+    (out / "colors.json").write_text(json.dumps(card, indent=1) + "\n")
+    print(f"{path.stat().st_size / 1e3:.0f} kB", json.dumps(card), flush=True)
+
+
+if __name__ == "__main__":
+    main()
