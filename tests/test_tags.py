@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from benchmarks.tags import Stage, crossing, f1, route, score, scripted, traffic, variants
 from metric_scenes import agent, scenario
+from scipy.signal import savgol_filter
 
 from log2sim.datatypes import TAGS, MapFeatures, Scenario
 from log2sim.edit import Remove, edit
@@ -17,7 +18,7 @@ from log2sim.errors import ScenarioError
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios import criticality as c
 from log2sim.scenarios import criticality_table, find_tags, tag
-from log2sim.scenarios.traffic import Traffic, latched, runs
+from log2sim.scenarios.traffic import Traffic, fitted, latched, runs
 
 # What has to be reached on the truth.
 LEAST_F1 = {"cut_in": 0.95, "overtaking": 0.97}
@@ -277,3 +278,13 @@ def test_speeds_and_headings_of_labels_that_jump_are_no_braking_and_no_turning_b
     found = find_tags(replace(world, agents=(*world.agents[:2], flips)))
     assert [g.agent for g in found if g.tag == "hard_braking"] == ["car-1"]
     assert not [g for g in found if g.tag in ("u_turn", "turning")]
+
+
+@pytest.mark.parametrize(("window", "order"), [(5, 1), (9, 2), (21, 2)])
+def test_polynomials_through_windows_are_those_of_savitzky_and_golay(window, order):
+    values = np.random.default_rng(5).normal(size=(2, 60)).cumsum(axis=1)
+    expected = savgol_filter(values, window, order)
+    np.testing.assert_allclose(fitted(values[0] + 1j * values[1], window, order), expected[0] + 1j * expected[1])
+    np.testing.assert_allclose(
+        fitted(values[0, :window], window, order), savgol_filter(values[0, :window], window, order)
+    )

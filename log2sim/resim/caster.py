@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from log2sim.resim.rays import Floats, Rays, bin_of
 from log2sim.resim.surfels import Surfels
 
-CELL_RAD = np.float32(np.deg2rad(0.2))
+CELL_RAD, ROW_RAD = np.float32(np.deg2rad(0.1)), np.float32(np.deg2rad(0.2))  # of azimuth and of elevation
 MARGIN_RAD = np.float32(np.deg2rad(0.05))  # around what a disc covers, for what angles leave out
 MAX_HALF_WIDTH_RAD = np.float32(np.deg2rad(20.0))  # of a disc in the sensor's picture
 MIN_RANGE_M = 0.5
@@ -31,9 +31,17 @@ class RayGrid:
     elevation: Floats  # (E,)
     start: NDArray[np.int32]  # (R * C + 1,): first entry of each cell
     columns: int
-    rows: int
+    rank: NDArray[
+        np.int64
+    ]  # (E,): how many rows below one of `CELL_RAD` above `low_el` have a ray; only those are kept
     low_az: np.float32
     low_el: np.float32
+
+    def rows_of(self, elevation: Floats, half: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the first row (N,) that angles with half a width reach, and the one after the last."""
+        last = len(self.rank) - 2
+        low, high = (((elevation + side - self.low_el) / ROW_RAD).astype(np.int64) for side in (-half, half))
+        return self.rank[np.clip(low, 0, last)], self.rank[np.clip(high, -1, last) + 1]
 
 
 def grid_of(rays: Rays) -> RayGrid:
@@ -45,13 +53,16 @@ def grid_of(rays: Rays) -> RayGrid:
     elevation = rays.elevation[index]
     low_az, low_el = np.float32(-np.pi - margin), elevation.min() - CELL_RAD
     columns = int((turn + 2 * margin) / CELL_RAD) + 1
-    row = ((elevation - low_el) / CELL_RAD).astype(np.int64)
+    row = ((elevation - low_el) / ROW_RAD).astype(np.int64)
+    used = np.bincount(row) > 0
+    rank = np.concatenate([[0], np.cumsum(used)])
+    row = rank[row]
     cell = row * columns + ((azimuth - low_az) / CELL_RAD).astype(np.int64)
-    rows = int(row.max()) + 2
+    rows = int(rank[-1])
     order = np.argsort(cell, kind="stable")
     start = np.zeros(rows * columns + 1, np.int32)
     np.cumsum(np.bincount(cell, minlength=rows * columns), out=start[1:])
-    return RayGrid(index[order], azimuth[order], elevation[order], start, columns, rows, low_az, np.float32(low_el))
+    return RayGrid(index[order], azimuth[order], elevation[order], start, columns, rank, low_az, np.float32(low_el))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,29 +93,31 @@ def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floa
     seen = center @ middle[:3, :3].T + middle[:3, 3]
     bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
     # Where the sensor is when it looks there.
-    seen = np.einsum("nij,nj->ni", to_sensor[bins, :3, :3], center) + to_sensor[bins, :3, 3]
-    azimuth = np.arctan2(seen[:, 1], seen[:, 0])
-    flat_m = np.hypot(seen[:, 0], seen[:, 1])
-    distance = np.hypot(flat_m, seen[:, 2])
-    elevation = np.arctan2(seen[:, 2], flat_m)
-    # Half the angles that a disc covers: less for one that is seen from its side.
-    turned = np.einsum("nij,nj->ni", to_sensor[bins, :3, :3], normal)
-    c, s = np.cos(azimuth), np.sin(azimuth)
-    across = c * turned[:, 1] - s * turned[:, 0]
-    upward = (flat_m * turned[:, 2] - seen[:, 2] * (c * turned[:, 0] + s * turned[:, 1])) / np.maximum(distance, 0.01)
+    turn = to_sensor[:, :3].reshape(-1, 12).take(bins, axis=0)
+    x, y, z = (_along(turn, axis, center) + turn[:, 4 * axis + 3] for axis in range(3))
+    flat_m = np.sqrt(x * x + y * y)
+    distance = np.sqrt(flat_m * flat_m + z * z)
+    elevation = np.arctan2(z, flat_m)
     free = np.maximum(distance - radius - rays.spread_m, 0.1)
+    # Most discs are far away, and lie between two lines of the LiDAR even if they face it.
+    low_row, high_row = grid.rows_of(elevation, np.minimum((radius + rays.spread_m) / free, MAX_HALF_WIDTH_RAD))
+    own = np.flatnonzero((high_row > low_row) & (distance > MIN_RANGE_M / 2))
+    x, y, z, flat_m, distance, elevation, free, radius = (
+        v[own] for v in (x, y, z, flat_m, distance, elevation, free, radius)
+    )
+    center, normal, turn = center[own], normal[own], turn[own]
+    azimuth = np.arctan2(y, x)
+    # Half the angles that a disc covers: less for one that is seen from its side.
+    nx, ny, nz = (_along(turn, axis, normal) for axis in range(3))
+    across = (x * ny - y * nx) / np.maximum(flat_m, 0.01)
+    upward = (flat_m * nz - z * (x * nx + y * ny) / np.maximum(flat_m, 0.01)) / np.maximum(distance, 0.01)
     half_az = (radius * np.sqrt(np.maximum(1 - across**2, 0)) + rays.spread_m) / np.maximum(
         free * flat_m / np.maximum(distance, 0.01), 0.1
     )
     half_el = (radius * np.sqrt(np.maximum(1 - upward**2, 0)) + rays.spread_m) / free
     half_az, half_el = np.minimum(half_az, MAX_HALF_WIDTH_RAD), np.minimum(half_el, MAX_HALF_WIDTH_RAD)
-    near = distance > MIN_RANGE_M / 2
-    low_row = ((elevation - half_el - grid.low_el) / CELL_RAD).astype(np.int64)
-    high_row = ((elevation + half_el - grid.low_el) / CELL_RAD).astype(np.int64)
-    near &= (high_row >= 0) & (low_row < grid.rows)
-    low_row, high_row = np.maximum(low_row, 0), np.minimum(high_row, grid.rows - 1)
-    own = np.flatnonzero(near)
-    disc, row = _expanded(own, low_row[own], high_row[own] + 1)
+    low_row, high_row = grid.rows_of(elevation, half_el)
+    disc, row = _expanded(np.arange(len(own)), low_row, high_row)
     low = ((azimuth - half_az - grid.low_az) / CELL_RAD).astype(np.int64)
     high = ((azimuth + half_az - grid.low_az) / CELL_RAD).astype(np.int64)
     begin = grid.start[row * grid.columns + low[disc]].astype(np.int64)
@@ -112,11 +125,10 @@ def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floa
     some = end > begin
     disc, entry = _expanded(disc[some], begin[some], end[some])
     # Cells are wider than what a disc covers of them.
-    beside = np.abs(grid.azimuth.take(entry) - azimuth.take(disc)) < (half_az + MARGIN_RAD).take(disc)
-    kept = np.flatnonzero(beside)
-    disc, entry = disc[kept], entry[kept]
-    kept = np.flatnonzero(np.abs(grid.elevation.take(entry) - elevation.take(disc)) < (half_el + MARGIN_RAD).take(disc))
-    disc, ray = disc[kept], grid.ray[entry[kept]]
+    inside = np.abs(grid.azimuth.take(entry) - azimuth.take(disc)) < (half_az + MARGIN_RAD).take(disc)
+    inside &= np.abs(grid.elevation.take(entry) - elevation.take(disc)) < (half_el + MARGIN_RAD).take(disc)
+    kept = np.flatnonzero(inside)
+    disc, ray = disc.take(kept), grid.ray.take(entry.take(kept))
     # Column by column: sums over three axes by einsum take three times as long.
     slope, along, plane, away2 = np.zeros((4, len(ray)), np.float32)
     for axis in range(3):
@@ -126,15 +138,16 @@ def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floa
         along += offset * d
         plane += n * offset
         away2 += offset * offset
-    rough = np.asarray(~normal.any(axis=1))[disc]
+    rough = ((nx == 0) & (ny == 0) & (nz == 0)).take(disc)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(rough, along, plane / slope)
     # From the middle of the disc to where the ray meets its plane.
     off2 = t * (t - 2 * along) + away2
-    weight = 1 - off2 / radius[disc] ** 2
-    met = (weight > 0) & (t > MIN_RANGE_M) & (rough | (np.abs(slope) > MIN_FACING))
+    weight = np.asarray(1 - off2 / (radius * radius).take(disc), np.float32)
     facing = np.where(rough, np.float32(1), np.abs(slope))
-    return Meetings(ray[met], (disc[met] + first).astype(np.int32), t[met], facing[met], weight[met])
+    met = np.flatnonzero((weight > 0) & (t > MIN_RANGE_M) & (facing > MIN_FACING))
+    surfel = (own.take(disc.take(met)) + first).astype(np.int32)
+    return Meetings(ray.take(met), surfel, t.take(met), facing.take(met), weight.take(met))
 
 
 def _expanded(
@@ -143,8 +156,16 @@ def _expanded(
     """Repeat each index for every number from its begin up to its end, and return those numbers."""
     count = end - begin
     total = np.cumsum(count)
-    which = np.repeat(np.arange(len(index)), count)
-    return index[which], np.arange(len(which)) - (total - count - begin)[which]
+    number = np.repeat(begin - (total - count), count)
+    number += np.arange(len(number))
+    return np.repeat(index, count), number
+
+
+def _along(turn: Floats, axis: int, vector: Floats) -> Floats:
+    """Return a coordinate (N,) of vectors (N, 3) that rows (N, 12) of poses turn."""
+    first = 4 * axis
+    out: Floats = turn[:, first] * vector[:, 0] + turn[:, first + 1] * vector[:, 1] + turn[:, first + 2] * vector[:, 2]
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,21 +196,22 @@ def first_hits(met: Meetings, surfels: Surfels, count: int, rng: np.random.Gener
 
     One draw a ray decides on all discs that lie within a meter of range, as they are of one fence or one tree.
     """
-    share = surfels.share[met.surfel]
+    share = surfels.share.take(met.surfel)
     stops = share > 0.98
     open_ = np.flatnonzero(~stops)
     draws = rng.random((count, 8), dtype=np.float32)
     stops[open_] = draws[met.ray[open_], met.range_m[open_].astype(np.int32) % 8] < share[open_]
-    ray, surfel, t = met.ray[stops], met.surfel[stops], met.range_m[stops]
+    kept = np.flatnonzero(stops)
+    ray, t = met.ray.take(kept), met.range_m.take(kept)
     first = np.full(count, np.inf, np.float32)
     np.minimum.at(first, ray, t)
-    depth = (t - first[ray]) * met.facing[stops]
-    same = depth < THICKNESS_M
+    depth = (t - first.take(ray)) * met.facing.take(kept)
     which = np.full(count, -1, np.int32)
-    at = depth == 0
-    which[ray[at]] = surfel[at]
-    ray, surfel, t = ray[same], surfel[same], t[same]
-    facing, weight = met.facing[stops][same], met.weight[stops][same]
+    at = np.flatnonzero(depth == 0)
+    which[ray[at]] = met.surfel[kept[at]]
+    same = np.flatnonzero(depth < THICKNESS_M)
+    kept, ray, t = kept.take(same), ray.take(same), t.take(same)
+    surfel, facing, weight = met.surfel.take(kept), met.facing.take(kept), met.weight.take(kept)
     total = np.bincount(ray, weight, count)
 
     def mean(values: Floats) -> Floats:
