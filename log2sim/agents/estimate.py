@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
@@ -60,6 +60,7 @@ def estimate_agents(
         found = [*moving, *zip((k for k, p in parts if p.static), standing)]
         return [(k, replace(c, track=replace(c.track, measurements=Measurements.empty()))) for k, c in found]
 
+    jobs = useful_jobs(tracks, jobs)
     shares = split_evenly(range(len(tracks)), jobs)
     found = list(chain.from_iterable(map_in_processes(estimate, shares, jobs)))
     candidates = []

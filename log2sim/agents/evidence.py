@@ -13,7 +13,7 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import AgentCandidate, Timeline
+from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
 from log2sim.agents.rays import count_rays
 from log2sim.agents.size import independent
 from log2sim.datatypes import (
@@ -99,6 +99,7 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int
     """Gather the evidence for and against each of C candidates, which so many processes share."""
     if not candidates:
         return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
+    jobs = useful_jobs((c.track for c in candidates), jobs)
     most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(candidates) // jobs)) or 1
     shares = [candidates[k : k + most] for k in range(0, len(candidates), most)]
 
