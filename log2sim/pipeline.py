@@ -60,7 +60,7 @@ def reconstruct(
     cache : bool
         Whether what is detected and measured is taken from the user's cache, and kept there.
     jobs : int, optional
-        Processes that share the ticks; the result is the same for any number. None for all usable cores, or one with a detector
+        Processes that share the work; the result is the same for any number. None for all usable cores, or one with a detector
         from elsewhere, which need not work in a forked process.
 
     Raises `LogError`, `ConfigError` and `MissingExtra` for logs and settings that cannot work, `PluginError` when the detector fails

@@ -33,7 +33,7 @@ class Run:
 
     `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
     `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
-    of processes that share the ticks.
+    of processes that share the work.
     """
 
     log: Log

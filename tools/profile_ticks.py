@@ -30,6 +30,7 @@ from benchmarks.table import markdown
 from log2sim.config import Config
 from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError
+from log2sim.files.stages import cpu_seconds
 from log2sim.logs.opening import open_log
 from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule
@@ -62,13 +63,9 @@ class Measured:
 
 def times_of(call: Callable[[], Any]) -> tuple[Any, Times]:
     """What a call returns, and its times."""
-
-    def spent() -> float:  # with processes that ended meanwhile
-        return time.process_time() + sum(os.times()[2:4])
-
-    wall, cpu = time.perf_counter(), spent()
+    wall, cpu = time.perf_counter(), cpu_seconds()
     out = call()
-    return out, Times(time.perf_counter() - wall, spent() - cpu)
+    return out, Times(time.perf_counter() - wall, cpu_seconds() - cpu)
 
 
 def records_of(schedule: Schedule) -> list[tuple[str, int]]:
@@ -218,7 +215,7 @@ def main() -> int:
     parser.add_argument("--ticks", type=int, default=0, metavar="N", help="the first ones; by default all")
     parser.add_argument("--repeats", type=int, default=3, metavar="N")
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes that share the ticks; by default the usable cores"
+        "--jobs", type=int, metavar="N", help="processes that share the work; by default the usable cores"
     )
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of reconstruct")
     parser.add_argument("--json", action="store_true", help="all figures as JSON")

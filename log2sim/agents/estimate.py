@@ -29,7 +29,7 @@ from log2sim.datatypes import (
     Track,
     Waypoints,
 )
-from log2sim.files.processes import map_in_processes, split_evenly
+from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, undistort, yaw_of
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.records import RecordSource
@@ -61,7 +61,7 @@ def estimate_agents(
         return [(k, replace(c, track=replace(c.track, measurements=Measurements.empty()))) for k, c in found]
 
     jobs = useful_jobs(tracks, jobs)
-    shares = split_evenly(range(len(tracks)), jobs)
+    shares = [range(k, len(tracks), jobs) for k in range(jobs)]
     found = list(chain.from_iterable(map_in_processes(estimate, shares, jobs)))
     candidates = []
     for k, candidate in sorted(found, key=lambda of: (of[1].agent.static, of[0])):

@@ -167,8 +167,8 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     return columns | {name: float(np.clip(columns[name], low, high)) for name, (low, high) in LIMITS.items()}
 
 
-# Fewer points may lie on one side of a person.
-MIN_WIDE_POINTS = 5
+# Fewer points may lie on one side of a person; by so much extents of points err, m.
+MIN_WIDE_POINTS, EXTENT_ERROR_M = 5, 0.05
 
 
 def _thin(candidate: AgentCandidate) -> float:
@@ -178,7 +178,7 @@ def _thin(candidate: AgentCandidate) -> float:
     widest = widest[np.isfinite(widest)]
     if not len(widest):
         return 0.0
-    return max(float(np.log(TYPICAL_SIZE_M[candidate.agent.category][1] / (np.median(widest) + 0.05))), 0.0)
+    return max(float(np.log(TYPICAL_SIZE_M[candidate.agent.category][1] / (np.median(widest) + EXTENT_ERROR_M))), 0.0)
 
 
 def _odd_size(agent: Agent) -> float:
@@ -293,13 +293,13 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
-    went_on = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_THROUGH_NATS)
+    through_nats = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_THROUGH_NATS)
     solid = np.array([GROUP_OF[agent.category] == "vehicle" for agent in agents])
     return {
-        "through": np.where(solid, went_on, 0.0),
-        "through_gaps": np.where(solid, 0.0, went_on),
+        "through": np.where(solid, through_nats, 0.0),
+        "through_gaps": np.where(solid, 0.0, through_nats),
         "continued": continued(boxes, recording.clouds) * solid,
-        "remains": remaining(boxes, recording.clouds) * [not agent.static for agent in agents],
+        "remains": remaining(boxes, recording.clouds),
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
         "shown_ticks": shown.sum(axis=1).astype(np.float64),
         "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
@@ -317,8 +317,8 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     Only where the points inside are, which is where rays arrive: beyond a side of a vehicle whose end they show is nothing.
     """
     inside, beyond = np.zeros((len(boxes.present), 5)), np.zeros((len(boxes.present), 5))
-    visits = [(tick, k, tick) for k, ticks in enumerate(_recorded(boxes, clouds)) for tick in _some(ticks, SIDE_TICKS)]
-    for cloud, (tick, k, _) in _with_clouds(visits, clouds):
+    visits = [(tick, k) for k, ticks in enumerate(_recorded(boxes, clouds)) for tick in _some(ticks, SIDE_TICKS)]
+    for cloud, tick, k in _with_clouds(visits, clouds):
         half, points = boxes.size_m[k] / 2, _points_at(boxes, k, tick, cloud, SIDE_M)
         local = np.column_stack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]), points[:, 2]])
         within = np.abs(local) < half + SIDE_ERROR_M / 2
@@ -336,35 +336,36 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
 
 
-# An agent that moved so far, m, left its place by more than the errors of boxes. So many moments of each agent suffice.
-LEFT_M, LEFT_MOMENTS = 1.5, 4
+# An agent that moved so far, m, left its place by more than the errors of boxes. So many ticks of each agent suffice.
+MOVED_M, MOVED_TICKS = 1.5, 4
 
 
 def remaining(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     """Return the mean shares (A,) of the points of agents that are there also when these have left, or have not come yet.
 
-    Compared are pairs of ticks between which an agent moves by `LEFT_M`, in the part of its box at one that is outside of its box at
+    Compared are pairs of ticks between which an agent moves by `MOVED_M`, in the part of its box at one that is outside of its box at
     the other, by as many points as a surface shows at the other distance. 0 for what stands.
     """
     pairs = []
     for k, ticks in enumerate(_recorded(boxes, clouds)):
         way = boxes.center_m[k, ticks, :2]
-        for first in _some(np.arange(len(ticks)), LEFT_MOMENTS):
-            gone = np.flatnonzero(np.hypot(*(way[first:] - way[first]).T) >= LEFT_M)
-            for last in gone[:1].tolist():
+        for first in _some(np.arange(len(ticks)), MOVED_TICKS):
+            moved = np.flatnonzero(np.hypot(*(way[first:] - way[first]).T) >= MOVED_M)
+            for last in moved[:1].tolist():
                 pair = int(ticks[first]), int(ticks[first + last])
                 pairs += [(k, *pair), (k, *pair[::-1])]
     points, spread_m2 = np.zeros((len(pairs), 2)), np.ones((len(pairs), 2))
-    visits = [(pair[1 + at], n, at) for n, pair in enumerate(pairs) for at in range(2)]
-    for cloud, (_, n, at) in _with_clouds(visits, clouds):
-        (k, place, other), center = pairs[n], boxes.center_m[pairs[n][0]]
-        half = boxes.size_m[k, :2] / 2
+    visits = [(pair[1 + at], 2 * n + at) for n, pair in enumerate(pairs) for at in range(2)]
+    for cloud, _, visit in _with_clouds(visits, clouds):
+        n, at = divmod(visit, 2)
+        k, place, other = pairs[n]
+        center, half = boxes.center_m[k], boxes.size_m[k, :2] / 2
         near = _points_at(boxes, k, place, cloud, SIDE_ERROR_M)
         xy = near[near[:, 2] <= boxes.size_m[k, 2] / 2 + SIDE_ERROR_M, :2]
         own = rotate(xy, -boxes.yaw_rad[k, place])
         elsewhere = rotate(xy + (center[place] - center[other])[:2], -boxes.yaw_rad[k, other])
-        left = (np.abs(own) <= half + SIDE_ERROR_M).all(axis=1) & (np.abs(elsewhere) > half + SIDE_M / 2).any(axis=1)
-        points[n, at] = left.sum()
+        vacated = (np.abs(own) <= half + SIDE_ERROR_M).all(axis=1) & (np.abs(elsewhere) > half + SIDE_M / 2).any(axis=1)
+        points[n, at] = vacated.sum()
         spread_m2[n, at] = np.sum((center[place] - cloud.origin - cloud.sensor)[:2] ** 2)
     known = points[:, 0] >= MIN_SIDE_POINTS
     share = np.minimum(points[:, 1] * spread_m2[:, 1] / np.maximum(points[:, 0] * spread_m2[:, 0], 1e-9), 1.0)[known]
@@ -385,14 +386,14 @@ def _some(ticks: NDArray[np.intp], most: int) -> list[int]:
 
 
 def _with_clouds(
-    visits: list[tuple[int, int, int]], clouds: Sequence[Obstacles | None]
-) -> Iterator[tuple[Obstacles, tuple[int, int, int]]]:
-    """Yield visits in the order of their ticks, which come first, with the cloud of the tick, which is read once."""
+    visits: list[tuple[int, int]], clouds: Sequence[Obstacles | None]
+) -> Iterator[tuple[Obstacles, int, int]]:
+    """Yield visits, a tick and a number each, in the order of their ticks with the cloud of the tick, which is read once."""
     for tick, same in groupby(sorted(visits), itemgetter(0)):
         cloud = clouds[tick]
         assert cloud is not None
-        for visit in same:
-            yield cloud, visit
+        for _, number in same:
+            yield cloud, tick, number
 
 
 def _points_at(boxes: AgentTable, k: int, tick: int, cloud: Obstacles, margin_m: float) -> Array:

@@ -181,7 +181,7 @@ def reconstruct(
     jobs: Annotated[
         int | None,
         opt.option(
-            "Processes that share the ticks; the result is the same for any number.",
+            "Processes that share the work; the result is the same for any number.",
             "N",
             min=1,
             default="the usable cores",

@@ -21,7 +21,7 @@ GRAY_CHROMA, BLUISH_GRAY_CHROMA = 10.0, 12.5
 # What is nearly black or white needs more chroma before a hue is named; cream and ivory are whites of vehicles.
 BLACK_CHROMA_PER_L, WHITE_L, WHITE_CHROMA, CREAM_CHROMA = 0.5, 86.0, 17.0, 27.0
 # Upper ends of hue angles hab in degrees. They part the basic terms of the XKCD survey (Munroe 2010; 140 000 answers) about
-# where the answers change; tests/test_color_names.py holds the agreement.
+# where the answers change; tests/test_appearance_colors.py holds the agreement.
 RED_FROM, RED_TO, ORANGE_TO, YELLOW_TO, GREEN_TO = 318.0, 45.0, 74.0, 111.0, 190.0
 # Orange and yellow that are dark (orange below the first lightness, yellow below the second) or dull are brown, red only where it is dull; dark yellow next to green is olive.
 BROWN_L, BROWN_CHROMA, BROWN_FROM, DULL_RED_CHROMA, LIGHT_L, OLIVE_FROM = (42.0, 55.0), 42.0, 20.0, 30.0, 66.0, 99.0

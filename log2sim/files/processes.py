@@ -11,7 +11,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -70,11 +70,6 @@ def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: i
                 done[running.pop(ready)] = _receive(ready, workers[ready])
     finally:
         _end(workers)
-
-
-def split_evenly(items: Sequence[Task], jobs: int) -> list[Sequence[Task]]:
-    """Split a sequence into as many parts as there are processes, which take turns with its items, or fewer; none is empty."""
-    return [items[k::jobs] for k in range(min(jobs, len(items)))]
 
 
 @contextmanager

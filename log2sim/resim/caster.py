@@ -31,9 +31,8 @@ class RayGrid:
     elevation: Floats  # (E,)
     start: NDArray[np.int32]  # (R * C + 1,): first entry of each cell
     columns: int
-    rank: NDArray[
-        np.int64
-    ]  # (E,): how many rows below one of `CELL_RAD` above `low_el` have a ray; only those are kept
+    # (B + 1,): how many of the B rows of `ROW_RAD` from `low_el` up to each have a ray; others are left out
+    rank: NDArray[np.int64]
     low_az: np.float32
     low_el: np.float32
 

@@ -348,7 +348,7 @@ def smoothed(table: MotionTable) -> tuple[Complex, Complex]:
 def fitted(values: Array | Complex, window: int, order: int) -> Any:
     """Replace values by those of the polynomial through the window around each; at either end, of the last whole window.
 
-    Savitzky and Golay (1964): `scipy.signal.savgol_filter`, which fits both ends anew for each call and takes ten times as long.
+    Savitzky and Golay (1964): `scipy.signal.savgol_filter`, which fits both ends anew for each call.
     """
     half, projection = window // 2, _projection(window, order)
     inside = np.convolve(values, projection[half, ::-1], "valid")

@@ -8,7 +8,6 @@ All is written anew by each call; a question opens it as `log2sim find` does.
 
 from __future__ import annotations
 
-import resource
 import time
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from benchmarks.tags import traffic
 from log2sim.batch.run import local_workers
 from log2sim.cli.find import map_on_workers
 from log2sim.files.processes import map_in_processes
+from log2sim.files.stages import cpu_seconds, peak_memory_mib
 from log2sim.scenarios.index import INDEX_FILE, open_index
 from log2sim.scenarios.query import ask
 
@@ -45,9 +45,9 @@ def main(arguments: list[str] | None = None) -> None:
     begin = spent_s()
     with local_workers(asked.jobs) as workers:
         index = open_index(folder, fresh=True, map_files=partial(map_on_workers, workers.client))
-        peaks = workers.client.run(peak_mib)
+        peaks = workers.client.run(peak_memory_mib)
     say(f"{index.scenarios} scenarios indexed, {len(index.table)} tags, {len(index.problems)} left out", begin)
-    print(f"memory: {peak_mib():.0f} MiB, of a worker {max(peaks.values()):.0f} MiB")
+    print(f"memory: {peak_memory_mib():.0f} MiB, of a worker {max(peaks.values()):.0f} MiB")
     print(f"{INDEX_FILE}: {(folder / INDEX_FILE).stat().st_size / 1e6:.1f} MB; hard brakings made: {known}")
     for question in QUESTIONS:
         begin, wall = time.process_time(), time.perf_counter()
@@ -71,16 +71,10 @@ def write(folder: Path, seed: int) -> int:
 
 def spent_s() -> tuple[float, float]:
     """Wall time and processor time of this process and of those that it waited for."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return time.perf_counter(), sum(u.ru_utime + u.ru_stime for u in used)
+    return time.perf_counter(), cpu_seconds()
 
 
 def say(what: str, begin: tuple[float, float]) -> None:
     """Print the time since a moment."""
     wall, cpu = (now - then for now, then in zip(spent_s(), begin))
     print(f"{what}: {wall:.1f} s, CPU {cpu:.1f} s")
-
-
-def peak_mib() -> float:
-    """Most memory that this process ever had."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
