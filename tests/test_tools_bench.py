@@ -32,10 +32,10 @@ def test_one_command_lists_the_benchmarks_runs_them_and_refuses_unknown_ones(
 ) -> None:
     assert run_named("benchmarks", []) == 0
     listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
-    assert {"lanes", "homography"} <= {name for name, _ in listed}
+    assert {"lanes", "homography", "kitti"} <= {name for name, _ in listed}
     assert all(len(title) > 10 for _, title in listed)
     assert run_named("benchmarks", ["tracks"]) == 2
-    assert {"kitti", "confidence"} <= set(commands_in("fits"))
+    assert {"outline", "confidence"} <= set(commands_in("fits"))
 
 
 @pytest.mark.parametrize("folder", ["benchmarks", "fits"])

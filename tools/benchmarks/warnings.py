@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from kitti.map import read_view
+from kitti.boxes import read_view
 
 from log2sim.datatypes import EGO, Agent, EgoVehicle, Scenario, Waypoints
 from log2sim.evaluation.metrics.truth import is_static, speed_along, truth_from_log
