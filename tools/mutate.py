@@ -11,43 +11,35 @@ without a word though the damage can be seen.
 from __future__ import annotations
 
 import shutil
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
 from benchmarks.table import markdown
-from entry import parser_of
+from entry import run
 from mutation import killing
 from mutation.bases import KINDS
 from mutation.harness import BAD, GOOD, Harness, Row, indices, kind_of
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(
+    seed: int = 0, count: int = 100, start: int = 0, only: list[str] = [], keep: bool = False, kill: int = 0
+) -> int:
     """Run the command; 1 when anything is as it must not be."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--count", type=int, default=100)
-    parser.add_argument("--start", type=int, default=0, help="index to begin with")
-    parser.add_argument("--only", action="append", choices=KINDS, default=[], help="kind of input; may be repeated")
-    parser.add_argument("--keep", action="store_true", help="keep the folder, with the last input")
-    parser.add_argument("--kill", type=int, metavar="N")
-    options = parser.parse_args(arguments)
     folder = Path(tempfile.mkdtemp(prefix="mutate-")).resolve()  # not a link
-    if options.kill:
-        bad = kill(folder, options.kill, options.seed)
+    if kill:
+        bad = kill_commands(folder, kill, seed)
     else:
-        numbers = list(indices(options.count, options.only, options.start))
-        harness = Harness(folder, options.seed, sorted({kind_of(i) for i in numbers}, key=KINDS.index))
-        rows = []
+        numbers, rows = list(indices(count, only, start)), []
+        harness = Harness(folder, seed, sorted({kind_of(i) for i in numbers}, key=KINDS.index))
         for number in numbers:
             rows.append(row := harness.run(number))
-            if row.verdict in BAD or options.keep:
-                print(f"{row.verdict}: {options.seed}:{row.index} {row.kind}: {row.damage}: {row.reason}", flush=True)
+            if row.verdict in BAD or keep:
+                print(f"{row.verdict}: {seed}:{row.index} {row.kind}: {row.damage}: {row.reason}", flush=True)
         bad = any(row.verdict in BAD for row in rows)
         print(table(rows))
         print("\n".join(f"{name}: {text}" for name, text in BAD.items() if any(row.verdict == name for row in rows)))
-    print(f"kept: {folder}") if options.keep else shutil.rmtree(folder, ignore_errors=True)
+    print(f"kept: {folder}") if keep else shutil.rmtree(folder, ignore_errors=True)
     return int(bad)
 
 
@@ -64,7 +56,7 @@ def table(rows: list[Row]) -> str:
     return markdown(["kind", *GOOD, *BAD, "inputs", "longest s", "peak MiB"], lines)
 
 
-def kill(folder: Path, count: int, seed: int) -> bool:
+def kill_commands(folder: Path, count: int, seed: int) -> bool:
     """Print a table of commands by what was left; whether anything was torn."""
     found = []
     for name, left, words in killing.kill_many(folder, count, seed):
@@ -79,4 +71,4 @@ def kill(folder: Path, count: int, seed: int) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main, __doc__)

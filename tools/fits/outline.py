@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from entry import parser_of
 
 from log2sim.agents.heading import HEIGHT_CELLS, Outline, outline_of
 from log2sim.datatypes.log_odds import probability_of
@@ -155,21 +154,17 @@ def write(weights: dict[tuple[bool, bool], np.ndarray]) -> None:
     WEIGHTS.write_text(text, encoding="utf-8")
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--vehicles", type=int, default=4000)
-    parser.add_argument("--test", type=int, default=500)
-    options = parser.parse_args(arguments)
+def main(vehicles: int = 4000, test: int = 500) -> None:
     found: dict[tuple[bool, bool], list[np.ndarray]] = {kind: [] for kind in NAMES}
     tests: list[Outline] = []
-    for seed in range(options.vehicles + options.test):
+    for seed in range(vehicles + test):
         rng = np.random.default_rng([1, seed])
         seen = draw(rng)
         if seen is None:
             continue
         for _ in range(BOXES):
             outline = measured(seen, rng)
-            if outline is not None and seed < options.vehicles:
+            if outline is not None and seed < vehicles:
                 found[outline.kind].append(outline.features)
             elif outline is not None:
                 tests.append(outline)
