@@ -9,7 +9,6 @@ by what boxes of tracks are wrong by. A minute for a thousand vehicles.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +22,6 @@ from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
-WEIGHTS = Path(__file__).resolve().parents[2] / "log2sim" / "agents" / "heading" / "outline_weights.py"
 # By whether the vehicle is tall, and whether most of its length shows.
 NAMES = {(False, True): "LOW", (False, False): "LOW_IN_PART", (True, True): "TALL", (True, False): "TALL_IN_PART"}
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)
@@ -145,15 +143,6 @@ def report(name: str, odds: np.ndarray) -> None:
             )
 
 
-def write(weights: dict[tuple[bool, bool], np.ndarray]) -> None:
-    text = '"""Weights of `Outline.features` in hundredths, made by `tools/fit.py outline`."""\n'
-    for kind, name in NAMES.items():
-        numbers = np.round(100 * weights[kind]).astype(int)
-        rows = [", ".join(map(str, row)) for row in numbers[:-1].reshape(-1, HEIGHT_CELLS)]
-        text += f"\n{name} = (\n" + "".join(f"    {row},\n" for row in rows) + f"    {numbers[-1]},\n)  # fmt: skip\n"
-    WEIGHTS.write_text(text, encoding="utf-8")
-
-
 def main(vehicles: int = 4000, test: int = 500) -> None:
     found: dict[tuple[bool, bool], list[np.ndarray]] = {kind: [] for kind in NAMES}
     tests: list[Outline] = []
@@ -171,4 +160,7 @@ def main(vehicles: int = 4000, test: int = 500) -> None:
     weights = {kind: fit(np.array(rows)) for kind, rows in found.items()}
     for kind, name in NAMES.items():
         report(name, np.array([o.features @ weights[kind] for o in tests if o.kind == kind]))
-    write(weights)
+    for kind, name in NAMES.items():
+        numbers = np.round(100 * weights[kind]).astype(int)
+        rows = [", ".join(map(str, row)) for row in numbers[:-1].reshape(-1, HEIGHT_CELLS)]
+        print(f"{name} = (\n" + "".join(f"    {row},\n" for row in rows) + f"    {numbers[-1]},\n)  # fmt: skip")
