@@ -151,8 +151,4 @@ def figures(rows: Sequence[Array]) -> dict[str, object]:
         if recall is not None and recall < 0.5:
             break
         reached = float(high)
-    return {
-        "range_m": reached,
-        "recall_30m": float(table[inside, 1].mean()),
-        "recall_by_distance": by_bin,
-    }
+    return {"range_m": reached, "recall_30m": float(table[inside, 1].mean()), "recall_by_distance": by_bin}
