@@ -1,6 +1,6 @@
 """Precision and recall of tags in worlds whose maneuvers are known in closed form.
 
-    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json SCENE.toml]
+    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=SCENE.toml]
 
 `--write` writes the random traffic as scenarios, for `log2sim find` and `vary`. `--pair` compares the tags of what was reconstructed of a
 rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other.
@@ -570,14 +570,14 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
 
 def main(
     worlds: int = 48, scripts: int = 12, noise: float = 0.0, first: int = 0, write: Path | None = None,
-    pair: list[tuple[Path, Path]] = [], wrong: bool = False,
+    pair: list[str] = [], wrong: bool = False,
 ) -> None:  # fmt: skip
     """Print a table of random worlds and of `scripts` of each scripted scene from a first seed, whose places have noise, m; `wrong` lists what was."""
     drawn = [*variants(worlds, noise, first), *scripted(scripts, noise, first)]
     for k, world in enumerate(drawn if write is not None else ()):
         world.scenario.save(write / f"{k:04}" / "scenario.json")
     sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
-    for made, scene in pair:
+    for made, scene in (map(Path, text.split("=", 1)) for text in pair):
         for tag, lists in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
             sums[tag] = [[*a, *(f"{made.name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
     rows, lines = [], []
