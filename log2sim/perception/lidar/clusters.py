@@ -197,17 +197,18 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     return np.asarray(kept[np.hypot(*(xy_all[kept] - center).T) <= reach])
 
 
-def continued_sides(seed: Array, xy: Array, max_length_m: float) -> Index:
+def continued_sides(seed: Array, xy: Array, max_length_m: float, yaw_rad: float | None = None) -> Index:
     """Find the points (m, 2) that continue the sides of a cluster (n, 2) where rays are far apart: their indices.
 
-    `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it.
+    `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it. `yaw_rad`: along one of the
+    sides; fitted to the cluster where it is not known.
 
     Notes
     -----
     The flank of a long vehicle is seen at so flat an angle that successive rays meet it farther apart than the cells of
     the clusters are: at 15 m along a flank 2.5 m aside, 0.4 degrees are 0.6 m.
     """
-    yaw, step_rad = fit_yaw(seed)[0], azimuth_step_rad(seed)
+    yaw, step_rad = fit_yaw(seed)[0] if yaw_rad is None else yaw_rad, azimuth_step_rad(seed)
     own, others = rotate(seed, -yaw), rotate(xy, -yaw)
     low, high = own.min(axis=0), own.max(axis=0)
     found = np.zeros(len(xy), dtype=bool)

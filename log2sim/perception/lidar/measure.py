@@ -500,5 +500,17 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
         order = np.lexsort((outside_m, point))
         own[shared[order[np.r_[False, np.diff(point[order]) == 0]]]] = False
     edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
-    members = cloud.obstacles[found.point[own]]
-    return [members[a:b] for a, b in pairwise(edges)]
+    free = np.ones(len(xyz), dtype=bool)
+    free[found.point] = False
+    members = [found.point[own][a:b] for a, b in pairwise(edges)]
+    # The boxes of a detector that sees little of a long flank at a time end before it does.
+    long = [k for k, c in enumerate(boxes.category) if MAX_SIZE_M[c][0] >= MIN_LONG_M and len(members[k]) >= MIN_CLUSTER_POINTS]
+    for k in long:
+        rest, axis = np.flatnonzero(free), rotate(np.array([1.0, 0.0]), float(boxes.yaw_rad[k]))
+        seed, more = (xyz[part, :2].astype(np.float64) - cloud.sensor[:2] for part in (members[k], rest))
+        added = rest[continued_sides(seed, more, np.inf, float(boxes.yaw_rad[k]))]
+        grown = np.union1d(members[k], added)
+        # A side that goes on past the longest vehicle is a wall's.
+        if np.ptp(xyz[grown, :2] @ axis) <= MAX_SIZE_M[boxes.category[k]][0]:
+            free[added], members[k] = False, grown
+    return [cloud.obstacles[index] for index in members]
