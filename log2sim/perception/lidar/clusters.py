@@ -28,8 +28,9 @@ MIN_IMAGE_IOU = 0.12
 # Margin around a box, as a share of its sides, and the point density in it, relative to the cluster's, from which on the
 # cluster counts as extending beyond the box.
 MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
-# Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost.
-SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS = 0.2, 0.3, 1.5
+# Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost, but
+# two vehicles of a row stand this near to each other.
+SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS, MAX_GAP_M = 0.2, 0.3, 1.5, 1.0
 # Boxes with a higher IoU are duplicates and share points. A cluster is rejected when a larger share of its points already
 # belongs to another box.
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5
@@ -229,7 +230,7 @@ def continued_sides(seed: Array, xy: Array, max_length_m: float, yaw_rad: float 
 def _walk(along_m: Array, end_m: float, step_rad: float, side_m: float) -> float:
     """Go on from an end over coordinates (m,) along a side at a distance, as long as the next is no farther than the next ray."""
     for next_m in np.sort(along_m[along_m > end_m]).tolist():
-        if next_m - end_m > MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m:
+        if next_m - end_m > min(MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m, MAX_GAP_M):
             break
         end_m = next_m
     return end_m
