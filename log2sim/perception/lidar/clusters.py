@@ -28,9 +28,8 @@ MIN_IMAGE_IOU = 0.12
 # Margin around a box, as a share of its sides, and the point density in it, relative to the cluster's, from which on the
 # cluster counts as extending beyond the box.
 MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
-# Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost, but
-# two vehicles of a row stand this near to each other.
-SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS, MAX_GAP_M = 0.2, 0.3, 1.5, 1.0
+# Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost.
+SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS = 0.2, 0.3, 1.5
 # Boxes with a higher IoU are duplicates and share points. A cluster is rejected when a larger share of its points already
 # belongs to another box.
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5
@@ -198,11 +197,13 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     return np.asarray(kept[np.hypot(*(xy_all[kept] - center).T) <= reach])
 
 
-def continued_sides(seed: Array, xy: Array, max_length_m: float, yaw_rad: float | None = None) -> Index:
+def continued_sides(
+    seed: Array, xy: Array, max_length_m: float, yaw_rad: float | None = None, max_gap_m: float = np.inf
+) -> Index:
     """Find the points (m, 2) that continue the sides of a cluster (n, 2) where rays are far apart: their indices.
 
     `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it. `yaw_rad`: along one of the
-    sides; fitted to the cluster where it is not known.
+    sides; fitted to the cluster where it is not known. `max_gap_m`: a wider gap ends a side also where rays are farther apart.
 
     Notes
     -----
@@ -220,17 +221,17 @@ def continued_sides(seed: Array, xy: Array, max_length_m: float, yaw_rad: float 
             continue
         on_side = np.abs(others[:, across] - side_m) < SIDE_DEPTH_M
         for sign, end in ((1.0, high[axis]), (-1.0, low[axis])):
-            farthest = _walk(sign * others[on_side, axis], sign * end, step_rad, abs(side_m))
+            farthest = _walk(sign * others[on_side, axis], sign * end, step_rad, abs(side_m), max_gap_m)
             farthest = min(farthest, sign * end + max_length_m - (high[axis] - low[axis]))
             along = sign * others[:, axis]
             found |= on_side & (along > sign * end) & (along <= farthest)
     return np.flatnonzero(found)
 
 
-def _walk(along_m: Array, end_m: float, step_rad: float, side_m: float) -> float:
+def _walk(along_m: Array, end_m: float, step_rad: float, side_m: float, max_gap_m: float) -> float:
     """Go on from an end over coordinates (m,) along a side at a distance, as long as the next is no farther than the next ray."""
     for next_m in np.sort(along_m[along_m > end_m]).tolist():
-        if next_m - end_m > min(MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m, MAX_GAP_M):
+        if next_m - end_m > min(MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m, max_gap_m):
             break
         end_m = next_m
     return end_m

@@ -36,6 +36,7 @@ from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, Camera, box_iou
 from log2sim.perception.boxes import (
     TOP_QUANTILE,
+    corrected_yaw,
     fit_extents_of_clusters,
     place_boxes,
     quantile_of_clusters,
@@ -424,6 +425,8 @@ def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[ND
 
 # A box is wrong by less than this at each side; neighbors are farther away.
 BOX_MARGIN_M = 0.2
+# Two vehicles of a row stand this near to each other.
+ROW_GAP_M = 1.0
 # Mirrors reach so far beyond a vehicle's width, and boxes around them half as far again.
 EGO_MARGIN_M = 0.4
 # A box is sought at the times of another viewpoint's points up to this speed and distance, in steps of a LiDAR's noise and
@@ -504,14 +507,19 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
     free = np.ones(len(xyz), dtype=bool)
     free[found.point] = False
     members = [found.point[own][a:b] for a, b in pairwise(edges)]
-    # The boxes of a detector that sees little of a long flank at a time end before it does.
-    long = [k for k, c in enumerate(boxes.category) if MAX_SIZE_M[c][0] >= MIN_LONG_M and len(members[k]) >= MIN_CLUSTER_POINTS]
-    for k in long:
-        rest, axis = np.flatnonzero(free), rotate(np.array([1.0, 0.0]), float(boxes.yaw_rad[k]))
-        seed, more = (xyz[part, :2].astype(np.float64) - cloud.sensor[:2] for part in (members[k], rest))
-        added = rest[continued_sides(seed, more, np.inf, float(boxes.yaw_rad[k]))]
-        grown = np.union1d(members[k], added)
+    for k, category in enumerate(boxes.category):
+        longest_m, seed = MAX_SIZE_M[category][0], members[k]
+        if longest_m < MIN_LONG_M or len(seed) < MIN_CLUSTER_POINTS:
+            continue
+        # The boxes of a detector that sees little of a long flank at a time end before it does.
+        near = free & (np.abs(xyz[:, :2] - center[k, :2].astype(xyz.dtype)).max(axis=1) < longest_m)
+        rest, place = np.flatnonzero(near), xyz[:, :2] - cloud.sensor[:2]
+        yaw_rad = corrected_yaw(place[seed].astype(np.float64), float(boxes.yaw_rad[k]))
+        for _ in range(2):  # along the flank, then round the corner
+            own, more = (place[index].astype(np.float64) for index in (seed, rest))
+            added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
+            seed, rest = np.union1d(seed, rest[added]), np.delete(rest, added)
         # A side that goes on past the longest vehicle is a wall's.
-        if np.ptp(xyz[grown, :2] @ axis) <= MAX_SIZE_M[boxes.category[k]][0]:
-            free[added], members[k] = False, grown
+        if np.ptp(rotate(place[seed], -yaw_rad), axis=0).max() <= longest_m:
+            free[seed], members[k] = False, seed
     return [cloud.obstacles[index] for index in members]
