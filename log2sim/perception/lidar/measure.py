@@ -520,6 +520,6 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
             added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
             seed, rest = np.union1d(seed, rest[added]), np.delete(rest, added)
         # A side that goes on past the longest vehicle is a wall's.
-        if np.ptp(rotate(place[seed], -yaw_rad), axis=0).max() <= longest_m:
+        if np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0).max() <= longest_m:
             free[seed], members[k] = False, seed
     return [cloud.obstacles[index] for index in members]
