@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,28 +62,18 @@ if TYPE_CHECKING:
 ALPHAS: Array = np.arange(1, 20) / 20
 
 
-@dataclass(frozen=True)
-class Hota:
-    """HOTA with its detection and association parts, each the mean over `ALPHAS`."""
-
-    hota: float
-    det_a: float
-    ass_a: float
-
-
-def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | None:
-    """Score the tracking.
+def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> dict[str, float | None]:
+    """Score the tracking: "hota" with its detection and association parts "det_a" and "ass_a", each the mean over `ALPHAS`.
 
     `pairs`: candidates; those of absent agents and those with similarity 0 are left out. `truth_present`,
-    `other_present` (A, T), (B, T): which agents count at which ticks. None when there is no truth.
+    `other_present` (A, T), (B, T): which agents count at which ticks. All are None when there is no truth.
 
     Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize the sum of similarity times the global alignment of
     both identities. Without any reconstructed agent all figures are 0.
     """
-    if not truth_present.any():
-        return None
-    if not other_present.any():
-        return Hota(0.0, 0.0, 0.0)
+    names = ("hota", "det_a", "ass_a")
+    if not (truth_present.any() and other_present.any()):
+        return dict.fromkeys(names, 0.0 if truth_present.any() else None)
     present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
     pairs = pairs.take(present)
     truth_count, other_count = truth_present.sum(1), other_present.sum(1)
@@ -113,7 +103,7 @@ def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | 
         i, j = np.divmod(code, len(other_present))
         ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
         det_a[k] = tpa.sum() / (total - tpa.sum())
-    return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
+    return {name: float(v.mean()) for name, v in zip(names, (np.sqrt(det_a * ass_a), det_a, ass_a))}
 
 
 DIGITS = 6
@@ -199,7 +189,7 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
     if theirs.projection and ours.projection:
         if theirs.projection == ours.projection:
             apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
-            return truth, _placement("same_map", apart_m)
+            return truth, {"method": "same_map", "ego_apart_m": apart_m}
         altitudes = theirs.altitude_m, ours.altitude_m
         rise_m = 0.0 if altitudes[0] is None or altitudes[1] is None else altitudes[0] - altitudes[1]
         target = on_map(theirs, ours.projection, ours.offset_m)
@@ -213,12 +203,11 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
     else:
         apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
         if apart_m is None or apart_m <= GATE_M:
-            return truth, _placement("same_map", apart_m)
+            return truth, {"method": "same_map", "ego_apart_m": apart_m}
         method = "ego_path"
         near = far = _fit_egos(truth, scenario)
-    moved = _moved(truth, near, far)
-    moved = replace(moved, map=scenario.map)
-    return moved, _placement(method, _ego_apart_m(moved, scenario, np.zeros(3)))
+    moved = replace(_moved(truth, near, far), map=scenario.map)
+    return moved, {"method": method, "ego_apart_m": _ego_apart_m(moved, scenario, np.zeros(3))}
 
 
 def describe_placement(placement: dict[str, Any]) -> str | None:
@@ -231,10 +220,6 @@ def describe_placement(placement: dict[str, Any]) -> str | None:
     }[placement["method"]]
     apart_m = placement["ego_apart_m"]
     return how if apart_m is None else f"{how}; then the boxes of the egos are {apart_m:.2f} m apart (median)"
-
-
-def _placement(method: str, ego_apart_m: float | None) -> dict[str, Any]:
-    return {"method": method, "ego_apart_m": ego_apart_m}
 
 
 def _common_egos(truth: Scenario, scenario: Scenario) -> tuple[Array, Array]:
@@ -375,6 +360,18 @@ def evaluate(
     ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
+    sides = compared.truth, compared.other
+    by_range = {
+        f"{low:g}-{high:g}": _figures(compared, *((s.range_m >= low) & (s.range_m < high) for s in sides))
+        for low, high in RANGES_M
+    }
+    # By the category of the truth for matched ticks, of the reconstructed agent for false ones.
+    names = {*compared.truth.category[compared.asked_for.any(1)], *compared.other.category[compared.false.any(1)]}
+    by_category = {
+        name: _figures(compared, *(over_ticks(s.category == name, s.present) for s in sides))
+        for name in CATEGORIES
+        if name in names
+    }
     # The agent that each truth agent is matched with most often, by its id.
     agents = {agent.id: agent for agent in scenario.others}
     partners = {}
@@ -393,8 +390,8 @@ def evaluate(
         "placement": placement,
         "quarantined": quarantined,
         **_figures(compared, *everywhere),
-        "by_range": None if ego is None else _by_range(compared),
-        "by_category": _by_category(compared),
+        "by_range": None if ego is None else by_range,
+        "by_category": by_category,
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
         "map_features": map_figures(scenario, truth),
@@ -420,12 +417,22 @@ def compare_scenarios(
     """
     ticks_s = evaluation_ticks_s(scenario, truth)
     if len(ticks_s) == 0 and scenario.agents and truth.agents:
-        raise ScenarioError(_no_common_time(scenario, truth))
+        spans = [
+            f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
+            f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
+            for s in (scenario, truth)
+        ]
+        raise ScenarioError(
+            f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
+        )
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     shift_m = truth.shift_to(scenario)
     ego = states_of_ego(scenario, truth, ticks_s, truth_ticks_s, shift_m)
     ego_xy = None if ego is None else ego.xy_m[0]
-    _check_range(selection.max_range_m, ego_xy)
+    if selection.max_range_m is not None and not selection.max_range_m > 0:
+        raise ConfigError(f"range is {selection.max_range_m:g} m; it must be greater than 0")
+    if selection.max_range_m is not None and ego_xy is None:
+        raise ConfigError("a range is given, but neither the scenario nor the truth has an ego to measure it from")
     true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
     ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
     stated = truth.provenance.get("visibility") != "computed"
@@ -446,7 +453,6 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
     agents, found = counted.any(1), (counted & (c.match >= 0)).sum(1) >= 0.5 * counted.sum(1)
     ours, real = (hit | false).any(1), hit.sum(1) >= false.sum(1)
     id_switches = int((c.switched & counted).sum())
-    tracking = hota(c.pairs, counted, hit | false)
     return {
         "recall": matched / truth_ticks if truth_ticks else None,
         "precision": matched / (matched + wrong) if matched + wrong else None,
@@ -455,7 +461,7 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
         **summarize_verdicts(state_errors(c.truth, c.other, c.match, counted)),
         "id_switches": id_switches,
         "mota": mota(truth_ticks, truth_ticks - matched, wrong, id_switches),
-        **(dict.fromkeys(("hota", "det_a", "ass_a")) if tracking is None else vars(tracking)),
+        **hota(c.pairs, counted, hit | false),
         "coverage": coverage(c, truth_selected),
         "counts": {
             "truth_agents": int(agents.sum()),
@@ -468,25 +474,6 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
             "reconstructed_agents": int(ours.sum()),
             "false_agents": int((ours & ~real).sum()),
         },
-    }
-
-
-def _by_range(c: Comparison) -> dict[str, Any]:
-    return {
-        f"{low:g}-{high:g}": _figures(c, *((s.range_m >= low) & (s.range_m < high) for s in (c.truth, c.other)))
-        for low, high in RANGES_M
-    }
-
-
-def _by_category(c: Comparison) -> dict[str, Any]:
-    """Compute the figures by category: of the truth for matched ticks, of the reconstructed agent for false ones."""
-    names = set(c.truth.category[c.asked_for.any(1)]) | set(c.other.category[c.false.any(1)])
-    return {
-        name: _figures(
-            c, over_ticks(c.truth.category == name, c.counted), over_ticks(c.other.category == name, c.false)
-        )
-        for name in CATEGORIES
-        if name in names
     }
 
 
@@ -506,24 +493,6 @@ def _selected(categories: Sequence[str] | None) -> frozenset[str]:
         if name not in known:
             raise ConfigError(f"unknown category '{name}'{nearest(name, known)}; known: {', '.join(known)}")
     return frozenset(c for name in categories for c in GROUPS.get(name, (name,)))
-
-
-def _no_common_time(scenario: Scenario, truth: Scenario) -> str:
-    spans = [
-        f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
-        f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
-        for s in (scenario, truth)
-    ]
-    return f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
-
-
-def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
-    if max_range_m is None:
-        return
-    if not max_range_m > 0:
-        raise ConfigError(f"range is {max_range_m:g} m; it must be greater than 0")
-    if ego_xy is None:
-        raise ConfigError("a range is given, but neither the scenario nor the truth has an ego to measure it from")
 
 
 def _ego_figures(
