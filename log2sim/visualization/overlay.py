@@ -160,13 +160,11 @@ class _SweepReader:
 
     def at(self, schedule: Schedule, row: int, tick: int) -> tuple[SweepInMap, ...]:
         """Return the sweeps of a row of the schedule at a tick."""
-        found = [self._read(name, int(index[row, tick])) for name, index in schedule.sweeps.items()]
-        return tuple(sweep for sweep in found if sweep is not None)
-
-    def _read(self, name: str, index: int) -> SweepInMap | None:
-        if index >= 0 and (name, index) not in self._known:
-            self._known[name, index] = self._load(name, index)
-        return self._known.get((name, index))
+        wanted = [(name, int(index[row, tick])) for name, index in schedule.sweeps.items()]
+        for key in wanted:
+            if key[1] >= 0 and key not in self._known:
+                self._known[key] = self._load(*key)
+        return tuple(sweep for key in wanted if (sweep := self._known.get(key)) is not None)
 
     def _load(self, name: str, index: int) -> SweepInMap | None:
         try:
@@ -191,7 +189,10 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
     if index < 0:
         return replace(empty, problem="no image near this tick")
     t_ns = int(log.streams[name].t_ns[index])
-    shot = replace(empty, t_ns=t_ns, image_boxes_px=_image_boxes(log, name, t_ns))
+    shot = replace(empty, t_ns=t_ns)
+    if (labels := log.image_labels.get(name)) is not None:
+        near = np.abs(labels.t_ns - t_ns) <= STAMP_TOLERANCE_NS
+        shot = replace(shot, image_boxes_px=np.asarray(labels.box_px[near], dtype=np.float64))
     try:
         shot = replace(shot, image=RecordSource(log).require(name, index))
     except RecordError as error:
@@ -201,13 +202,9 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
     sweeps = reader.at(schedule, row, tick)
     points = np.concatenate([s.xyz for s in sweeps]) if sweeps else np.zeros((0, 3))
     uv, depth, valid = project_moving(camera, points, poses_around(log, name, t_ns))
-    return replace(
-        shot,
-        uv_px=uv[valid],
-        depth_m=depth[valid],
-        boxes=_wireframes(log, camera, t_ns),
-        residuals_s={s.name: (s.middle_ns - t_ns) / NS_PER_S for s in sweeps},
-    )
+    residuals_s = {s.name: (s.middle_ns - t_ns) / NS_PER_S for s in sweeps}
+    boxes = _wireframes(log, camera, t_ns)
+    return replace(shot, uv_px=uv[valid], depth_m=depth[valid], boxes=boxes, residuals_s=residuals_s)
 
 
 def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str], ...]:
@@ -222,13 +219,6 @@ def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str],
         corners = corners_in_view(view, shown.box_px[i], boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])
         out.append((box_lines(camera, corners), str(boxes.category[i])))
     return tuple(out)
-
-
-def _image_boxes(log: Log, name: str, t_ns: int) -> Array:
-    labels = log.image_labels.get(name)
-    if labels is None:
-        return np.zeros((0, 4))
-    return np.asarray(labels.box_px[np.abs(labels.t_ns - t_ns) <= STAMP_TOLERANCE_NS], dtype=np.float64)
 
 
 # Colors of boxes by group, none of which the colors of depths have.
@@ -343,18 +333,15 @@ def _draw_above(ax: Axes, moment: OverlayMoment, aspect: float) -> tuple[str, st
     boxes = moment.boxes
     corners = box_corners_bev(boxes.center_m[:, :2] - origin[:2], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad)
     colors = [COLORS[CATEGORY[str(c)].group] for c in boxes.category]
-    add_lines(ax, [_outline(c) for c in corners], colors=colors, linewidths=0.9, zorder=3)
+    # Around a box, and across its front to the center.
+    fronts = [(c[0] + c[3]) / 2 for c in corners]
+    lines = [np.array([front, *c, c[0], front, c.mean(axis=0)]) for c, front in zip(corners, fronts)]
+    add_lines(ax, lines, colors=colors, linewidths=0.9, zorder=3)
     for name in (*moment.log.lidars, *moment.log.cameras):
         at = moment.log.map_T_sensor(name, moment.t_ns)[0][0, :2, 3] - origin[:2]
         ax.plot(*at, "+", color="#FF5050", ms=5, mew=0.8, zorder=4)
     motion = [f"{s.name} {(s.middle_ns - moment.t_ns) / 1e6:+.1f} ms, {MOTION[s.motion]}" for s in moment.sweeps]
     return f"from above, in m from the ego or the sensors (+), {len(boxes.t_ns)} boxes", " · ".join(motion)
-
-
-def _outline(corners: Array) -> Array:
-    """Line (7, 2) around a box with corners (4, 2), and across its front to the center."""
-    front = (corners[0] + corners[3]) / 2
-    return np.array([front, *corners, corners[0], front, corners.mean(axis=0)])
 
 
 def _draw_frame(figure: Figure, moment: OverlayMoment, box_name: str) -> None:

@@ -54,16 +54,13 @@ def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) ->
     """
     require_cameras(log, asked)
     used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
-    return tuple(sorted(asked or used or log.cameras, key=lambda name: _place(log.cameras[name])))
 
+    def place(name: str) -> tuple[int, float]:  # those that look back come after the others, then those at the road
+        x, y = log.cameras[name].mount_T_cam[:2, 2]
+        azimuth = float(np.arctan2(y, x))
+        return (int(abs(azimuth) > BACK_RAD), -azimuth) if log.cameras[name].mount == "ego" else (2, 0.0)
 
-def _place(camera: Camera) -> tuple[int, float]:
-    """Sort cameras of a vehicle from left to right, then those that look back, then those at the road."""
-    x, y = camera.mount_T_cam[:2, 2]
-    azimuth = float(np.arctan2(y, x))
-    if camera.mount != "ego":
-        return 2, 0.0
-    return (1 if abs(azimuth) > BACK_RAD else 0), -azimuth
+    return tuple(sorted(asked or used or log.cameras, key=place))
 
 
 def require_overlap(log: Log, scenario: Scenario) -> None:
@@ -255,12 +252,19 @@ def picture_document(
     give_pictures(reader, [pictures], progress, least_px=width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
-    _thin_out(entries, budget_bytes)
+    used = [log.cameras[name] for name in entries]
+    forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in used]
+    while (total := sum(map(_bytes_of, entries.values()))) > budget_bytes:  # evenly over the time
+        for entry in entries.values():
+            kept = take_evenly(len(entry["t_s"]), int(0.97 * len(entry["t_s"]) * budget_bytes / total)).tolist()
+            entry |= {key: [entry[key][k] for k in kept] for key in ("t_s", "jpeg", "outlines", "cam_T_map")}
+        if all(len(entry["t_s"]) <= 1 for entry in entries.values()):
+            break
     return {
         "cameras": list(entries.values()),
-        "ahead": _ahead([log.cameras[name] for name in entries]),
+        "ahead": int(np.argmax(forward)) if forward else 0,
         "agents": [agent.id for agent in projector.agents],
-        "width_px": min(width_px, max((log.cameras[name].width_px for name in entries), default=0)),
+        "width_px": min(width_px, max((camera.width_px for camera in used), default=0)),
         "rate_hz": detail.rate_hz,
         "bytes": sum(map(_bytes_of, entries.values())),
     }
@@ -333,23 +337,6 @@ def _entry(
         "jpeg": [base64.b64encode(jpeg[i]).decode() for i in order],
         "outlines": [projector.outlines(name, int(t_ns[i])) for i in order],
     }
-
-
-def _ahead(cameras: Sequence[Camera]) -> int:
-    """Return the place of the camera that looks straight ahead most; 0 where none is on the vehicle."""
-    forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in cameras]
-    return int(np.argmax(forward)) if forward else 0
-
-
-def _thin_out(entries: Mapping[str, dict[str, Any]], budget_bytes: int) -> None:
-    """Leave out pictures, evenly over the time, until all fit."""
-    while (total := sum(map(_bytes_of, entries.values()))) > budget_bytes:
-        for entry in entries.values():
-            kept = take_evenly(len(entry["t_s"]), int(0.97 * len(entry["t_s"]) * budget_bytes / total))
-            for key in ("t_s", "jpeg", "outlines", "cam_T_map"):
-                entry[key] = [entry[key][k] for k in kept.tolist()]
-        if all(len(entry["t_s"]) <= 1 for entry in entries.values()):
-            return
 
 
 def _bytes_of(entry: Mapping[str, Any]) -> int:
@@ -498,10 +485,6 @@ class _Sweeps:
 POINT_SHARE = 0.3  # of the budget, for points, where there are pictures too; what they leave is for the pictures
 
 
-def _silent(stage: str, done: int, total: int) -> None:
-    """Report nothing."""
-
-
 # Of a page with pictures: mail and chat programs take so much, and a phone still opens it.
 DEFAULT_MAX_BYTES = 40_000_000
 
@@ -514,7 +497,7 @@ class Recorded:
     max_bytes: int = DEFAULT_MAX_BYTES  # of the whole page
     cameras: tuple[str, ...] = ()  # whose pictures to take; those that the scenario was made with where it is empty
     # Called as `progress(stage, done, total)` while records are read.
-    progress: Callable[[str, int, int], None] = _silent
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None
 
 
 def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int) -> dict[str, Any]:
@@ -531,33 +514,28 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     points = point_document(
         log, scenario, int(share * budget_bytes), reader, lambda done, total: report("page: sweeps", done, total)
     )
-    left = budget_bytes - (0 if points is None else points["bytes"])
-    pictures = None
+    left, pictures = budget_bytes - (0 if points is None else points["bytes"]), None
     if cameras:
-
-        def told(done: int, total: int) -> None:
-            report("page: pictures", done, total)
-
-        pictures = picture_document(log, scenario, cameras, budget_bytes=left, reader=reader, progress=told)
+        pictures = picture_document(
+            log, scenario, cameras, budget_bytes=left, reader=reader,
+            progress=lambda done, total: report("page: pictures", done, total),
+        )  # fmt: skip
     reader.require_some()
-    if pictures is not None and not pictures["cameras"]:
+    seen, hit = (
+        "no pictures: the log has none during the scenario",
+        "no LiDAR points: the log has none during the scenario",
+    )
+    if pictures is not None and pictures["cameras"]:
+        count, cameras_shown = sum(len(c["t_s"]) for c in pictures["cameras"]), len(pictures["cameras"])
+        noun = f"{count} picture{'s' * (count != 1)} of {cameras_shown} camera{'s' * (cameras_shown != 1)}"
+        seen = f"{noun}, {pictures['width_px']} px wide, {_rate_and_size(pictures)}"
+    else:
         pictures = None
-    return {"pictures": pictures, "points": points, "notes": [_tell_pictures(pictures), _tell_points(points)]}
+    if points is not None:
+        noun = f"LiDAR points of {len(points['t_s'])} sweep{'s' * (len(points['t_s']) != 1)}"
+        hit = f"{noun}, one in {points['cell_m']:g} m, {_rate_and_size(points)}"
+    return {"pictures": pictures, "points": points, "notes": [seen, hit]}
 
 
-def _tell_pictures(pictures: dict[str, Any] | None) -> str:
-    if pictures is None:
-        return "no pictures: the log has none during the scenario"
-    count, cameras = sum(len(c["t_s"]) for c in pictures["cameras"]), len(pictures["cameras"])
-    noun = f"{count} picture{'s' * (count != 1)} of {cameras} camera{'s' * (cameras != 1)}"
-    rate = f"up to {pictures['rate_hz']:g} a second"
-    return f"{noun}, {pictures['width_px']} px wide, {rate}: {pictures['bytes'] / 1e6:.1f} MB"
-
-
-def _tell_points(points: dict[str, Any] | None) -> str:
-    if points is None:
-        return "no LiDAR points: the log has none during the scenario"
-    count = len(points["t_s"])
-    noun = f"LiDAR points of {count} sweep{'s' * (count != 1)}"
-    rate = f"up to {points['rate_hz']:g} a second"
-    return f"{noun}, one in {points['cell_m']:g} m, {rate}: {points['bytes'] / 1e6:.1f} MB"
+def _rate_and_size(part: dict[str, Any]) -> str:
+    return f"up to {part['rate_hz']:g} a second: {part['bytes'] / 1e6:.1f} MB"

@@ -24,33 +24,10 @@ SUFFIXES = (".html", ".htm")
 MARGIN_BYTES = 10_000  # of a page, for the names and keys around pictures and points
 # Parts of the script in the order of their dependencies.
 SCRIPT_FILES = (
-    "track.js",
-    "features.js",
-    "background.js",
-    "predicted.js",
-    "decoded.js",
-    "theme.js",
-    "ends.js",
-    "warnings.js",
-    "map.js",
-    "scale.js",
-    "points.js",
-    "paint.js",
-    "chart.js",
-    "list.js",
-    "details.js",
-    "controls.js",
-    "state.js",
-    "outlines.js",
-    "pictures.js",
-    "collisions.js",
-    "timeline.js",
-    "lists.js",
-    "main.js",
-    "surface.js",
-    "studio.js",
-    "scripting.js",
-)
+    "track.js", "features.js", "background.js", "predicted.js", "decoded.js", "theme.js", "ends.js", "warnings.js", "map.js",
+    "scale.js", "points.js", "paint.js", "chart.js", "list.js", "details.js", "controls.js", "state.js", "outlines.js",
+    "pictures.js", "collisions.js", "timeline.js", "lists.js", "main.js", "surface.js", "studio.js", "scripting.js",
+)  # fmt: skip
 
 
 def write_page(

@@ -20,7 +20,6 @@ from log2sim.visualization.plot.layers import (
     draw_predictions,
     draw_warnings,
     tells_ends,
-    warned_places,
 )
 from log2sim.visualization.plot.layout import FigureLayout, draw_labels
 from log2sim.visualization.plot.scene import draw_base, draw_moving
@@ -70,15 +69,10 @@ def plot_tracks(
     whole = scenario
     scenario, replay = select_shown(scenario, replay, options)
     span = choose_span(scenario, options)
-    overlays = Overlays(
-        replay=cut_replay(replay, span, scenario),
-        truth=None if truth is None else cut_scenario(truth.aligned_to(scenario), span),
-        background=background,
-        predicted=None if predict_s is None else PredictedPaths(scenario, predict_s),
-        title=title,
-        span=span,
-        options=options,
-    )
+    shown_truth = None if truth is None else cut_scenario(truth.aligned_to(scenario), span)
+    predicted = None if predict_s is None else PredictedPaths(scenario, predict_s)
+    shown_replay = cut_replay(replay, span, scenario)
+    overlays = Overlays(shown_replay, shown_truth, background, predicted, title, span, options)
     scenario = cut_scenario(scenario, span)
     roles = assign_view_roles(scenario, whole)
     if suffix in MOVING:
@@ -93,15 +87,15 @@ def plot_tracks(
 
 def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAYS) -> FigureLayout:
     """Draw a still picture."""
-    base = draw_base(scenario, roles, overlays)
-    layout, ax, replay = base.layout, base.layout.ax, overlays.replay
-    draw_moving(ax, roles, layout.view, base.step_s, truth=overlays.truth, replay=replay, ghosts=True)
+    layout, step_s, _, labels = draw_base(scenario, roles, overlays)
+    ax, replay = layout.ax, overlays.replay
+    draw_moving(ax, roles, layout.view, step_s, truth=overlays.truth, replay=replay, ghosts=True)
     if tells_ends(scenario):
         draw_observers(ax, roles, layout.view)
-    draw_warnings(ax, warned_places(replay))
+    draw_warnings(ax, replay)
     if overlays.predicted is not None:
         draw_predictions(ax, roles, overlays.predicted)
-    draw_labels(ax, base.labels)
+    draw_labels(ax, labels)
     if overlays.options.size_px is not None:
         layout.set_width_px(overlays.options.size_px[0])
     return layout
@@ -122,12 +116,8 @@ def resolve_picture(requested: Path) -> FilmFile:
 
 
 def _save(layout: FigureLayout, path: Path, dpi: float) -> None:
-    suffix = path.suffix.lower()
     # The same scenario gives the same bytes: no random element names, no dates.
-    metadata: dict[str, dict[str, Any]] = {
-        ".svg": {"Date": None},
-        ".pdf": {"CreationDate": None},
-        ".png": {"Software": None},
-    }
+    kind = path.suffix.lower().removeprefix(".")
+    left_out: Any = {{"svg": "Date", "pdf": "CreationDate", "png": "Software"}[kind]: None}
     with replaced(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
-        layout.figure.savefig(temporary, format=suffix[1:], dpi=dpi, metadata=metadata[suffix])
+        layout.figure.savefig(temporary, format=kind, dpi=dpi, metadata=left_out)
