@@ -71,13 +71,10 @@ def evaluate_batch(
             entries.append(entry | {"error": str(error)})
         progress(k + 1, len(known))
     return {
-        "batch_metrics_version": VERSION,
-        "max_range_m": max_range_m,
-        "categories": None if categories is None else sorted(categories),
-        "without_truth": len(rows) - len(known),
-        "total": pool([entry for entry in entries if "error" not in entry]),
-        "logs": entries,
-    }
+        "batch_metrics_version": VERSION, "max_range_m": max_range_m,
+        "categories": None if categories is None else sorted(categories), "without_truth": len(rows) - len(known),
+        "total": pool([entry for entry in entries if "error" not in entry]), "logs": entries,
+    }  # fmt: skip
 
 
 def pool(entries: Sequence[Figures]) -> Figures:

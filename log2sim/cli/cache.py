@@ -59,13 +59,10 @@ def summarize_cache(store: DiskCache) -> dict[str, Any]:
     ]
     found, kept = last.get("found"), last.get("kept")
     return {
-        "folder": str(store.folder),
-        "max_mb": store.max_mb,
-        "bytes": sum(size for _, size in usage.values()),
-        "parts": sum(count for count, _ in usage.values()),
-        "detectors": detectors,
+        "folder": str(store.folder), "max_mb": store.max_mb, "bytes": sum(size for _, size in usage.values()),
+        "parts": sum(count for count, _ in usage.values()), "detectors": detectors,
         "last_run": {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None,
-    }
+    }  # fmt: skip
 
 
 def describe_cache(found: dict[str, Any]) -> list[str]:

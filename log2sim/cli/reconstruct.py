@@ -208,14 +208,11 @@ def reconstruct(
     check_targets(out, report, topdown, overwrite=overwrite)
     fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
     changes: dict[str, Any] = {
-        "cameras": None if cameras is None else opt.camera_names(cameras),
-        "start_s": start,
-        "stop_s": stop,
-        "seed": seed,
-        "track": None if static_for_all is None else {"static_for_all": static_for_all},
+        "cameras": None if cameras is None else opt.camera_names(cameras), "start_s": start, "stop_s": stop,
+        "seed": seed, "track": None if static_for_all is None else {"static_for_all": static_for_all},
         "cooperation": {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None},
         "calibration": {name: True for name, chosen in fixes.items() if chosen},
-    }
+    }  # fmt: skip
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
         from log2sim.edit.corrections import correct, load_corrections

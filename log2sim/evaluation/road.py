@@ -179,16 +179,13 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
         agreement[f"{name}_accuracy"] = share(matched.length_m[stated], same[stated])
     beside = away <= LATERAL_REACH_M
     return {
-        "true_m": true_m,
-        "found_m": found_m,
-        "precision": share(ours.length_m, right),
+        "true_m": true_m, "found_m": found_m, "precision": share(ours.length_m, right),
         "recall": share(theirs.length_m, missed_by <= MATCH_M),
         "recall_20_m": share(theirs.length_m[close], missed_by[close] <= MATCH_M),
         "lateral_median_m": _quantile(away[beside], ours.length_m[beside], 0.5),
         "lateral_p95_m": _quantile(away[beside], ours.length_m[beside], 0.95),
-        "false_m_per_100_m": None if area.path_m < 1 else 100 * false_m / area.path_m,
-        **agreement,
-    }
+        "false_m_per_100_m": None if area.path_m < 1 else 100 * false_m / area.path_m, **agreement,
+    }  # fmt: skip
 
 
 def share(weight: Array, chosen: NDArray[np.bool_]) -> float | None:
@@ -354,14 +351,11 @@ def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str
             if color["name"] != true_color["name"]:
                 confused[f"{true_color['name']} as {color['name']}"] += 1
     return {
-        "vehicles": len(matched),
-        "with_color": with_color,
-        "named": named,
-        "right": right,
+        "vehicles": len(matched), "with_color": with_color, "named": named, "right": right,
         "accuracy": right / named if named else None,
         "ciede2000_median": float(np.median(distance)) if distance else None,
         "confused": dict(sorted(confused.items())),
-    }
+    }  # fmt: skip
 
 
 def _difference(a: Any, b: Any) -> float:

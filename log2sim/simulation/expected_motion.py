@@ -25,13 +25,9 @@ from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
 CHOICES = (*ENDS, "both")
 
 _RANGES = {
-    "horizon_s": (0.5, 10.0),
-    "margin_s": (0.0, 10.0),
-    "early_probability": (0.01, 1.0),
-    "min_probability": (0.01, 1.0),
-    "reaction_s": (0.0, 10.0),
-    "brake_mps2": (0.5, 20.0),
-}
+    "horizon_s": (0.5, 10.0), "margin_s": (0.0, 10.0), "early_probability": (0.01, 1.0), "min_probability": (0.01, 1.0),
+    "reaction_s": (0.0, 10.0), "brake_mps2": (0.5, 20.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

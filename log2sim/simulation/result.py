@@ -203,17 +203,11 @@ class Replay:
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/replay-1.json`."""
         document = {
-            "replay_version": VERSION,
-            "scenario": self.scenario,
-            "scenario_digest": self.scenario_digest,
-            "mode": self.mode,
-            "model": self.model,
-            "dt_s": self.dt_s,
-            "store_dt_s": self.store_dt_s,
-            "agents": [_agent_to_dict(a) for a in self.agents],
-            "metrics": dict(self.metrics),
+            "replay_version": VERSION, "scenario": self.scenario, "scenario_digest": self.scenario_digest,
+            "mode": self.mode, "model": self.model, "dt_s": self.dt_s, "store_dt_s": self.store_dt_s,
+            "agents": [_agent_to_dict(a) for a in self.agents], "metrics": dict(self.metrics),
             "left_out": dict(self.left_out),
-        }
+        }  # fmt: skip
         return document if self.warnings is None else {**document, "warnings": self.warnings.to_dict()}
 
     @classmethod
@@ -267,17 +261,12 @@ def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
     length, width, height = (float(v) for v in agent.size_m)
     commands, known = agent.commands, agent.cross_track_m is not None
     return {
-        "id": agent.id,
-        "category": agent.category,
-        "size_m": {"length": length, "width": width, "height": height},
-        "driver": agent.driver,
-        "model": agent.model,
-        "model_reason": agent.model_reason,
-        "flags": list(agent.flags),
+        "id": agent.id, "category": agent.category, "size_m": {"length": length, "width": width, "height": height},
+        "driver": agent.driver, "model": agent.model, "model_reason": agent.model_reason, "flags": list(agent.flags),
         "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
         "commands": {k: getattr(commands, k).tolist() for k in Commands.COLUMNS} if commands is not None else None,
         "errors": {k: getattr(agent, k).tolist() for k in AgentReplay.ERRORS} if known else None,
-    }
+    }  # fmt: skip
 
 
 def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:

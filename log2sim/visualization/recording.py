@@ -411,15 +411,10 @@ def point_document(
         moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
     return {
         "t_s": [round((points.t_ns - scenario.t0_ns) / NS_PER_S, 4) for points, _ in moments],
-        "origin_m": [list(points.origin) for points, _ in moments],
-        "points": [text for _, text in moments],
-        "unit_m": UNIT_M,
-        "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M],
-        "intensity": bright > 0,
-        "cell_m": detail.size,
-        "rate_hz": detail.rate_hz,
-        "bytes": total,
-    }
+        "origin_m": [list(points.origin) for points, _ in moments], "points": [text for _, text in moments],
+        "unit_m": UNIT_M, "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M], "intensity": bright > 0, "cell_m": detail.size,
+        "rate_hz": detail.rate_hz, "bytes": total,
+    }  # fmt: skip
 
 
 def pack_recording(points: PointsAbove, cell_m: float, bright: float) -> str:

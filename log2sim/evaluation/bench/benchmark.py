@@ -458,17 +458,12 @@ def bench_document(result: Benchmark) -> dict[str, Any]:
         "bench_version": VERSION,
         "log": {"name": context.log.name, "format": context.log.format, "digest": context.log.digest},
         "log2sim_version": __version__,
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "ticks": len(t),
-        "duration_s": int(t[-1] - t[0]) / NS_PER_S,
-        "cameras": list(context.plan.cameras),
-        "truth": context.truth.name if context.truth is not None else None,
-        "max_range_m": context.scope.max_range_m,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(), "ticks": len(t),
+        "duration_s": int(t[-1] - t[0]) / NS_PER_S, "cameras": list(context.plan.cameras),
+        "truth": context.truth.name if context.truth is not None else None, "max_range_m": context.scope.max_range_m,
         "categories": None if context.scope.categories is None else list(context.scope.categories),
-        "config": config.to_dict(),
-        "notes": list(result.notes),
-        "panels": [_panel_document(p) for p in result.panels],
-    }
+        "config": config.to_dict(), "notes": list(result.notes), "panels": [_panel_document(p) for p in result.panels],
+    }  # fmt: skip
     check(out, "bench-1", ScenarioError)
     return out
 

@@ -276,16 +276,13 @@ def figures(objects: Objects, pairs: BoxPairs, criterion: Criterion, min_score: 
     rows = np.flatnonzero(matches.right & (objects.found.score >= min_score))
     turned = wrap_angle(objects.found.box[rows, 6] - objects.truth.box[matches.truth[rows], 6])
     return {
-        "objects": objects.name,
-        "match": match_entry(criterion),
-        "truths": matches.truths,
-        "ap_r40": curve.average(40),
+        "objects": objects.name, "match": match_entry(criterion), "truths": matches.truths, "ap_r40": curve.average(40),
         "ap_r11": curve.average(11),
         "ap_nuscenes": curve.nuscenes_average() if criterion.measure == "center_m" else None,
         **(published(objects, pairs, criterion) if objects.boxes.found_views is not None else {}),
         **operating_point(objects.found, matches, min_score),
         "heading_over_90_deg": float((np.abs(turned) > np.pi / 2).mean()) if len(rows) else None,
-    }
+    }  # fmt: skip
 
 
 def published(objects: Objects, pairs: BoxPairs, criterion: Criterion) -> dict[str, Any]:
@@ -475,21 +472,14 @@ def evaluate_boxes(
     boxes = _project(log, detected.t_ns, found, truth, camera, options)
     figures = {c.name: class_figures(_class_boxes(boxes, c), c, options.min_score) for c in classes}
     return {
-        "detection_metrics_version": VERSION,
-        "log": detected.log,
-        "truth": log.name,
-        "detector": detected.detector,
-        "protocol": protocol.name,
-        "min_score": options.min_score,
-        "max_range_m": options.max_range_m,
-        "sweeps": int(truth.labeled.sum()),
-        "sweeps_without_labels": int((~truth.labeled).sum()),
+        "detection_metrics_version": VERSION, "log": detected.log, "truth": log.name, "detector": detected.detector,
+        "protocol": protocol.name, "min_score": options.min_score, "max_range_m": options.max_range_m,
+        "sweeps": int(truth.labeled.sum()), "sweeps_without_labels": int((~truth.labeled).sum()),
         "reference_camera": camera,
         "occlusion_known": None if camera is None else log.labels is not None and log.labels.occlusion is not None,
-        "min_points": None if truth.boxes.points is None else MIN_POINTS,
-        "overall": overall(figures),
+        "min_points": None if truth.boxes.points is None else MIN_POINTS, "overall": overall(figures),
         "classes": figures,
-    }
+    }  # fmt: skip
 
 
 def _reference_camera(log: Log, protocol: Protocol) -> str | None:

@@ -37,16 +37,11 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     if not found["ticks"]:
         return []
     return [
-        "",
-        "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
-        "NEES: squared errors of position, yaw and speed over sigma, 1 is right",
-        *columns_text(_cells(found)),
-        *textwrap.wrap(_confused_line(found["confusion"]), 100, subsequent_indent="  "),
-        "",
-        *_calibration_lines(found),
-        "",
-        *worst_agents(found["judged_agents"], MAX_WORST),
-    ]
+        "", "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
+        "NEES: squared errors of position, yaw and speed over sigma, 1 is right", *columns_text(_cells(found)),
+        *textwrap.wrap(_confused_line(found["confusion"]), 100, subsequent_indent="  "), "", *_calibration_lines(found),
+        "", *worst_agents(found["judged_agents"], MAX_WORST),
+    ]  # fmt: skip
 
 
 def _cells(found: Mapping[str, Any]) -> list[list[str]]:

@@ -77,17 +77,13 @@ def summarize_verdicts(errors: StateErrors) -> dict[str, float | None]:
     np.add.at(total, index, values)
     by_agent = total / count[:, None]
     return {
-        "position_rmse_m": root_mean_square(errors.position_m),
-        "position_median_m": median(errors.position_m),
-        "ade_m": float(by_agent[:, 3].mean()) if len(by_agent) else None,
-        "yaw_median_deg": median(np.degrees(headed)),
+        "position_rmse_m": root_mean_square(errors.position_m), "position_median_m": median(errors.position_m),
+        "ade_m": float(by_agent[:, 3].mean()) if len(by_agent) else None, "yaw_median_deg": median(np.degrees(headed)),
         "yaw_flipped": float(np.mean(headed > np.pi / 2)) if len(headed) else None,
-        "speed_rmse_mps": root_mean_square(errors.speed_mps),
-        "size_median_m": median(by_agent[:, :3].mean(axis=1)),
-        "length_median_m": median(by_agent[:, 0]),
-        "width_median_m": median(by_agent[:, 1]),
+        "speed_rmse_mps": root_mean_square(errors.speed_mps), "size_median_m": median(by_agent[:, :3].mean(axis=1)),
+        "length_median_m": median(by_agent[:, 0]), "width_median_m": median(by_agent[:, 1]),
         "height_median_m": median(by_agent[:, 2]),
-    }
+    }  # fmt: skip
 
 
 def root_mean_square(values: Array) -> float | None:

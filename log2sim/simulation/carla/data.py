@@ -37,29 +37,18 @@ class Asset:
 
 
 CARS: Mapping[str, Size] = {
-    "vehicle.audi.a2": (3.71, 1.79, 1.55),
-    "vehicle.audi.etron": (4.86, 2.03, 1.65),
-    "vehicle.audi.tt": (4.18, 1.99, 1.39),
-    "vehicle.bmw.grandtourer": (4.61, 2.24, 1.67),
-    "vehicle.chevrolet.impala": (5.36, 2.03, 1.41),
-    "vehicle.citroen.c3": (3.99, 1.85, 1.62),
-    "vehicle.dodge.charger_2020": (5.01, 1.88, 1.53),
-    "vehicle.ford.mustang": (4.72, 1.89, 1.30),
-    "vehicle.jeep.wrangler_rubicon": (3.87, 1.91, 1.88),
-    "vehicle.lincoln.mkz_2017": (4.90, 2.13, 1.51),
-    "vehicle.lincoln.mkz_2020": (4.89, 1.84, 1.49),
-    "vehicle.mercedes.coupe": (5.03, 2.15, 1.65),
-    "vehicle.mercedes.coupe_2020": (4.67, 1.81, 1.44),
-    "vehicle.micro.microlino": (2.21, 1.48, 1.38),
-    "vehicle.mini.cooper_s": (3.81, 1.97, 1.48),
-    "vehicle.mini.cooper_s_2021": (4.55, 2.10, 1.77),
-    "vehicle.nissan.micra": (3.63, 1.85, 1.50),
-    "vehicle.nissan.patrol": (4.60, 1.93, 1.85),
-    "vehicle.nissan.patrol_2021": (5.57, 2.15, 2.05),
-    "vehicle.seat.leon": (4.19, 1.82, 1.47),
-    "vehicle.tesla.model3": (4.79, 2.16, 1.49),
-    "vehicle.toyota.prius": (4.51, 2.01, 1.52),
-}
+    "vehicle.audi.a2": (3.71, 1.79, 1.55), "vehicle.audi.etron": (4.86, 2.03, 1.65),
+    "vehicle.audi.tt": (4.18, 1.99, 1.39), "vehicle.bmw.grandtourer": (4.61, 2.24, 1.67),
+    "vehicle.chevrolet.impala": (5.36, 2.03, 1.41), "vehicle.citroen.c3": (3.99, 1.85, 1.62),
+    "vehicle.dodge.charger_2020": (5.01, 1.88, 1.53), "vehicle.ford.mustang": (4.72, 1.89, 1.30),
+    "vehicle.jeep.wrangler_rubicon": (3.87, 1.91, 1.88), "vehicle.lincoln.mkz_2017": (4.90, 2.13, 1.51),
+    "vehicle.lincoln.mkz_2020": (4.89, 1.84, 1.49), "vehicle.mercedes.coupe": (5.03, 2.15, 1.65),
+    "vehicle.mercedes.coupe_2020": (4.67, 1.81, 1.44), "vehicle.micro.microlino": (2.21, 1.48, 1.38),
+    "vehicle.mini.cooper_s": (3.81, 1.97, 1.48), "vehicle.mini.cooper_s_2021": (4.55, 2.10, 1.77),
+    "vehicle.nissan.micra": (3.63, 1.85, 1.50), "vehicle.nissan.patrol": (4.60, 1.93, 1.85),
+    "vehicle.nissan.patrol_2021": (5.57, 2.15, 2.05), "vehicle.seat.leon": (4.19, 1.82, 1.47),
+    "vehicle.tesla.model3": (4.79, 2.16, 1.49), "vehicle.toyota.prius": (4.51, 2.01, 1.52),
+}  # fmt: skip
 VANS: Mapping[str, Size] = {
     "vehicle.mercedes.sprinter": (5.92, 1.99, 2.56),
     "vehicle.volkswagen.t2": (4.48, 2.07, 2.04),
@@ -96,22 +85,15 @@ def _walker(number: str) -> Size:
 
 WALKERS: Mapping[str, Size] = {f"walker.pedestrian.{k:04}": _walker(f"{k:04}") for k in range(1, 53)}
 PROPS: Mapping[str, Size] = {
-    "static.prop.barrel": (0.46, 0.47, 0.81),
-    "static.prop.busstop": (3.88, 1.89, 2.74),
-    "static.prop.clothcontainer": (1.24, 1.89, 1.81),
-    "static.prop.constructioncone": (0.34, 0.34, 0.59),
-    "static.prop.container": (1.93, 1.01, 1.71),
-    "static.prop.glasscontainer": (1.95, 2.01, 1.79),
-    "static.prop.kiosk_01": (1.63, 1.65, 3.25),
-    "static.prop.plantpot04": (4.97, 0.74, 0.12),
-    "static.prop.shoppingcart": (0.67, 1.21, 1.08),
-    "static.prop.streetbarrier": (1.21, 0.37, 1.07),
-    "static.prop.trafficcone01": (0.88, 0.88, 1.13),
-    "static.prop.trafficwarning": (2.37, 2.87, 3.57),
-    "static.prop.trashbag": (0.38, 0.43, 0.70),
-    "static.prop.trashcan03": (0.63, 0.55, 0.93),
+    "static.prop.barrel": (0.46, 0.47, 0.81), "static.prop.busstop": (3.88, 1.89, 2.74),
+    "static.prop.clothcontainer": (1.24, 1.89, 1.81), "static.prop.constructioncone": (0.34, 0.34, 0.59),
+    "static.prop.container": (1.93, 1.01, 1.71), "static.prop.glasscontainer": (1.95, 2.01, 1.79),
+    "static.prop.kiosk_01": (1.63, 1.65, 3.25), "static.prop.plantpot04": (4.97, 0.74, 0.12),
+    "static.prop.shoppingcart": (0.67, 1.21, 1.08), "static.prop.streetbarrier": (1.21, 0.37, 1.07),
+    "static.prop.trafficcone01": (0.88, 0.88, 1.13), "static.prop.trafficwarning": (2.37, 2.87, 3.57),
+    "static.prop.trashbag": (0.38, 0.43, 0.70), "static.prop.trashcan03": (0.63, 0.55, 0.93),
     "static.prop.vendingmachine": (0.87, 1.10, 2.11),
-}
+}  # fmt: skip
 
 BY_CATEGORY: Mapping[str, Mapping[str, Size]] = {
     "car": {**CARS, **VANS},
@@ -229,13 +211,9 @@ def _trajectories(
     bend = {"curvature_1pm": _rounded(-curvature)}
     exact = {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), **bend}
     pid = {
-        **_left_handed(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw),
-        **bend,
-        "speed_mps": _rounded(speed),
-        "accel_mps2": _rounded(accel),
-        "gear": _rounded(gear),
-        "stands": _rounded(stands),
-    }
+        **_left_handed(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw), **bend,
+        "speed_mps": _rounded(speed), "accel_mps2": _rounded(accel), "gear": _rounded(gear), "stands": _rounded(stands),
+    }  # fmt: skip
     return exact, pid
 
 
@@ -258,12 +236,9 @@ def _times(agent: Agent, trajectory: Trajectory) -> Array:
 def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
     """Convert columns to CARLA's left-handed frame."""
     return {
-        "t_s": _rounded(t_s, 7),
-        "x_m": _rounded(x),
-        "y_m": _rounded(-y),
-        "z_m": _rounded(z),
+        "t_s": _rounded(t_s, 7), "x_m": _rounded(x), "y_m": _rounded(-y), "z_m": _rounded(z),
         "yaw_deg": _rounded(-np.degrees(yaw)),
-    }
+    }  # fmt: skip
 
 
 def _rounded(values: ArrayLike, digits: int = 4) -> list[float]:

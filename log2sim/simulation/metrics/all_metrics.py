@@ -89,13 +89,10 @@ def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
     """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
     across = np.abs(errors.across_m)
     return {
-        "cross_track_rms_m": round(_rms(errors.across_m), 6),
-        "cross_track_max_m": round(float(np.max(across)), 6),
-        "along_track_rms_m": round(_rms(errors.along_m), 6),
-        "speed_rms_mps": round(_rms(errors.speed_mps), 6),
-        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6),
-        "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
-    }
+        "cross_track_rms_m": round(_rms(errors.across_m), 6), "cross_track_max_m": round(float(np.max(across)), 6),
+        "along_track_rms_m": round(_rms(errors.along_m), 6), "speed_rms_mps": round(_rms(errors.speed_mps), 6),
+        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6), "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
+    }  # fmt: skip
 
 
 def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
@@ -130,14 +127,9 @@ MIN_ROWS = 5
 
 # Comfort limits of nuPlan's planning benchmark (Karnchanachari et al., 2024), derived from human drivers.
 LIMITS = {
-    "lon_accel_max_mps2": 2.40,
-    "lon_decel_max_mps2": 4.05,
-    "lat_accel_max_mps2": 4.89,
-    "lon_jerk_max_mps3": 4.13,
-    "jerk_max_mps3": 8.37,
-    "yaw_rate_max_radps": 0.95,
-    "yaw_accel_max_radps2": 1.93,
-}
+    "lon_accel_max_mps2": 2.40, "lon_decel_max_mps2": 4.05, "lat_accel_max_mps2": 4.89, "lon_jerk_max_mps3": 4.13,
+    "jerk_max_mps3": 8.37, "yaw_rate_max_radps": 0.95, "yaw_accel_max_radps2": 1.93,
+}  # fmt: skip
 
 
 def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
@@ -159,17 +151,12 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     cos, sin = np.cos(yaw), np.sin(yaw)
     lon_accel, lat_accel, lon_jerk = ax * cos + ay * sin, ay * cos - ax * sin, jx * cos + jy * sin
     out = {
-        "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0),
-        "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
-        "lon_accel_rms_mps2": _rms(lon_accel),
-        "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
-        "lat_accel_rms_mps2": _rms(lat_accel),
-        "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
-        "lon_jerk_rms_mps3": _rms(lon_jerk),
-        "jerk_max_mps3": float(np.hypot(jx, jy).max()),
-        "yaw_rate_max_radps": float(np.abs(yaw_rate).max()),
-        "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
-    }
+        "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0), "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
+        "lon_accel_rms_mps2": _rms(lon_accel), "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
+        "lat_accel_rms_mps2": _rms(lat_accel), "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
+        "lon_jerk_rms_mps3": _rms(lon_jerk), "jerk_max_mps3": float(np.hypot(jx, jy).max()),
+        "yaw_rate_max_radps": float(np.abs(yaw_rate).max()), "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
+    }  # fmt: skip
     rounded: dict[str, float | bool] = {k: round(v, 4) for k, v in out.items()}
     rounded["comfortable"] = all(out[k] <= limit for k, limit in LIMITS.items())
     return rounded
@@ -216,12 +203,9 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     length_m = float(table.at(np.zeros(1, dtype=np.intp), np.array([path.t_s[-1]])).distance_m[0])
     steps_m = np.hypot(np.diff(ego.x_m), np.diff(ego.y_m))
     return {
-        "driven_m": round(float(steps_m.sum()), 3),
-        "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
-        "path_m": round(length_m, 3),
-        "min_gap": smallest_gap(boxes, index, t_s),
-        "max_brake": hardest_brake(ego),
-    }
+        "driven_m": round(float(steps_m.sum()), 3), "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
+        "path_m": round(length_m, 3), "min_gap": smallest_gap(boxes, index, t_s), "max_brake": hardest_brake(ego),
+    }  # fmt: skip
 
 
 def hardest_brake(ego: AgentReplay) -> dict[str, float] | None:
@@ -407,15 +391,10 @@ def replay_metrics(
     out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
     out["followers"] = len(on_time)
     return {
-        **out,
-        **ego,
-        "collisions": events,
-        "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
-        "min_ttc": most_critical(near, "min_ttc"),
-        "min_pet": most_critical(near, "pet"),
-        "conflicts": near,
+        **out, **ego, "collisions": events, "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
+        "min_ttc": most_critical(near, "min_ttc"), "min_pet": most_critical(near, "pet"), "conflicts": near,
         "by_agent": by_agent,
-    }
+    }  # fmt: skip
 
 
 def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:

@@ -113,12 +113,9 @@ def page_html(document: dict[str, Any]) -> str:
     ) + ("; connect-src 'self'" if "address" in document["studio"] else "")
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     parts = {
-        "policy": policy,
-        "title": html.escape(document["name"] or "scenario"),
-        "style": style,
-        "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
-        "script": script,
-    }
+        "policy": policy, "title": html.escape(document["name"] or "scenario"), "style": style,
+        "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"), "script": script,
+    }  # fmt: skip
     # One pass: inserted text is not searched again, so no name in a scenario can be taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
 
