@@ -143,7 +143,13 @@ class AgentGroup(ABC):
         if len(self.live):
             self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
             for slot, i in enumerate(self.live):
-                _copy_rows(self._table[:, :, slot], self.references[i], self._row0)
+                # The first and the last row of a table fill what lies before and after.
+                columns, begin_row = self.references[i].columns, self.references[i].first_row - self._row0
+                low = min(max(begin_row, 0), rows)
+                high = min(max(begin_row + len(columns), low), rows)
+                self._table[:low, :, slot] = columns[0]
+                self._table[low:high, :, slot] = columns[low - begin_row : high - begin_row]
+                self._table[high:, :, slot] = columns[-1]
         self._take()
 
     def log_times(self, t_s: float) -> Array:
@@ -225,10 +231,9 @@ class VehicleGroup(AgentGroup):
     ) -> None:
         super().__init__(agents, references, first, last)
         self.parameters, self.move, count = parameters, move, len(agents)
+        state, memory = VehicleState.zeros(count), ControllerMemory.fresh(count)
         commands = VehicleControls(np.zeros(count), np.zeros(count), np.zeros(count, bool))
-        self.keep(
-            state=VehicleState.zeros(count), memory=ControllerMemory.fresh(count), commands=commands, living=parameters
-        )
+        self.keep(state=state, memory=memory, commands=commands, living=parameters)
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
@@ -247,10 +252,8 @@ class VehicleGroup(AgentGroup):
         cos, sin = cos_sin(s.yaw_rad)
         x = s.x_m + o * cos + self.origin_x_m[self.live]
         y = s.y_m + o * sin + self.origin_y_m[self.live]
-        accel = np.where(
-            (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
-        )
-        c = self.commands
+        held, forward = (s.speed_mps == 0) & (s.pedal_mps2 < 0), np.where(s.speed_mps < 0, -1.0, 1.0)
+        accel, c = np.where(held, 0.0, s.pedal_mps2 * forward), self.commands
         gear = np.where(c.reverse, -1.0, 1.0)
         return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel, c.pedal_mps2, c.steer_rad, gear)
 
@@ -268,9 +271,8 @@ class PolicyVehicle(VehicleGroup):
 
     def _step(self, dt_s: float) -> None:
         c = self.controls
-        self.commands = VehicleControls(
-            np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
-        )
+        pedal, steer = np.array([[c.accel_mps2], [c.steer_rad]], float)
+        self.commands = VehicleControls(pedal, steer, np.array([c.reverse], bool))
         self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
@@ -304,16 +306,6 @@ class PedestrianGroup(AgentGroup):
     def _step(self, dt_s: float) -> None:
         self.commands = follow_points(self.row, self.state)
         self.state = self.move(self.state, self.commands, dt_s)
-
-
-def _copy_rows(window: Array, reference: Reference, row0: int) -> None:
-    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row fill what lies before and after."""
-    columns, begin = reference.columns, reference.first_row - row0
-    low = min(max(begin, 0), len(window))
-    high = min(max(begin + len(columns), low), len(window))
-    window[:low] = columns[0]
-    window[low:high] = columns[low - begin : high - begin]
-    window[high:] = columns[-1]
 
 
 # By agent id: the stored steps (S,) and the columns (C, S) of `Snapshot` at these steps.
@@ -391,23 +383,12 @@ class PolicyObserver:
 
     def _state(self) -> EgoState:
         """Build the ego's state, at the height of its path in the scenario at `progress_m`."""
-        agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
+        (length, width, height), s, p = self.ego.agents[0].size_m, self.ego.snapshot(), self.ego.living
         log_t_s = self._path_table.times(ONE, np.array([self.progress_m]))
-        return EgoState(
-            x_m=float(s.x_m[0]),
-            y_m=float(s.y_m[0]),
-            z_m=float(self._trajectory.heights(log_t_s)[0]),
-            yaw_rad=float(s.yaw_rad[0]),
-            speed_mps=float(s.speed_mps[0]),
-            accel_mps2=float(s.accel_mps2[0]),
-            steer_rad=float(s.steer_rad[0]),
-            length_m=agent.size_m[0],
-            width_m=agent.size_m[1],
-            height_m=agent.size_m[2],
-            wheelbase_m=float(p.wheelbase_m[0]),
-            rear_axle_offset_m=float(p.rear_axle_offset_m[0]),
-            understeer_s2pm2=float(p.understeer_s2pm2[0]),
-        )
+        moves = {k: float(getattr(s, k)[0]) for k in ("x_m", "y_m", "yaw_rad", "speed_mps", "accel_mps2", "steer_rad")}
+        built = {k: float(getattr(p, k)[0]) for k in ("wheelbase_m", "rear_axle_offset_m", "understeer_s2pm2")}
+        z_m = float(self._trajectory.heights(log_t_s)[0])
+        return EgoState(z_m=z_m, length_m=length, width_m=width, height_m=height, **moves, **built)
 
     def _route(self, t_s: float) -> Route:
         ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._trajectory.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
@@ -439,10 +420,8 @@ class PolicyObserver:
         near = np.argsort(distance, kind="stable")
         near = near[distance[near] <= self.sight_m]
         x, y, yaw, speed, seen = x[near], y[near], yaw[near], speed[near], np.concatenate(who)[near]
-        z = np.array(
-            [trajectory.heights(t) for trajectory, t in zip(seen["trajectory"], np.concatenate(log_s)[near])],
-            dtype=np.float64,
-        )
+        times = zip(seen["trajectory"], np.concatenate(log_s)[near])
+        z = np.array([trajectory.heights(t) for trajectory, t in times], dtype=np.float64)
         size = (seen[k] for k in ("length_m", "width_m", "height_m"))
         columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
         return Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))

@@ -180,13 +180,11 @@ class Watch:
             others = replace(others, position_m=self._moved(others.position_m, agent, tick, seen))
         lead_s = self._expected.lead_s
         own = self.ego_path.at(ego.take(row), lead_s)
-        found = expected_contacts(own, others, lead_s)
-        gone = np.concatenate(
-            [np.zeros((len(row), 1)), np.cumsum(np.abs(np.diff(own.position_m, axis=1)), axis=1)], axis=1
-        )
-        way = np.array([np.interp(t, lead_s, w) if np.isfinite(t) else np.inf for t, w in zip(found.time_s, gone)])
-        due = self.settings.is_due(found.probability, way, ego.speed_mps[row])
-        return Courses(agent, row, found.probability, found.time_s, way, due)
+        probability, time_s = expected_contacts(own, others, lead_s)
+        gone = np.cumsum(np.abs(np.diff(own.position_m, axis=1, prepend=own.position_m[:, :1])), axis=1)
+        way = np.array([np.interp(t, lead_s, w) if np.isfinite(t) else np.inf for t, w in zip(time_s, gone)])
+        due = self.settings.is_due(probability, way, ego.speed_mps[row])
+        return Courses(agent, row, probability, time_s, way, due)
 
     def _may_meet(self, ego: EgoStates, agent: Index, tick: Index) -> NDArray[np.bool_]:
         """Whether agents (C,) are within reach of the ego, and at a height of its path."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -25,15 +25,6 @@ from log2sim.simulation.reference import vehicle_limits, vehicle_reference
 from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
 Size = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Asset:
-    """A blueprint and the difference of its size from the agent's."""
-
-    blueprint: str
-    size_m: Size  # (3,), m length, width, height
-    error_m: Size  # (3,), m size of the blueprint less that of the agent
 
 
 CARS: Mapping[str, Size] = {
@@ -107,20 +98,21 @@ BY_CATEGORY: Mapping[str, Mapping[str, Size]] = {
 }
 
 
-def nearest_assets(agent: Agent, *, turn: int = 0, count: int = 3) -> tuple[Asset, ...]:
-    """Return the blueprints of an agent's category nearest in size (Euclidean over the three lengths), nearest first.
+def nearest_assets(agent: Agent, *, turn: int = 0) -> list[dict[str, Any]]:
+    """Return the three assets of an agent's category nearest in size (Euclidean over the three lengths), nearest first.
 
-    Among blueprints of one size, such as CARLA's adults, the `turn`-th comes first, so that not all look the same.
+    Each has "blueprint", "size_m", its length, width and height, and "error_m", that size less the agent's. Among
+    blueprints of one size, such as CARLA's adults, the `turn`-th comes first, so that not all look the same.
     """
     offers: dict[Size, list[str]] = {}
     for blueprint, size_m in BY_CATEGORY[agent.category].items():
         offers.setdefault(size_m, []).append(blueprint)
     assets = []
     for size_m in sorted(offers, key=lambda s: math.dist(s, agent.size_m)):
-        same = offers[size_m]
-        error_m = tuple(round(a - b, 3) for a, b in zip(size_m, agent.size_m))
-        assets += [Asset(same[(turn + k) % len(same)], size_m, error_m) for k in range(len(same))]  # type: ignore[arg-type]
-    return tuple(assets[:count])
+        same, error_m = offers[size_m], tuple(round(a - b, 3) for a, b in zip(size_m, agent.size_m))
+        turned = [same[(turn + k) % len(same)] for k in range(len(same))]
+        assets += [{"blueprint": blueprint, "size_m": size_m, "error_m": error_m} for blueprint in turned]
+    return assets[:3]
 
 
 SAMPLE_S = 0.05  # spacing of the samples; linear interpolation errs by at most a h^2 / 8 = 3 mm at 10 m/s2
@@ -142,18 +134,6 @@ def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
     Raises `ScenarioError` when their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for
     them.
     """
-    _require_few_samples(agents)
-    begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
-    end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
-    counts: Counter[str] = Counter()
-    described = []
-    for agent in agents:
-        described.append(_agent(agent, counts[agent.category], (begin_s, end_s)))
-        counts[agent.category] += 1
-    return described
-
-
-def _require_few_samples(agents: Sequence[Agent]) -> None:
     lasts_s = [0.0 if a.static else float(a.waypoints.t_s[-1] - a.waypoints.t_s[0]) for a in agents]
     size_bytes = sum(lasts_s) / SAMPLE_S * BYTES_PER_SAMPLE
     if size_bytes > MAX_SAMPLED_BYTES:
@@ -162,6 +142,14 @@ def _require_few_samples(agents: Sequence[Agent]) -> None:
             f"agents last {sum(lasts_s):g} s together, '{agents[k].id}' {lasts_s[k]:g} s: their samples every {SAMPLE_S:g} s take "
             f"{size_bytes / 2**30:.3g} GiB, at most {MAX_SAMPLED_BYTES / 2**30:g} GiB can be written; cut the scenario into parts"
         )
+    begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
+    end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
+    counts: Counter[str] = Counter()
+    described = []
+    for agent in agents:
+        described.append(_agent(agent, counts[agent.category], (begin_s, end_s)))
+        counts[agent.category] += 1
+    return described
 
 
 def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, Any]:
@@ -179,10 +167,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
         "color": None if agent.color is None else list(agent.color["rgb"]),
         "static": agent.static,
         "doubts": [doubt.to_dict() for doubt in agent.doubts],
-        "assets": [
-            {"blueprint": a.blueprint, "size_m": a.size_m, "error_m": a.error_m}
-            for a in nearest_assets(agent, turn=turn)
-        ],
+        "assets": nearest_assets(agent, turn=turn),
         "begin_s": life_s[0],
         "end_s": life_s[1],
         "discontinuities_s": [float(t) for t in trajectory.discontinuity_times()],
@@ -223,14 +208,10 @@ def _times(agent: Agent, trajectory: Trajectory) -> Array:
         return trajectory.t_s[:1]
     regular = np.arange(trajectory.t_s[0], trajectory.t_s[-1], SAMPLE_S)
     k = np.searchsorted(trajectory.t_s, regular, side="right")
-    gap_s = np.minimum(
-        regular - trajectory.t_s[k - 1], trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)] - regular
-    )
-    return np.sort(
-        np.concatenate(
-            [regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, trajectory.discontinuity_times() - DISCONTINUITY_S]
-        )
-    )
+    after = trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)]
+    gap_s = np.minimum(regular - trajectory.t_s[k - 1], after - regular)
+    before_jumps = trajectory.discontinuity_times() - DISCONTINUITY_S
+    return np.sort(np.concatenate([regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, before_jumps]))
 
 
 def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
