@@ -12,22 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim import geometry
 from log2sim.datatypes import AgentTable, Log, Scenario
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    apply,
-    box_corners,
-    box_lines,
-    fold_radius,
-    inverse,
-    line_time_s,
-    nearest_index,
-    period_of,
-    project,
-)
 from log2sim.geometry.boxes import EDGES, NEAR_M
 from log2sim.perception.frames import give_pictures
 from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
@@ -71,7 +58,7 @@ def require_overlap(log: Log, scenario: Scenario) -> None:
     spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
     if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
         first, last = min(span[0] for span in spans), max(span[1] for span in spans)
-        end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        end_ns = scenario.t0_ns + round(scenario.duration_s * geometry.NS_PER_S)
         raise LogError(
             f"{log.name}: its records are from stamp {first} to {last} ns, the scenario '{scenario.name}' from {scenario.t0_ns} "
             f"to {end_ns} ns; choose the log that the scenario was made of"
@@ -80,8 +67,8 @@ def require_overlap(log: Log, scenario: Scenario) -> None:
 
 def records_within(t_ns: NDArray[np.int64], scenario: Scenario) -> NDArray[np.int64]:
     """Return the indices of the records with stamps (F,) during a scenario."""
-    margin_ns = round(MARGIN_S * NS_PER_S)
-    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    margin_ns = round(MARGIN_S * geometry.NS_PER_S)
+    end_ns = scenario.t0_ns + round(scenario.duration_s * geometry.NS_PER_S)
     return np.flatnonzero((t_ns >= scenario.t0_ns - margin_ns) & (t_ns <= end_ns + margin_ns)).astype(np.int64)
 
 
@@ -90,11 +77,11 @@ def take_at_rate(t_ns: NDArray[np.int64], index: NDArray[np.int64], rate_hz: flo
 
     Beats count from `start_ns`, so that the cameras of a rig show the same moments.
     """
-    if len(index) < 2 or period_of(t_ns[index]) * rate_hz > 0.75:
+    if len(index) < 2 or geometry.period_of(t_ns[index]) * rate_hz > 0.75:
         return index
-    stamps, step_ns = t_ns[index], round(NS_PER_S / rate_hz)
+    stamps, step_ns = t_ns[index], round(geometry.NS_PER_S / rate_hz)
     beats = np.arange(start_ns, stamps[-1] + step_ns // 2, step_ns, dtype=np.int64)
-    return index[np.unique(nearest_index(stamps, beats))]
+    return index[np.unique(geometry.nearest_index(stamps, beats))]
 
 
 def take_evenly(count: int, most: int) -> NDArray[np.int64]:
@@ -131,7 +118,7 @@ class OutlineProjector:
         view = view_of(self._log, camera, t_ns)
         if view is None or not self.agents:
             return []
-        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / NS_PER_S]), permanent=True)
+        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / geometry.NS_PER_S]), permanent=True)
         center, yaw, rows = table.center_m[:, 0], table.yaw_rad[:, 0], np.flatnonzero(table.present[:, 0])
         found = project_boxes_in_view(view, center[rows], table.size_m[rows], yaw[rows])
         height_px = found.box_px[:, 3] - found.box_px[:, 1]
@@ -147,14 +134,14 @@ class OutlineProjector:
         return out
 
 
-def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
+def ground_outline(camera: geometry.Camera, corners_cam: geometry.Array) -> tuple[int, geometry.Array]:
     """Return the kind and the coordinates, px, of the outline of a box with corners (8, 3), m, cam frame.
 
     Corners where straight lines between them are right: all in front of the camera, and the lens bends no edge visibly.
     """
     if (corners_cam[:, 2] > NEAR_M).all():
         ends = corners_cam[np.array(EDGES)]
-        uv = project(camera, np.concatenate([corners_cam, ends.mean(axis=1)]))[0]
+        uv = geometry.project(camera, np.concatenate([corners_cam, ends.mean(axis=1)]))[0]
         straight = uv[np.array(EDGES)].mean(axis=1)
         # Perspective moves the middle of an edge along it; what counts is its distance from the line.
         along = uv[np.array(EDGES)[:, 1]] - uv[np.array(EDGES)[:, 0]]
@@ -163,16 +150,18 @@ def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
         bent = np.abs(along[:, 0] * off[:, 1] - along[:, 1] * off[:, 0]) / length
         if np.isfinite(uv).all() and bent.max() <= STRAIGHT_SHARE * camera.width_px:
             return CORNERS, uv[:8]
-    return SEGMENTS, box_lines(camera, corners_cam)
+    return SEGMENTS, geometry.box_lines(camera, corners_cam)
 
 
-def corners_in_view(view: View, box_px: Array, center_m: Array, size_m: Array, yaw_rad: float) -> Array:
+def corners_in_view(
+    view: View, box_px: geometry.Array, center_m: geometry.Array, size_m: geometry.Array, yaw_rad: float
+) -> geometry.Array:
     """Return the corners (8, 3), m, cam frame, of a box that is shown as `box_px` (4,), when the line of its middle is taken."""
     if view.cam_T_map_at is None:
-        cam_T_map = inverse(view.map_T_cam)
+        cam_T_map = geometry.inverse(view.map_T_cam)
     else:
-        cam_T_map = view.cam_T_map_at(line_time_s(view.camera, box_px.reshape(2, 2).mean(axis=0)[None]))[0]
-    return apply(cam_T_map, box_corners(center_m, size_m, yaw_rad)[0])
+        cam_T_map = view.cam_T_map_at(geometry.line_time_s(view.camera, box_px.reshape(2, 2).mean(axis=0)[None]))[0]
+    return geometry.apply(cam_T_map, geometry.box_corners(center_m, size_m, yaw_rad)[0])
 
 
 QUALITY = 72  # of JPEGs, of 100: at the sizes of a page, blocks are hardly seen
@@ -323,7 +312,7 @@ def _entry(
     camera, t_ns = log.cameras[name], log.streams[name].t_ns
     order = sorted(index for index, data in jpeg.items() if data)
     map_T_cam, known = log.map_T_sensor(name, t_ns[order])
-    reach = fold_radius(camera)
+    reach = geometry.fold_radius(camera)
     return {
         "name": name,
         "size_px": [camera.width_px, camera.height_px],
@@ -332,8 +321,10 @@ def _entry(
         "model": camera.distortion_model,
         "distortion": list(map(float, camera.distortion)),
         "reach": reach if np.isfinite(reach) else 1e6,
-        "cam_T_map": [np.round(inverse(m)[:3].ravel(), 7).tolist() if k else None for m, k in zip(map_T_cam, known)],
-        "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / NS_PER_S, 4) for i in order],
+        "cam_T_map": [
+            np.round(geometry.inverse(m)[:3].ravel(), 7).tolist() if k else None for m, k in zip(map_T_cam, known)
+        ],
+        "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / geometry.NS_PER_S, 4) for i in order],
         "jpeg": [base64.b64encode(jpeg[i]).decode() for i in order],
         "outlines": [projector.outlines(name, int(t_ns[i])) for i in order],
     }
@@ -370,9 +361,9 @@ class PointsAbove:
 
     t_ns: int
     origin: tuple[int, int]  # (2,) tuple of, m map position that the points are relative to
-    xy_m: Array  # (N, 2) relative to `origin`
-    height_m: Array  # (N,) above the ground
-    intensity: Array  # (N,) NaN where it is not known
+    xy_m: geometry.Array  # (N, 2) relative to `origin`
+    height_m: geometry.Array  # (N,) above the ground
+    intensity: geometry.Array  # (N,) NaN where it is not known
 
 
 def point_document(
@@ -410,7 +401,7 @@ def point_document(
     while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
         moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
     return {
-        "t_s": [round((points.t_ns - scenario.t0_ns) / NS_PER_S, 4) for points, _ in moments],
+        "t_s": [round((points.t_ns - scenario.t0_ns) / geometry.NS_PER_S, 4) for points, _ in moments],
         "origin_m": [list(points.origin) for points, _ in moments], "points": [text for _, text in moments],
         "unit_m": UNIT_M, "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M], "intensity": bright > 0, "cell_m": detail.size,
         "rate_hz": detail.rate_hz, "bytes": total,
@@ -450,8 +441,8 @@ class _Sweeps:
         xyz, intensity = [], []
         for name, middle_ns in self._middle_ns.items():
             stamps = self._log.streams[name].t_ns + middle_ns
-            near = index if name == main else int(nearest_index(stamps, t_ns)[0])
-            if abs(int(stamps[near]) - t_ns) > MAX_APART_S * NS_PER_S:
+            near = index if name == main else int(geometry.nearest_index(stamps, t_ns)[0])
+            if abs(int(stamps[near]) - t_ns) > MAX_APART_S * geometry.NS_PER_S:
                 continue
             sweep = self._reader.get(name, near)
             mapped = None if sweep is None else sweep_to_map(self._log, name, sweep, compensate=True)
@@ -464,7 +455,7 @@ class _Sweeps:
             intensity.append(none if sweep.intensity is None else np.asarray(sweep.intensity, dtype=np.float64))
         return self._from_above(t_ns, np.concatenate(xyz), np.concatenate(intensity))
 
-    def _from_above(self, t_ns: int, xyz: Array, intensity: Array) -> PointsAbove:
+    def _from_above(self, t_ns: int, xyz: geometry.Array, intensity: geometry.Array) -> PointsAbove:
         """Keep what is near and neither under the ground nor high above it."""
         middle, ground_z = cloud_origin(self._log, t_ns)
         origin = np.rint(middle[:2])

@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import MissingExtra, ScenarioError
+from log2sim.evaluation.bench import settings
 from log2sim.evaluation.bench.runs import STAGE as ENDS_STAGE
 from log2sim.evaluation.bench.runs import (
     BenchContext,
@@ -32,17 +33,6 @@ from log2sim.evaluation.bench.runs import (
     whole_points,
 )
 from log2sim.evaluation.bench.scores import EVERYTHING, ScoreScope
-from log2sim.evaluation.bench.settings import (
-    COVERAGE,
-    Point,
-    Recommendation,
-    default_settings,
-    error_interval,
-    front_mask,
-    make_grid,
-    recommend,
-    short,
-)
 from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.evaluation.road import cell
 from log2sim.files.documents import check
@@ -79,9 +69,9 @@ class Panel:
     error: str
     label: str
     unit: str
-    points: tuple[Point, ...]
+    points: tuple[settings.Point, ...]
     on_front: tuple[bool, ...]  # which points are Pareto-optimal
-    recommendation: Recommendation
+    recommendation: settings.Recommendation
 
 
 # Key, description and unit of a stage's error with truth, and without.
@@ -110,13 +100,13 @@ ERRORS = {
 }
 
 
-def make_panels(context: BenchContext, report: Progress, default: Sequence[Point] = ()) -> list[Panel]:
+def make_panels(context: BenchContext, report: Progress, default: Sequence[settings.Point] = ()) -> list[Panel]:
     """Run all settings and make one panel for each stage and one for whole runs, with those of the default beside them."""
     runs, observations = run_all(context, report)
     homographies = homography_points(context, observations, report)
     whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
 
-    def own(stage: str) -> list[Point]:
+    def own(stage: str) -> list[settings.Point]:
         return [_point(context, stage, r) for r in runs if r is runs[0] or r.setting.stage == stage]
 
     points = {
@@ -127,15 +117,17 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[Point
     return [_panel(stage, found, whole_ms, known) for stage, found in points.items() if found]
 
 
-def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) -> Panel:
+def _panel(stage: str, points: Sequence[settings.Point], whole_ms: float, known: bool) -> Panel:
     error, label, unit = ERRORS[stage][0 if known else 1]
-    recommendation = recommend(points, unit, whole_ms)
+    recommendation = settings.recommend(points, unit, whole_ms)
     if not known and stage != "homography":
-        recommendation = Recommendation(None, recommendation.present, WITHOUT_TRUTH)
-    return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_mask(points)), recommendation)
+        recommendation = settings.Recommendation(None, recommendation.present, WITHOUT_TRUTH)
+    return Panel(
+        stage, error, label, unit, tuple(points), tuple(bool(f) for f in settings.front_mask(points)), recommendation
+    )
 
 
-def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
+def _point(context: BenchContext, stage: str, run: BenchRun) -> settings.Point:
     """Make the point of a run in a stage; the present run belongs to every stage."""
     name = run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
     ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
@@ -143,7 +135,7 @@ def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
     return score.point(name, run.setting.present, ms, ERRORS[stage][context.truth is None][0])
 
 
-def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
+def _add_placed_shares(whole: Sequence[settings.Point], homographies: Sequence[settings.Point]) -> list[settings.Point]:
     """Add to whole runs the share of the obstacles that their homographies place."""
     if not homographies:
         return list(whole)
@@ -152,7 +144,7 @@ def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) ->
     return [replace(p, figures={**p.figures, "placed_share": shares.get(p.setting, present)}) for p in whole]
 
 
-def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> Point:
+def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> settings.Point:
     """Make the point of a run; where it is `compared` with the others, that of the present settings is marked."""
     present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
     name = present if run.setting.present else run.setting.key
@@ -232,9 +224,9 @@ def bench(
     config = config or Config()
     ends = ends_settings(log, config)
     if log.cameras:
-        grid = make_grid(log, config, detectors)
+        grid = settings.make_grid(log, config, detectors)
         context = make_context(log, grid, truth, report, scope)
-        default = default_settings(log, config)
+        default = settings.default_settings(log, config)
         panels = make_panels(context, report, whole_points(log, default, truth, scope, report))
         detector = grid.present.config.detect.name
         notes = [
@@ -267,7 +259,7 @@ CANDIDATES = np.array([
 ])  # fmt: skip
 
 
-def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
+def place_point_labels(ax: Axes, points: Sequence[settings.Point], xy: Array, line: Array) -> None:
     """Label points (K, 2) with their settings, clear of each other and of a line with corners `line` (n, 2)."""
     pt, to_data = float(ax.figure.dpi) / 72, ax.transData.inverted()
     at, corners = ax.transData.transform(xy) / pt, ax.transData.transform(line) / pt
@@ -284,7 +276,7 @@ def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array
         name = points[k].setting if name in ("", "on", "off") or stage == "smooth" else name
         if not points[k].covers_as_many_as(present):
             key, share = min(points[k].coverage.items(), key=lambda item: item[1])
-            name = f"{name} ({share:.0%} {COVERAGE[key]})"
+            name = f"{name} ({share:.0%} {settings.COVERAGE[key]})"
         name = printable_label(name, 42)
         size = np.array([len(name) * LETTER_PT, LINE_PT])
         middle = at[k] + np.column_stack([CANDIDATES[:, 0] + CANDIDATES[:, 1] * size[0] / 2, CANDIDATES[:, 2]])
@@ -377,7 +369,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     x = np.array([p.ms_per_tick for p in points])
     y = np.array([p.error for p in points], dtype=np.float64)
     present = next((p for p in points if p.present), None)
-    spread = None if present is None else error_interval(present.by_object)
+    spread = None if present is None else settings.error_interval(present.by_object)
     if present is not None and spread is not None:
         ax.vlines(present.ms_per_tick, *spread, color=CROWD_COLOR, lw=1.0, alpha=0.6, zorder=1.8)
     _limits(ax, x, np.append(y, spread or ()))
@@ -494,8 +486,8 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
     }
 
 
-def _interval(point: Point) -> list[float] | None:
-    found = error_interval(point.by_object) if point.error is not None else None
+def _interval(point: settings.Point) -> list[float] | None:
+    found = settings.error_interval(point.by_object) if point.error is not None else None
     return None if found is None else [round(value, 6) for value in found]
 
 
@@ -520,9 +512,9 @@ def _rows(panel: Panel) -> list[str]:
         [
             f"  {'*' if p.present else ' '}{'+' if on_front else ' '}",
             p.setting,
-            short(p.ms_per_tick),
-            short(p.error),
-            "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
+            settings.short(p.ms_per_tick),
+            settings.short(p.error),
+            "-" if (interval := _interval(p)) is None else " - ".join(map(settings.short, interval)),
             *(cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)
