@@ -39,24 +39,20 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
         *(("doubtful", line) for line in doubt_lines(scenario, result.findings, verbose=verbose) or ["none"]),
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
-        *(("used", line) for line in (stage_lines(scenario) if verbose else ())),
     ]
+    if verbose:
+        stages = [f"{'with' if s['kept'] else 'no'} {s['stage']}: {s['reason']}" for s in scenario.stages]
+        rows += [("used", line) for line in stages]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
     table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
-    made = ", ".join([f"made in {speed}", *known_ticks(result.report)])
+    known = (result.report["detection_cache"] or {"found": 0})["found"]
+    made = f"made in {speed}" + (f", {opt.counted(known, 'tick')} known from earlier runs" if known else "")
     # Never broken into lines: it is there to be copied.
     return [
         f"{out}: {ids} over {scenario.duration_s:.1f} s, {made}",
         *table,
         f"  {'next':<{len('doubtful')}}  {next_line}",
     ]
-
-
-def known_ticks(report: dict[str, Any]) -> list[str]:
-    """Say how many ticks were not looked at, since an earlier run had done it."""
-    cache = report["detection_cache"]
-    found = 0 if cache is None else cache["found"]
-    return [f"{opt.counted(found, 'tick')} known from earlier runs"] if found else []
 
 
 def described(scenario: Scenario) -> list[str]:
@@ -98,18 +94,6 @@ def missing_lines(scenario: Scenario) -> list[str]:
     features = scenario.map_features
     notes = () if features is None else features.notes
     return [*(f"{', '.join(stages)}: {reason}" for reason, stages in left_out.items()), *notes]
-
-
-def stage_lines(scenario: Scenario) -> list[str]:
-    """Say of every stage whether it was run, and why."""
-    return [f"{'with' if stage['kept'] else 'no'} {stage['stage']}: {stage['reason']}" for stage in scenario.stages]
-
-
-def view_command(log: Path, sequence: str | None, out: Path) -> str:
-    """Return the command that shows the scenario with the pictures and the ground of its log."""
-    chosen = [] if sequence is None else ["--sequence", sequence]
-    page = str(out.with_suffix(".html"))
-    return shlex.join(["log2sim", "view", str(out), "--log", str(log), *chosen, "-o", page])
 
 
 def pose_reasons(poses: dict[str, Any]) -> list[str]:
@@ -252,7 +236,11 @@ def reconstruct(
     opt.say_all("poses", pose_reasons(result.report["poses"]), quiet=quiet)
     opt.say_all("note", findings, quiet=quiet)
     opt.report_written(report, topdown, quiet=quiet)
-    for line in summarize_run(result, view_command(log, sequence, out), out, verbose=verbose):
+    # The next command shows the scenario with the pictures and the ground of its log.
+    sequences = [] if sequence is None else ["--sequence", sequence]
+    page = str(out.with_suffix(".html"))
+    view = shlex.join(["log2sim", "view", str(out), "--log", str(log), *sequences, "-o", page])
+    for line in summarize_run(result, view, out, verbose=verbose):
         opt.say(line, quiet=quiet)
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from log2sim.scenarios.failure import Outcome
 
 
-def run_test(
+def test_(
     policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy for the ego, as replay --ego takes it.")],
     path: opt.ScenarioFolder,
     condition: opt.Condition,
