@@ -13,18 +13,11 @@ if TYPE_CHECKING:
 
 def cache(
     clear: Annotated[bool, opt.option("Remove all that is kept.", None, "--clear")] = False,
-    max_mb: Annotated[
-        int | None,
-        opt.option(
-            "Size of the cache from now on, for all runs; what was not used for longest is dropped. At first 2048.",
-            "MB",
-            default="as it is",
-            min=0,
-            max=2**30,
-        ),
-    ] = None,
+    max_mb: Annotated[int | None, opt.option(
+        "Size of the cache from now on, for all runs; what was not used for longest is dropped. At first 2048.", "MB",
+        default="as it is", min=0, max=2**30)] = None,
     as_json: opt.AsJson = False,
-) -> None:
+) -> None:  # fmt: skip
     """Show what is kept of earlier runs, so that nothing is detected and measured twice; limit it or remove it.
 
     The environment variable LOG2SIM_CACHE moves the folder.

@@ -128,18 +128,15 @@ def inspect(
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     as_json: opt.AsJson = False,
-    overlay: Annotated[
-        Path | None,
-        opt.option("Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png"),
-    ] = None,
-    at: Annotated[
-        float | None, opt.option("Time to draw, in s after the first tick.", "S", default="in the middle")
-    ] = None,
+    overlay: Annotated[Path | None, opt.option(
+        "Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png")] = None,
+    at: Annotated[float | None, opt.option(
+        "Time to draw, in s after the first tick.", "S", default="in the middle")] = None,
     cameras: opt.Cameras = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Describe the content of a log, or of a scenario.json, or draw one tick of a log.
 
     Examples

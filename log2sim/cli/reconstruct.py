@@ -107,75 +107,43 @@ def reconstruct(
     out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
-    detector: Annotated[
-        str | None,
-        opt.option(
-            "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
-            "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
-            "NAME|MODEL.onnx|labels|lidar:NAME",
-            completes=opt.complete_detectors,
-            default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow",
-        ),
-    ] = None,
+    detector: Annotated[str | None, opt.option(
+        "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
+        "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
+        "NAME|MODEL.onnx|labels|lidar:NAME", completes=opt.complete_detectors,
+        default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow")] = None,
     cameras: opt.Cameras = None,
     start: opt.Start = None,
     stop: opt.Stop = None,
     poses: opt.Poses = None,
-    static_for_all: Annotated[
-        bool | None,
-        opt.option(
-            "Static agents exist all the time unless the log shows their place free, or only while observed.",
-            None,
-            "--static-for-all/--as-observed",
-            default="--static-for-all",
-        ),
-    ] = None,
-    fix_time: Annotated[
-        bool, opt.option("Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")
-    ] = False,
-    fix_calibration: Annotated[
-        bool, opt.option("Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")
-    ] = False,
-    ends: Annotated[
-        str | None,
-        opt.choose(
-            "--ends",
-            "both|vehicle|road",
-            "Use only the sensors on the vehicle, or only those at the road.",
-            default="both",
-        ),
-    ] = None,
-    fusion: Annotated[
-        str | None,
-        opt.choose(
-            "--fusion",
-            "points|boxes|tracks",
-            "What of the vehicle's and the road's LiDARs is joined.",
-            default="see log2sim config",
-        ),
-    ] = None,
-    corrections: Annotated[
-        Path | None, opt.option("Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")
-    ] = None,
+    static_for_all: Annotated[bool | None, opt.option(
+        "Static agents exist all the time unless the log shows their place free, or only while observed.", None,
+        "--static-for-all/--as-observed", default="--static-for-all")] = None,
+    fix_time: Annotated[bool, opt.option(
+        "Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")] = False,
+    fix_calibration: Annotated[bool, opt.option(
+        "Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")] = False,
+    ends: Annotated[str | None, opt.choose(
+        "--ends", "both|vehicle|road", "Use only the sensors on the vehicle, or only those at the road.",
+        default="both")] = None,
+    fusion: Annotated[str | None, opt.choose(
+        "--fusion", "points|boxes|tracks", "What of the vehicle's and the road's LiDARs is joined.",
+        default="see log2sim config")] = None,
+    corrections: Annotated[Path | None, opt.option(
+        "Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")] = None,
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     seed: Annotated[int | None, opt.option("Seed of all random numbers.", "N", default="0")] = None,
     report: Annotated[Path | None, opt.option("Report file to write.", "FILE.json")] = None,
     topdown: Annotated[Path | None, opt.option("Bird's-eye image of all cameras to write.", "FILE.png")] = None,
-    jobs: Annotated[
-        int | None,
-        opt.option(
-            "Processes that share the work; the result is the same for any number.",
-            "N",
-            min=1,
-            default="the usable cores",
-        ),
-    ] = None,
+    jobs: Annotated[int | None, opt.option(
+        "Processes that share the work; the result is the same for any number.", "N", min=1,
+        default="the usable cores")] = None,
     no_cache: opt.NoCache = False,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Reconstruct the scenario of a log.
 
     Examples

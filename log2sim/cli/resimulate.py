@@ -12,23 +12,18 @@ def resimulate(
     scenario: opt.ScenarioPath,
     log: Annotated[Path, opt.option("Log that the scenario was reconstructed from.", "LOG")],
     out: Annotated[Path, opt.write_to("DIR", "Log folder to write.")],
-    replay: Annotated[
-        Path | None,
-        opt.option("What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE"),
-    ] = None,
-    sensors: Annotated[
-        str | None, opt.option("LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")
-    ] = None,
+    replay: Annotated[Path | None, opt.option(
+        "What happens now: a replay or an edit of the scenario. [default: the scenario]", "FILE")] = None,
+    sensors: Annotated[str | None, opt.option(
+        "LiDARs and cameras that are simulated.", "A,B", default="all LiDARs")] = None,
     cameras: Annotated[bool, opt.option("All cameras, too.", None, "--cameras")] = False,
     sequence: Annotated[str | None, opt.option("Sequence of a log with several.", "NAME")] = None,
-    film: Annotated[
-        Path | None,
-        opt.option("Film of a LiDAR, and a camera where they are simulated: recorded, simulated, now.", "FILE.webm"),
-    ] = None,
+    film: Annotated[Path | None, opt.option(
+        "Film of a LiDAR, and a camera where they are simulated: recorded, simulated, now.", "FILE.webm")] = None,
     seed: Annotated[int, opt.option("Seed of noise and lost returns.", min=0)] = 0,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Write what the LiDARs and cameras of a log would have recorded from where the ego drives now, among its agents.
 
     Examples

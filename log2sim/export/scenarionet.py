@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import GROUP_OF, VERSION, Agent, MapFeatures, MapLane, Marking, Scenario
+from log2sim.datatypes import GROUP_OF, VERSION, Agent, MapFeatures, MapLane, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export.exporters import Options, SampledMotion, file_name, near_origin, sample_steps, step_times
 from log2sim.export.roads.opendrive import lanes, signal_lanes
@@ -34,8 +34,11 @@ def map_features(scenario: Scenario, origin_m: Array) -> dict[str, Any]:
     found = {lane.id: _lane(lane, origin_m) for lane in lanes(scenario)}
     features = scenario.map_features or MapFeatures()
     for marking in features.markings:
-        entry = _marking(marking, origin_m)
-        found |= {} if entry is None else {marking.id: entry}
+        points = marking.points_m - origin_m
+        if marking.kind == "crosswalk":
+            found[marking.id] = {"type": "CROSSWALK", "polygon": points}
+        elif marking.is_lane_line:
+            found[marking.id] = {"type": LINE_TYPE[marking.kind, marking.color or "white"], "polyline": points}
     for border in features.borders:
         found[border.id] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": border.points_m - origin_m, "kind": border.kind}
     return found
@@ -52,15 +55,6 @@ def _lane(lane: MapLane, origin_m: Array) -> dict[str, Any]:
         "exit_lanes": list(lane.successors), **{key: [] if name is None else [name] for key, name in beside.items()},
         "inferred_from": lane.inferred_from, "confidence": lane.confidence, "junction": lane.junction,
     }  # fmt: skip
-
-
-def _marking(marking: Marking, origin_m: Array) -> dict[str, Any] | None:
-    points = marking.points_m - origin_m
-    if marking.kind == "crosswalk":
-        return {"type": "CROSSWALK", "polygon": points}
-    if marking.is_lane_line:
-        return {"type": LINE_TYPE[marking.kind, marking.color or "white"], "polyline": points}
-    return None
 
 
 # States of traffic lights, as Waymo names them.
@@ -134,11 +128,15 @@ def scenario_description(scenario: Scenario) -> Value:
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = map_features(scenario, origin)
     lights = dynamic_map_states(scenario, t_s, origin)
+    objects = {k: _object_summary(k, track) for k, track in tracks.items()}
     metadata = {
-        **_metadata(scenario, t_s), "sdc_id": ego.id, "position_offset_m": origin.tolist(), "left_out": left_out,
-        "object_summary": {k: _object_summary(k, track) for k, track in tracks.items()},
+        "id": scenario.name, "scenario_id": scenario.name, "dataset": DATASET,
+        "history_metadata": dict(scenario.provenance), "metadrive_processed": False, "coordinate": "metadrive",
+        "ts": t_s - t_s[0], "sample_rate": STEP_S, "t0_ns": scenario.t0_ns + round(t_s[0] * NS_PER_S),
+        "timestamps_ns": scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64),
+        "map": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(scenario.map).items()},
+        "sdc_id": ego.id, "position_offset_m": origin.tolist(), "left_out": left_out, "object_summary": objects,
     }  # fmt: skip
-    objects = metadata["object_summary"]
     lines = [feature["polyline" if "polyline" in feature else "polygon"] for feature in features.values()]
     moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
     kinds = [o["type"] for o in objects.values()]
@@ -156,42 +154,22 @@ def scenario_description(scenario: Scenario) -> Value:
     }  # fmt: skip
 
 
-def _metadata(scenario: Scenario, t_s: Array) -> Value:
-    """Describe place, time and origin of a description with steps at times (T,)."""
-    return {
-        "id": scenario.name, "scenario_id": scenario.name, "dataset": DATASET,
-        "history_metadata": dict(scenario.provenance), "metadrive_processed": False, "coordinate": "metadrive",
-        "ts": t_s - t_s[0], "sample_rate": STEP_S, "t0_ns": scenario.t0_ns + round(t_s[0] * NS_PER_S),
-        "timestamps_ns": scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64),
-        "map": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(scenario.map).items()},
-    }  # fmt: skip
-
-
 def _track(agent: Agent, move: SampledMotion, origin: Array) -> Value:
     kind = TYPE_OF_GROUP[GROUP_OF[agent.category]]
     sizes = {key: np.where(move.valid, size, 0.0) for key, size in zip(("length", "width", "height"), agent.size_m)}
+    position = np.where(move.valid[:, None], move.position_m - origin, 0.0)
     return {
         "type": kind,
         "state": {
-            "position": np.where(move.valid[:, None], move.position_m - origin, 0.0),
-            "heading": move.yaw_rad,
-            "velocity": move.velocity_mps,
-            "valid": move.valid,
-            **sizes,
+            "position": position, "heading": move.yaw_rad, "velocity": move.velocity_mps, "valid": move.valid, **sizes,
         },
         "metadata": {
-            "type": kind,
-            "object_id": agent.id,
-            "track_length": len(move.valid),
-            "dataset": DATASET,
-            "category": agent.category,
-            "static": agent.static,
-            "color": dict(agent.color) if agent.color is not None else None,
-            "confidence": agent.confidence,
-            "doubts": [doubt.to_dict() for doubt in agent.doubts],
-            "rear_axle_offset_m": agent.rear_axle_offset_m,
+            "type": kind, "object_id": agent.id, "track_length": len(move.valid), "dataset": DATASET,
+            "category": agent.category, "static": agent.static,
+            "color": dict(agent.color) if agent.color is not None else None, "confidence": agent.confidence,
+            "doubts": [doubt.to_dict() for doubt in agent.doubts], "rear_axle_offset_m": agent.rear_axle_offset_m,
         },
-    }
+    }  # fmt: skip
 
 
 def _object_summary(name: str, track: Value) -> Value:
