@@ -169,14 +169,8 @@ def _calibration(record: viewers.CameraFrame) -> CameraCalibration:
     few = len(camera.distortion) <= PLUMB_BOB
     model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
     coefficients = [*camera.distortion, *[0.0] * count][:count]
+    K, P = camera.K.ravel().tolist(), np.column_stack([camera.K, np.zeros(3)]).ravel().tolist()
     return CameraCalibration(
-        timestamp=_stamp(record.t_ns),
-        frame_id=camera.name,
-        width=camera.width_px,
-        height=camera.height_px,
-        distortion_model=model,
-        D=coefficients,
-        K=camera.K.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.column_stack([camera.K, np.zeros(3)]).ravel().tolist(),
-    )
+        timestamp=_stamp(record.t_ns), frame_id=camera.name, width=camera.width_px, height=camera.height_px,
+        distortion_model=model, D=coefficients, K=K, R=np.eye(3).ravel().tolist(), P=P,
+    )  # fmt: skip

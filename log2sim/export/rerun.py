@@ -83,8 +83,11 @@ def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
     known: set[str] = set()
     for record in viewers.viewer_records(scenario, log) if log is not None else ():
         if isinstance(record, viewers.CameraFrame) and record.camera.name not in known:
-            known.add(record.camera.name)
-            yield _pinhole(record)
+            camera = record.camera
+            known.add(camera.name)
+            size = [[camera.width_px, camera.height_px]]
+            lens = rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size)
+            yield ("cameras", camera.name), None, lens
         yield from _shown(record, origin)
 
 
@@ -123,18 +126,6 @@ def _shown(record: viewers.ViewerRecord, origin: Array) -> Iterator[Part]:
         yield ("lidar", record.lidar), t_ns, points.partition([len(record.points_map)])
     else:
         yield from _picture(record, t_ns, origin)
-
-
-def _pinhole(record: viewers.CameraFrame) -> Part:
-    import rerun
-
-    camera = record.camera
-    size = [[camera.width_px, camera.height_px]]
-    return (
-        ("cameras", camera.name),
-        None,
-        rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size),
-    )
 
 
 def _picture(record: viewers.CameraFrame, t_ns: NDArray[np.int64], origin: Array) -> Iterator[Part]:
