@@ -196,7 +196,7 @@ def _hota(scene: Scene, match: Index, threshold: float) -> tuple[float, float, f
         1 - scene.iou, scene.iou, np.ones(len(scene.iou), dtype=bool),
     )  # fmt: skip
     result = hota(pairs, truth_there, other_there)
-    return (result.hota, result.det_a, result.ass_a) if result else (0.0, 0.0, 0.0)
+    return tuple(result[name] or 0.0 for name in ("hota", "det_a", "ass_a"))
 
 
 def table(scores: Mapping[str, Score]) -> str:
