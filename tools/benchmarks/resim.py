@@ -170,6 +170,7 @@ def around(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tupl
         found = reconstruct(shown, Config(detect="lidar:vehicle")).scenario
         judged = evaluate(found, count_points(now, shown), max_range_m=LIMIT_M)
         figures = {k: float(judged[k]) for k in ("recall", "precision", "position_median_m")}
+        figures["recall where there are points"] = float(judged["coverage"]["hit_recall"])
         changed = [row for row in judged["agents"] if moved(known.get(row["id"]), now[row["id"]])]
         if ticks := sum(r["ticks"] for r in changed):
             figures["recall of changed"] = sum(r["matched"] for r in changed) / ticks

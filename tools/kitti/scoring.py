@@ -256,4 +256,4 @@ def _hota(scene: Scene, match: Index, threshold: float) -> float:
         1 - scene.iou, scene.iou, np.ones(len(scene.iou), dtype=bool),
     )  # fmt: skip
     result = hota(pairs, truth_there, other_there)
-    return result.hota if result else 0.0
+    return float(result["hota"] or 0.0)
