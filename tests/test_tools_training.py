@@ -143,11 +143,11 @@ def test_two_streams_learn_one_pair_are_exported_and_find_its_objects(tmp_path: 
 
     pair = pair_of_a_slope()
     network = two_stream.TwoStream(((8, 1), (16, 1)))
-    batch = two_stream.Batch.of(two_stream.inputs_of(pair))
+    batch = two_stream.batch_of(two_stream.inputs_of(pair))
     losses: list[float] = []
 
     def step(n: Any, rng: np.random.Generator, _: int) -> Any:
-        loss, parts = two_stream.loss_of_anchors(*batch.run(n), batch)
+        loss, parts = two_stream.loss_of_anchors(n, batch)
         losses.append(float(loss.detach()))
         return loss, parts
 
