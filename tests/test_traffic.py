@@ -82,45 +82,6 @@ def test_rays_meet_the_faces_of_a_box_of_any_pose(yaw: float, bearing: float, di
     assert sure.sum() - ambiguous.sum() <= on_box.sum() <= (sure | ambiguous).sum()
 
 
-def test_distances_equal_those_of_the_mesh_caster() -> None:
-    """A parked car as a box: both casters, the same rays, within a centimeter."""
-    from log2sim.synth import raycast
-    from log2sim.synth.actors import MovingScene
-    from log2sim.synth.scene import scene_from_table
-
-    table = {
-        "name": "box", "duration_s": 1.0, "ego": {"waypoints": [[-50, 0, 0.0], [-40, 0, 1.0]], "start_s": 5.0},
-        "building": [{"center": [-38, 3], "size_m": [4, 2, 3], "yaw_deg": 30.0}, {"center": [-44, -9], "size_m": [3, 5, 2.15]}],
-        "lidar": [{"name": "l", "position_m": [0, 0, 2.0], "channels": 41, "elevation_deg": [-30, 10], "azimuth_step_deg": 0.5,
-                   "noise_m": 0.0, "dropout": 0.0, "resolution_m": 0.0, "range_m": 100}],
-    }  # fmt: skip
-    scene = scene_from_table(table)
-    moving = MovingScene.of(scene)
-    stamp = int(raycast.sweep_stamps(scene.lidar[0], scene)[0])
-    mesh = raycast.cast_sweep(scene.lidar[0], moving, stamp, np.random.default_rng(0))
-    solids = [
-        solid([box((-b.size_m[0] / 2, -b.size_m[1] / 2, 0), (b.size_m[0] / 2, b.size_m[1] / 2, b.size_m[2]), Material.WALL)],
-              np.array(b.center) - [-50, 0], np.deg2rad(b.yaw_deg))
-        for b in scene.building
-    ]  # fmt: skip
-    fast = cast_polytopes(FINE, sensor(), solids, FLAT, np.random.default_rng(0), EXACT)
-    walls = mesh.sweep.xyz_m[mesh.hit == raycast.BUILDING]
-    ours = fast.xyz_m[fast.hit >= 0]
-    assert abs(len(walls) - len(ours)) <= 0.01 * len(walls)
-
-    def by_angle(points):
-        points = points - [0, 0, 0] if points is walls else points - [0, 0, 2.0]
-        azimuth = np.floor(2 * np.rad2deg(np.arctan2(points[:, 1], points[:, 0])))
-        elevation = np.round(np.rad2deg(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))))
-        angles = np.column_stack([azimuth, elevation])
-        return {tuple(a): float(np.linalg.norm(p)) for a, p in zip(angles.tolist(), points, strict=True)}
-
-    a, b = by_angle(walls), by_angle(ours)
-    shared = a.keys() & b.keys()
-    assert len(shared) > 0.95 * len(a)
-    assert max(abs(a[k] - b[k]) for k in shared) < 0.01
-
-
 def test_an_object_that_moves_during_the_sweep_is_drawn_out() -> None:
     """A wall that runs across the seam is met half a turn apart in time."""
     wall = solid([box((-0.1, -6, 0), (0.1, 6, 3), Material.WALL)], (-8, 0), 0.0, velocity=(10.0, 0.0))
