@@ -92,20 +92,14 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     if observe:
         truth = replace(truth, provenance={**truth.provenance, "seen_ground": seen_ground(moving, cameras, cast)})
     log = Log(
-        name=scene.name,
-        format="synthetic",
-        cameras=cameras,
-        lidars=lidars,
-        streams=streams,
+        name=scene.name, format="synthetic", cameras=cameras, lidars=lidars, streams=streams,
         ego=None if moving.ego is None else _measured_poses(moving.ego, scene, np.random.default_rng([seed, 1])),
         ego_vehicle=EgoVehicle() if scene.ego is None else EgoVehicle(scene.ego.size_m, scene.ego.rear_axle_offset_m),
-        map=truth.map,
-        labels=labels_3d(scene, frames, moving.actors) if observe else None,
+        map=truth.map, labels=labels_3d(scene, frames, moving.actors) if observe else None,
         image_labels=labels_2d(frames, moving.actors) if observe else {},
-        reference_camera=scene.camera[0].name if scene.camera else None,
-        digest=_digest(scene, seed),
+        reference_camera=scene.camera[0].name if scene.camera else None, digest=_digest(scene, seed),
         notes=(f"synthetic, seed {seed}",),
-    )
+    )  # fmt: skip
     return log, truth
 
 
