@@ -26,12 +26,7 @@ from log2sim.evaluation.bench.scores import (
     split_holdout,
     true_positions,
 )
-from log2sim.evaluation.bench.settings import (
-    Point,
-    make_grid,
-    pareto_front,
-    recommend,
-)
+from log2sim.evaluation.bench.settings import Point, make_grid, pareto_front, recommend
 from log2sim.files.documents import check
 from log2sim.geometry import Array, apply_homography
 from log2sim.perception.detect.layouts import COCO_80, LAYOUTS, InputSpec
