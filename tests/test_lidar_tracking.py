@@ -150,6 +150,11 @@ def test_a_bus_beside_the_sensor_is_found_by_its_flank_and_one_end(x, azimuth_de
     assert np.hypot(*(match.xy_m - [x, y])) < 0.3
 
 
+def test_a_flank_that_is_longer_than_its_box_by_as_much_as_detectors_err_is_found():
+    match = seen(around([standing(0.0, 3.0, 0, BUS)]), (0.1, 3.1), size=np.array([9.8, *BUS[1:]]))
+    assert np.hypot(*(match.xy_m - [0.0, 3.0])) < 0.3
+
+
 WALL = Solid((0.0, 3.0, 1.5), (80.0, 2.55, 3.0))
 
 

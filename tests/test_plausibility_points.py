@@ -106,6 +106,22 @@ def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
     assert (doubt.kind, doubt.values["through_share"]) == ("empty", pytest.approx(0.9))
 
 
+@pytest.mark.parametrize(
+    ("way_m", "score", "in_sweeps", "confirmed"),
+    [(0.0, 0.8, True, True), (0.0, 0.5, True, False), (1.5, 0.45, True, False), (8.0, 0.45, True, True), (8.0, 0.45, False, False)],
+)  # fmt: skip
+def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(way_m, score, in_sweeps, confirmed):
+    found = rows_at(np.zeros((5, 2)), "pedestrian", score=score, camera="" if in_sweeps else "front")
+    found = replace(found, t_ns=TIMELINE.t_ns, box_yaw_rad=np.full(5, 0.0 if in_sweeps else np.nan))
+    track = Track("pedestrian", np.arange(5), found)
+    person = agent(20.0, category="pedestrian", size=(0.6, 0.6, 1.7), speed=way_m / 4)
+    seen = replace(candidate(person), track=track, geometry=static_geometry(track))
+    recording = Recording(
+        Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
+    )
+    assert gather([seen], recording)["confirmed"] == [confirmed]
+
+
 VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)
 
 

@@ -135,16 +135,17 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_sweep, in_image = np.isfinite(m.box_yaw_rad), m.camera != ""
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
+    way_m = float(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))) if moving else 0.0
     sweep = sweep_log_odds(track) if in_sweep.any() else 0.0
     if group == "vehicle" and in_sweep.any():
         sweep = min(sweep + MATCH_NATS * candidate.followed, MAX_LOG_ODDS)
-    travel = float(np.log1p(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m)) / agent.size_m[0])) if moving else 0.0
+    moved = sweep + float(np.log1p(way_m / DRIFT_M)) if in_sweep.any() else 0.0
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
         "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
         "no_image": float(not in_image.any()),
-        "travel": travel,
+        "travel": float(np.log1p(way_m / agent.size_m[0])),
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         "scatter": np.log1p(_scatter(candidate, timeline)),
@@ -160,7 +161,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         if moving and w.sigma_speed_mps is not None
         else 0.0,
         "moving": float(moving),
-        "confirmed": float(_is_confirmed(candidate, sweep, travel)),
+        "confirmed": float(moved >= MIN_SWEEP_LOG_ODDS or _shown_well(candidate)),
         "two_wheeler": float(group == "two_wheeler"),
         "pedestrian": float(group == "pedestrian"),
     }
@@ -188,15 +189,15 @@ def _odd_size(agent: Agent) -> float:
 
 
 # Confidence by images that suffices. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes
-# and signs look like. Boxes in sweeps suffice where an object is twice as likely as none; what moves on is not what stays.
-MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS = 0.3, 0.6, float(np.log(2.0))
+# and signs look like. Boxes in sweeps suffice where an object is twice as likely as none; what moves on is not what stays, which
+# seems to move by `DRIFT_M` within seconds as poses drift and other sides come into view.
+MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS, DRIFT_M = 0.3, 0.6, float(np.log(2.0)), 2.0
 
 
-def _is_confirmed(candidate: AgentCandidate, sweep: float, travel: float) -> bool:
-    """Return whether the detections of a candidate suffice, given its columns."""
+def _shown_well(candidate: AgentCandidate) -> bool:
+    """Return whether the detections of a candidate in images suffice."""
     ordinary = candidate.geometry.is_likely and GROUP_OF[candidate.agent.category] != "pedestrian"
-    least = MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE
-    return image_confidence(candidate.track) >= least or (sweep > 0 and sweep + travel >= MIN_SWEEP_LOG_ODDS)
+    return image_confidence(candidate.track) >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
 
 
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video

@@ -184,7 +184,7 @@ def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
     box = replace(box, yaw_rad=yaw_rad + turn_rad)
     low, high = extents(local[inside], turn_rad)
-    if np.any(high - low > size[:2] + 0.6):
+    if np.any(high - low > size[:2] + np.maximum(0.6, MAX_SHIFT_SHARE * size[:2])):
         return None
     sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
     real, gap_m, rays = facing_ends(low, high, sensor), np.zeros((2, 2)), None

@@ -8,36 +8,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from log2sim.cli import (
-    batch,
-    bench,
-    cache,
-    config,
-    convert,
-    correct,
-    detect,
-    doctor,
-    edit,
-    evaluate,
-    export,
-    find,
-    help,
-    import_,
-    inspect,
-    map,
-    plot,
-    predict,
-    reconstruct,
-    replay,
-    resimulate,
-    studio,
-    synth,
-    tag,
-    test_,
-    validate,
-    vary,
-    view,
-)
+from log2sim.cli import change, doctor, evaluate, exchange, logs, reconstruct, show, simulate, situations
 from log2sim.cli.options import fail, printable, say
 from log2sim.cli.shared import (
     DEBUG,
@@ -94,14 +65,12 @@ def root(
 
 
 for command in (
-    reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, resimulate.resimulate, correct.correct, tag.tag, find.find, vary.vary, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+    reconstruct.reconstruct, reconstruct.batch, logs.inspect, logs.validate, logs.convert, logs.detect, evaluate.evaluate,
+    evaluate.bench, show.plot, show.view, change.studio, simulate.replay, simulate.predict, change.edit, simulate.resimulate,
+    change.correct, situations.tag, situations.find, situations.vary, exchange.export, exchange.synth, doctor.config, doctor.cache,
+    doctor.doctor, doctor.help, exchange.import_, situations.test_, logs.map,
 ):  # fmt: skip
     add_command(app, command)
-add_command(app, help.help_, "help")
-add_command(app, import_.import_, "import")
-add_command(app, test_.run_test, "test")
-add_command(app, map.map_, "map")
 
 
 def main() -> None:

@@ -1,16 +1,27 @@
-"""Reconstruct the scenario of a log."""
+"""Scenarios of logs: of one, or of all below a folder."""
 
 from __future__ import annotations
 
 import shlex
+import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
 from log2sim.cli import options as opt
+from log2sim.cli.progress import progress
+from log2sim.errors import ConfigError, LogsFailed, MissingExtra
+from log2sim.files.outputs import together
+from log2sim.visualization.progress import OPENING
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from log2sim.batch.folder import Row
     from log2sim.datatypes import Scenario
     from log2sim.datatypes.findings import Finding
     from log2sim.report import Result
@@ -39,24 +50,20 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
         *(("doubtful", line) for line in doubt_lines(scenario, result.findings, verbose=verbose) or ["none"]),
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
-        *(("used", line) for line in (stage_lines(scenario) if verbose else ())),
     ]
+    if verbose:
+        stages = [f"{'with' if s['kept'] else 'no'} {s['stage']}: {s['reason']}" for s in scenario.stages]
+        rows += [("used", line) for line in stages]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
     table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
-    made = ", ".join([f"made in {speed}", *known_ticks(result.report)])
+    known = (result.report["detection_cache"] or {"found": 0})["found"]
+    made = f"made in {speed}" + (f", {opt.counted(known, 'tick')} known from earlier runs" if known else "")
     # Never broken into lines: it is there to be copied.
     return [
         f"{out}: {ids} over {scenario.duration_s:.1f} s, {made}",
         *table,
         f"  {'next':<{len('doubtful')}}  {next_line}",
     ]
-
-
-def known_ticks(report: dict[str, Any]) -> list[str]:
-    """Say how many ticks were not looked at, since an earlier run had done it."""
-    cache = report["detection_cache"]
-    found = 0 if cache is None else cache["found"]
-    return [f"{opt.counted(found, 'tick')} known from earlier runs"] if found else []
 
 
 def described(scenario: Scenario) -> list[str]:
@@ -100,18 +107,6 @@ def missing_lines(scenario: Scenario) -> list[str]:
     return [*(f"{', '.join(stages)}: {reason}" for reason, stages in left_out.items()), *notes]
 
 
-def stage_lines(scenario: Scenario) -> list[str]:
-    """Say of every stage whether it was run, and why."""
-    return [f"{'with' if stage['kept'] else 'no'} {stage['stage']}: {stage['reason']}" for stage in scenario.stages]
-
-
-def view_command(log: Path, sequence: str | None, out: Path) -> str:
-    """Return the command that shows the scenario with the pictures and the ground of its log."""
-    chosen = [] if sequence is None else ["--sequence", sequence]
-    page = str(out.with_suffix(".html"))
-    return shlex.join(["log2sim", "view", str(out), "--log", str(log), *chosen, "-o", page])
-
-
 def pose_reasons(poses: dict[str, Any]) -> list[str]:
     """Say which poses were used and why; nothing of the log's own where no others were asked for."""
     own = poses["source"] == "none" or poses["source"] == poses["requested"] == "given"
@@ -123,75 +118,43 @@ def reconstruct(
     out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
-    detector: Annotated[
-        str | None,
-        opt.option(
-            "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
-            "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
-            "NAME|MODEL.onnx|labels|lidar:NAME",
-            completes=opt.complete_detectors,
-            default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow",
-        ),
-    ] = None,
+    detector: Annotated[str | None, opt.option(
+        "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
+        "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
+        "NAME|MODEL.onnx|labels|lidar:NAME", completes=opt.complete_detectors,
+        default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow")] = None,
     cameras: opt.Cameras = None,
     start: opt.Start = None,
     stop: opt.Stop = None,
     poses: opt.Poses = None,
-    static_for_all: Annotated[
-        bool | None,
-        opt.option(
-            "Static agents exist all the time unless the log shows their place free, or only while observed.",
-            None,
-            "--static-for-all/--as-observed",
-            default="--static-for-all",
-        ),
-    ] = None,
-    fix_time: Annotated[
-        bool, opt.option("Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")
-    ] = False,
-    fix_calibration: Annotated[
-        bool, opt.option("Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")
-    ] = False,
-    ends: Annotated[
-        str | None,
-        opt.choose(
-            "--ends",
-            "both|vehicle|road",
-            "Use only the sensors on the vehicle, or only those at the road.",
-            default="both",
-        ),
-    ] = None,
-    fusion: Annotated[
-        str | None,
-        opt.choose(
-            "--fusion",
-            "points|boxes|tracks",
-            "What of the vehicle's and the road's LiDARs is joined.",
-            default="see log2sim config",
-        ),
-    ] = None,
-    corrections: Annotated[
-        Path | None, opt.option("Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")
-    ] = None,
+    static_for_all: Annotated[bool | None, opt.option(
+        "Static agents exist all the time unless the log shows their place free, or only while observed.", None,
+        "--static-for-all/--as-observed", default="--static-for-all")] = None,
+    fix_time: Annotated[bool, opt.option(
+        "Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")] = False,
+    fix_calibration: Annotated[bool, opt.option(
+        "Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")] = False,
+    ends: Annotated[str | None, opt.choose(
+        "--ends", "both|vehicle|road", "Use only the sensors on the vehicle, or only those at the road.",
+        default="both")] = None,
+    fusion: Annotated[str | None, opt.choose(
+        "--fusion", "points|boxes|tracks", "What of the vehicle's and the road's LiDARs is joined.",
+        default="see log2sim config")] = None,
+    corrections: Annotated[Path | None, opt.option(
+        "Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")] = None,
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     seed: Annotated[int | None, opt.option("Seed of all random numbers.", "N", default="0")] = None,
     report: Annotated[Path | None, opt.option("Report file to write.", "FILE.json")] = None,
     topdown: Annotated[Path | None, opt.option("Bird's-eye image of all cameras to write.", "FILE.png")] = None,
-    jobs: Annotated[
-        int | None,
-        opt.option(
-            "Processes that share the work; the result is the same for any number.",
-            "N",
-            min=1,
-            default="the usable cores",
-        ),
-    ] = None,
+    jobs: Annotated[int | None, opt.option(
+        "Processes that share the work; the result is the same for any number.", "N", min=1,
+        default="the usable cores")] = None,
     no_cache: opt.NoCache = False,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Reconstruct the scenario of a log.
 
     Examples
@@ -200,26 +163,19 @@ def reconstruct(
     log2sim reconstruct drive.mcap -o s.json --poses auto --stop 20
     log2sim reconstruct pandaset/ --sequence 002 --detector lidar:vehicle -o s.json
     """
-    from log2sim.cli.progress import progress
     from log2sim.files.documents import check_targets, write_json
-    from log2sim.files.outputs import together
-    from log2sim.visualization.progress import OPENING
 
     check_targets(out, report, topdown, overwrite=overwrite)
     fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
     changes: dict[str, Any] = {
-        "cameras": None if cameras is None else opt.camera_names(cameras),
-        "start_s": start,
-        "stop_s": stop,
-        "seed": seed,
-        "track": None if static_for_all is None else {"static_for_all": static_for_all},
+        "cameras": None if cameras is None else opt.camera_names(cameras), "start_s": start, "stop_s": stop,
+        "seed": seed, "track": None if static_for_all is None else {"static_for_all": static_for_all},
         "cooperation": {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None},
         "calibration": {name: True for name, chosen in fixes.items() if chosen},
-    }
+    }  # fmt: skip
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
         from log2sim.edit.corrections import correct, load_corrections
-        from log2sim.errors import ConfigError, MissingExtra
         from log2sim.logs.opening import open_log
         from log2sim.perception.detect3d.detectors import describe_weakness
         from log2sim.perception.run_detectors import check_detectors
@@ -255,13 +211,17 @@ def reconstruct(
     opt.say_all("poses", pose_reasons(result.report["poses"]), quiet=quiet)
     opt.say_all("note", findings, quiet=quiet)
     opt.report_written(report, topdown, quiet=quiet)
-    for line in summarize_run(result, view_command(log, sequence, out), out, verbose=verbose):
+    # The next command shows the scenario with the pictures and the ground of its log.
+    sequences = [] if sequence is None else ["--sequence", sequence]
+    page = str(out.with_suffix(".html"))
+    view = shlex.join(["log2sim", "view", str(out), "--log", str(log), *sequences, "-o", page])
+    for line in summarize_run(result, view, out, verbose=verbose):
         opt.say(line, quiet=quiet)
 
 
 def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
-    from log2sim.cli.layers import CELL_M
+    from log2sim.cli.show import CELL_M
     from log2sim.config import MapConfig
     from log2sim.perception.records import RecordSource
     from log2sim.road.builder import map_ground
@@ -271,3 +231,82 @@ def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
     ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), records)
     write_map(ground.around(ground.coverage), path, overwrite=overwrite)
     result.report["unreadable"] = {**records.summary(), **result.report["unreadable"]}
+
+
+MAX_NAMED = 5
+
+
+def batch(
+    root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder with logs of any formats below it.")],
+    out: Annotated[Path, opt.write_to("DIR", "Folder for the results; the same command goes on there.")],
+    jobs: Annotated[int | None, opt.option(
+        "Worker processes on this machine.", "N", min=1, default="one for each core")] = None,
+    scheduler: Annotated[str | None, opt.option(
+        "Use the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
+    format: opt.Format = "auto",
+    detector: Annotated[str | None, opt.option(
+        "Detector, see reconstruct.", "NAME|MODEL.onnx|labels|lidar:NAME")] = None,
+    poses: opt.Poses = None,
+    config: opt.ConfigFile = None,
+    settings: opt.Settings = None,
+    seed: Annotated[int | None, opt.option("Seed of all random numbers.")] = None,
+    replay: Annotated[bool, opt.option(
+        "Replay each scenario, too: replay.json, and its figures in the tables.", None, "--replay")] = False,
+    no_cache: opt.NoCache = False,
+    overwrite: Annotated[bool, opt.option(
+        "Start over: first remove the results that DIR holds.", None, "--overwrite", "-f")] = False,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Reconstruct all logs below a folder, several at once.
+
+    Each log gets a folder in DIR/logs with scenario.json and report.json, with --replay also replay.json, or error.txt where it failed; table.html and
+    table.parquet list them all. A log that fails by something else than its data is run once more at the end. A second call
+    runs what is missing or failed. Exits with 7 when logs failed.
+
+    Examples
+    --------
+    log2sim batch drives/ -o results/
+    log2sim batch drives/ -o results/ --replay
+    log2sim batch drives/ -o results/ --scheduler tcp://10.0.0.5:8786
+    """
+    from log2sim.batch import plan_batch, run_batch
+    from log2sim.batch.run import connect
+
+    opt.require_own_workers(jobs, scheduler)
+    chosen = opt.load_config(config, settings, detector=detector, poses=poses, seed=seed)
+    planned = plan_batch(root, out, chosen, format=format, overwrite=overwrite, cache=not no_cache, replay=replay)
+    found = f"{opt.counted(len(planned.jobs), 'log')} below {root}"
+    opt.say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
+
+    begun = time.perf_counter()
+    with progress(quiet=quiet) as report_progress:
+        rows = run_batch(planned, lambda: connect(jobs, scheduler), progress=partial(report_progress, "logs"))
+    for line in _failure_lines(rows):
+        opt.say(line, quiet=quiet)
+    now = sum(row.is_done and row.name not in planned.done for row in rows)
+    rate = f"; {now / (time.perf_counter() - begun) * 3600:,.0f} logs an hour" if now else ""
+    opt.say(f"{out / 'table.html'}: {_summary(rows)}{rate}", quiet=quiet)
+    failed = sum(not row.is_done for row in rows)
+    if failed:
+        raise LogsFailed(f"{failed} of {opt.counted(len(rows), 'log')} failed; {out / 'table.html'} says why")
+
+
+def _summary(rows: Sequence[Row]) -> str:
+    from log2sim.batch.folder import sum_up
+
+    sums = sum_up(rows)
+    off_m = [row.cross_track_max_m for row in rows if row.cross_track_max_m is not None]
+    collisions = opt.counted(sum(row.new_collisions or 0 for row in rows), "new collision")
+    replayed = f"; replayed at most {max(off_m):.3f} m off the paths, {collisions}" if off_m else ""
+    return (
+        f"{sums['done']:.0f} of {opt.counted(len(rows), 'log')} done, {sums['agents']:.0f} agents ({sums['static']:.0f} static, "
+        f"{sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s{replayed}"
+    )
+
+
+def _failure_lines(rows: Sequence[Row]) -> list[str]:
+    """Say why the first logs failed."""
+    failed = [row for row in rows if not row.is_done]
+    lines = [f"failed: {row.log}: {row.error.splitlines()[0] if row.error else row.error_kind}" for row in failed]
+    more = len(lines) - MAX_NAMED
+    return [*lines[:MAX_NAMED], *([f"and {more} more"] if more > 0 else [])]
