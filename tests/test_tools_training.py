@@ -192,7 +192,7 @@ def test_a_toy_learns_to_find_paint_on_drawn_maps(tmp_path: Path) -> None:
     """Half a minute from nothing: what is called paint on fresh maps is paint three times as often as chance."""
     import train_lanes
 
-    train_lanes.main(["--out", str(tmp_path), "--files", "1", "--maps", "30", "--steps", "350"])
+    train_lanes.main(tmp_path, files=1, maps=30, steps=350)
     drawn = json.loads((tmp_path / "paint.json").read_text())["drawn"]
     report = np.load(tmp_path / "report-1-000.npz")
     kinds = report["kind"][report["kind"] != train_lanes.IGNORED]

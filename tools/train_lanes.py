@@ -1,8 +1,8 @@
 """Train a network that finds paint in maps of the ground on drawn maps: draw, fit, report, in one command that resumes.
 
 pip install 'log2sim[train]'
-python tools/train_lanes.py --out DIR                                # everything: a quarter of an hour of one core
-python tools/train_lanes.py --out DIR --files 1 --steps 200          # a toy
+python tools/train_lanes.py DIR                                # everything: a quarter of an hour of one core
+python tools/train_lanes.py DIR --files 1 --steps 200          # a toy
 
 It writes DIR/paint.onnx and its card DIR/paint.json. log2sim itself finds markings by rules (`log2sim/road/ridges.py`).
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from entry import parser_of
+from entry import run
 from lane_training.maps import CELL_M, KINDS, SIDE, UNKNOWN_DIRECTION, draw_map
 from lidar_training import fitting
 from lidar_training.export import describe, export_checked
@@ -221,27 +221,19 @@ def report(network: nn.Module, path: Path) -> dict[str, object]:
     }  # fmt: skip
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run the steps."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of maps, checkpoint and results")
-    parser.add_argument("--files", type=int, default=FILES, help="how many, of `--maps` maps each")
-    parser.add_argument("--maps", type=int, default=MAPS_PER_FILE)
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args(arguments)
-    out, seed = options.out, options.seed
+def main(out: Path, *, files: int = FILES, maps: int = MAPS_PER_FILE, steps: int = STEPS, seed: int = 1) -> None:
+    """Run the steps in a folder of maps, checkpoint and results, with `files` of `maps` maps each."""
     out.mkdir(parents=True, exist_ok=True)
-    paths = [draw(out, "train", k, options.maps, seed) for k in range(options.files)]
-    test = draw(out, "report", 0, options.maps, seed)
+    paths = [draw(out, "train", k, maps, seed) for k in range(files)]
+    test = draw(out, "report", 0, maps, seed)
     begun = time.process_time()
-    network, path = fit(paths, out, options.steps, seed), out / "paint.onnx"
+    network, path = fit(paths, out, steps, seed), out / "paint.onnx"
     inputs = {"layers": torch.rand((1, LAYERS, 64, 96), generator=torch.Generator().manual_seed(0))}
     axes = {name: {0: "batch", 2: f"{name}_rows", 3: f"{name}_columns"} for name in ("layers", "kinds", "turned")}
     export_checked(network, path, inputs, ("kinds", "turned"), axes, halved=True)
     describe(path, {"version": 1, "kinds": list(KINDS), "cell_m": 2 * CELL_M}, METADATA_KEY)
     card = {
-        "seed": seed, "maps": options.files * options.maps, "steps": options.steps, "batch": BATCH, "rate": RATE,
+        "seed": seed, "maps": files * maps, "steps": steps, "batch": BATCH, "rate": RATE,
         "torch": torch.__version__, "cpu_s": round(time.process_time() - begun), "drawn": report(network, test),
     }  # fmt: skip
     (out / "paint.json").write_text(json.dumps(card, indent=1) + "\n")
@@ -249,4 +241,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)
