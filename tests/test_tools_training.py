@@ -167,9 +167,8 @@ def test_a_toy_learns_to_name_colors(tmp_path: Path, monkeypatch: pytest.MonkeyP
     """Chance names one of ten right."""
     import train_colors
 
-    monkeypatch.setattr("sys.argv", ["train_colors", "--out", str(tmp_path), "--worlds", "300", "--steps", "120"])
     monkeypatch.setattr(train_colors, "TRACKS", 60)
-    train_colors.main()
+    train_colors.main(tmp_path, worlds=300, steps=120)
     card = json.loads((tmp_path / "colors.json").read_text())
     assert card["simulated"]["top1"] > 0.25
     assert (tmp_path / "colors.onnx").stat().st_size < 160_000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import ast
 import importlib
 import sys
@@ -21,8 +20,6 @@ def run(main: Callable[..., Any], doc: str | None, arguments: list[str] | None =
 
     It ends the process, with the number that `main` returns if it does.
     """
-    if next(iter(main.__code__.co_varnames), "") in ("arguments", "argv"):
-        sys.exit(main(arguments))
 
     @wraps(main)
     def command(**values: Any) -> None:
@@ -60,8 +57,3 @@ def commands_in(folder: str) -> dict[str, str]:
         for name, tree in sorted(trees.items())
         if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body)
     }
-
-
-def parser_of(doc: str | None) -> argparse.ArgumentParser:
-    """A parser whose help is the docstring of a module."""
-    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -1,8 +1,8 @@
 """Train the network that names the colors of vehicles on rendered pictures: draw, fit, calibrate, report, in one command that resumes.
 
 pip install 'log2sim[train]'
-python tools/train_colors.py --out DIR                                # everything, with the settings of the shipped weights
-python tools/train_colors.py --out DIR --worlds 2000 --steps 500      # a toy
+python tools/train_colors.py DIR                                # everything, with the settings of the shipped weights
+python tools/train_colors.py DIR --worlds 2000 --steps 500      # a toy
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from color_training.pictures import draw_shape, draw_view, draw_world
-from entry import parser_of
+from entry import run
 from lidar_training import fitting
 from lidar_training.export import describe, export_checked
 from lidar_training.fitting import FitPlan, draw_once
@@ -145,25 +145,18 @@ def share(right: NDArray[np.bool_]) -> float:
     return round(float(right.mean()), 4)
 
 
-def main() -> None:
-    """Run the steps."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of pictures, checkpoint and results")
-    parser.add_argument("--worlds", type=int, default=WORLDS)
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", choices=("draw",), help="with --first: the files from there on alone")
-    parser.add_argument("--first", type=int, default=0)
-    options = parser.parse_args()
-    out, seed = options.out, options.seed
+def main(
+    out: Path, worlds: int = WORLDS, steps: int = STEPS, seed: int = 1, only_draw: bool = False, first: int = 0
+) -> None:
+    """Run the steps in a folder of pictures, checkpoint and results; with `only_draw` those files of pictures alone that begin with the first."""
     out.mkdir(parents=True, exist_ok=True)
-    each = min(PER_FILE, options.worlds)
-    paths = [draw(out, "train", k, each, 1, seed) for k in range(options.first, options.worlds // each)]
-    if options.only:
+    each = min(PER_FILE, worlds)
+    paths = [draw(out, "train", k, each, 1, seed) for k in range(first, worlds // each)]
+    if only_draw:
         return
     tune, test = (draw(out, part, 0, min(TRACKS, each), VIEWS, seed) for part in ("tune", "report"))
     begun = time.process_time()
-    network, path = fit(paths, out, options.steps, seed), out / "colors.onnx"
+    network, path = fit(paths, out, steps, seed), out / "colors.onnx"
     inputs = {"picture": torch.rand((2, 3, SIDE_PX, SIDE_PX), generator=torch.Generator().manual_seed(0))}
     axes = {"picture": {0: "batch"}, "names": {0: "batch"}}
     export_checked(network, path, inputs, ("names",), axes, halved=True)
@@ -172,7 +165,7 @@ def main() -> None:
     info["scale"], info["power"] = calibrate(open_color_network(path), tune)
     describe(path, info, METADATA_KEY)
     card = {
-        "seed": seed, "worlds": options.worlds, "steps": options.steps, "batch": BATCH, "rate": RATE, "torch": torch.__version__,
+        "seed": seed, "worlds": worlds, "steps": steps, "batch": BATCH, "rate": RATE, "torch": torch.__version__,
         "cpu_s": round(time.process_time() - begun), "calibration": info, "simulated": report(open_color_network(path), test),
     }  # fmt: skip
     (out / "colors.json").write_text(json.dumps(card, indent=1) + "\n")
@@ -180,4 +173,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from entry import parser_of
 
 from log2sim.geometry import Camera, apply
 from log2sim.road.lane_picture import PictureMarkings, find_markings_in_picture
@@ -136,10 +135,7 @@ def _row(name: str, score: Score, more: str) -> str:
     return f"{name}: precision {score.precision:.3f}, recall {score.recall:.3f}, F1 {score.f1:.3f}; {more}"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("folder", type=Path)
-    folder = parser.parse_args(arguments).folder
+def main(folder: Path) -> None:
     for name, scores in (
         ("tusimple", score_tusimple(folder / "tusimple")),
         ("openlane", score_openlane(folder / "openlane")),

@@ -1,6 +1,6 @@
 """Lane lines, markings, lanes and colors of vehicles in synthetic scenes, by light, weather and wear.
 
-    python tools/bench.py lanes [--only PATTERN] [--seeds 1 2] [--detector NAME] [--rig cameras|lidar] [--keep DIR] [--json FILE]
+    python tools/bench.py lanes [--only PATTERN] [--seeds 1] [--detector NAME] [--rig cameras|lidar] [--keep DIR]
 
 Each scene is rendered in its conditions, reconstructed and compared with its truth as `log2sim evaluate` does: precision and
 recall of lane lines at 0.3 m within 40 m of the ego's path where a sensor saw the ground, lateral error, kinds, false length,
@@ -10,19 +10,17 @@ light and weather. `--rig` leaves out the other sensors. `--keep` stores rendere
 
 from __future__ import annotations
 
-import argparse
 import fnmatch
-import json
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from entry import parser_of
+from entry import SAMPLES
 
 from benchmarks.table import cell, markdown
 from log2sim import Config, open_log, reconstruct
@@ -32,7 +30,7 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.synth.scene import load_scene
 from log2sim.synth.synthesis import write_synthetic
 
-SAMPLES = Path(__file__).resolve().parents[2] / "samples"
+Rig = Literal["all", "cameras", "lidar"]
 HEADER = [
     "scene", "condition", "precision", "recall", "within 20 m", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
     "crosswalks", "lanes precision", "recall", "center off by", "paths inside",
@@ -107,12 +105,12 @@ def with_rig(log: Log, rig: str) -> Log:
     return replace(log, cameras={}, streams=streams, reference_camera=None, image_labels={})
 
 
-def measure(case: Case, seed: int, options: argparse.Namespace, keep: Path) -> dict[str, Any]:
+def measure(case: Case, seed: int, detector: str, rig: Rig, keep: Path) -> dict[str, Any]:
     """Reconstruct one case and compare it with its truth."""
     folder = log_of(case, seed, keep)
-    detector = "lidar:labels" if options.rig == "lidar" else options.detector
-    result = reconstruct(with_rig(open_log(folder), options.rig), Config.load(detect={"name": detector}))
-    result.scenario.save(folder.with_suffix(f".{options.rig}.json"))
+    detector = "lidar:labels" if rig == "lidar" else detector
+    result = reconstruct(with_rig(open_log(folder), rig), Config.load(detect={"name": detector}))
+    result.scenario.save(folder.with_suffix(f".{rig}.json"))
     figures = evaluate(result.scenario, Scenario.load(folder / "truth.json"))
     keys = ("map_features", "colors", "signals")
     return {
@@ -184,28 +182,18 @@ def color_rows(results: Sequence[dict[str, Any]]) -> list[list[str]]:
     return out
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Print both tables."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--only", default="*", help="pattern of cases, such as 'worn*' or '*_night_*'")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    parser.add_argument("--detector", default="labels")
-    parser.add_argument("--rig", choices=("all", "cameras", "lidar"), default="all")
-    parser.add_argument("--keep", type=Path, help="folder of rendered logs and scenarios")
-    parser.add_argument("--json", type=Path, help="file to write all figures to")
-    options = parser.parse_args(arguments)
-    cases = [case for case in CASES if fnmatch.fnmatch(case.name, options.only)]
+def main(
+    only: str = "*", seeds: list[int] = [1], detector: str = "labels", rig: Rig = "all", keep: Path | None = None
+) -> None:
+    """Print both tables of the cases that a pattern names, such as 'worn*' or '*_night_*'."""
     results = []
     with tempfile.TemporaryDirectory() as temporary:
-        keep = options.keep or Path(temporary)
-        keep.mkdir(parents=True, exist_ok=True)
-        for case in cases:
-            for seed in options.seeds:
+        folder = keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for case in (case for case in CASES if fnmatch.fnmatch(case.name, only)):
+            for seed in seeds:
                 try:
-                    results.append(measure(case, seed, options, keep))
+                    results.append(measure(case, seed, detector, rig, folder))
                 except Log2SimError as error:
                     print(f"{case.name}, seed {seed}: {error}", file=sys.stderr)
-    if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     print(markdown(HEADER, lane_rows(results)) + "\n\n" + markdown(COLORS, color_rows(results)))
-    return 0
