@@ -18,7 +18,6 @@ import carla
 STEERING_CURVE = [(0.0, 1.0), (20.0, 0.9), (60.0, 0.8), (120.0, 0.7)]  # km/h
 ACCEL_MPS2, BRAKE_MPS2, DRAG_1PM, LAG_S = 5.0, 9.0, 0.002, 0.1
 ROAD_Z_M = 0.0
-COLORED = ("vehicle.",)
 
 
 @dataclass

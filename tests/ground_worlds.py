@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.datatypes import Agent, Lidar, Log, Scenario, Stream, Sweep, Waypoints
+from log2sim.datatypes import Agent, Lidar, Log, Scenario, Stream, Sweep
 from log2sim.geometry import Array, Camera, PoseTrack, apply, rotation_from_rpy, transform, undistort
 
 SLOPE = 0.05
@@ -74,14 +74,6 @@ def world_log(world: World = World()) -> Log:
 def empty_scenario(log: Log, *agents: Agent) -> Scenario:
     """The span of the log, with these agents."""
     return Scenario("road", int(log.ego.t_ns[0]) if log.ego else 10**18, DURATION_S, agents)
-
-
-def parked_car(x: float, y: float) -> Agent:
-    """A car that stands."""
-    one = np.ones(1)
-    z = float(height_at(np.array([x, y]))) + 0.75
-    waypoints = Waypoints(0 * one, x * one, y * one, z * one, 0 * one, 0 * one, one > 0, 0.1 * one)
-    return Agent("car", "car", (4.5, 1.8, 1.5), waypoints, static=True)
 
 
 def _pictures(camera: Camera, ego: PoseTrack, gain: float, shift_m: float) -> Callable[[int], np.ndarray]:

@@ -251,9 +251,7 @@ def test_points_are_where_they_are_when_their_line_is_exposed(direction: Literal
     found = points_in_mount(log, camera, 1_000_000_000, points)
     assert found is not None
     uv, _, valid = project_moving(
-        camera,
-        points,
-        lambda s: inverse(ego.at(1_000_000_000 + np.round(s * 1e9).astype(int))[0] @ camera.mount_T_cam),
+        camera, points, lambda s: inverse(ego.at(1_000_000_000 + np.round(s * 1e9).astype(int))[0] @ camera.mount_T_cam)
     )
     assert valid.sum() > 20
     np.testing.assert_allclose(

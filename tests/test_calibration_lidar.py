@@ -126,6 +126,9 @@ def test_late_stamps_are_corrected_with_those_of_the_points(lively: Log) -> None
     sweep, before = log.streams[TOP].read(3), lively.streams[TOP].read(3)
     assert sweep.stamp_ns - before.stamp_ns == shift_ns[3]
     assert (sweep.t_ns - before.t_ns == shift_ns[3]).all()
+    way = np.linalg.norm(np.diff(lively.ego.map_T_ego[:, :3, 3], axis=0), axis=1)
+    fastest = (way / np.diff(lively.ego.t_ns) * NS_PER_S).max()
+    assert fault.values["moved_m"] == pytest.approx(0.1 * fastest, rel=0.15)
 
 
 def test_stamps_at_the_end_of_sweeps_whose_points_have_no_times_are_half_a_turn_late(lively: Log) -> None:

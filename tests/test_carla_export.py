@@ -64,11 +64,11 @@ def test_every_category_has_assets_and_the_nearest_comes_first() -> None:
         for size in ((0.7, 0.7, 1.8), (4.2, 1.8, 1.5), (9.0, 2.6, 3.2)):
             some = replace(left_turn(), category=category, size_m=size)
             assets = nearest_assets(some)
-            distances = [math.dist(a.size_m, size) for a in assets]
+            distances = [math.dist(a["size_m"], size) for a in assets]
             assert distances == sorted(distances)
             assert distances[0] == min(math.dist(s, size) for s in BY_CATEGORY[category].values())
             for a in assets:
-                np.testing.assert_allclose(np.array(a.size_m) - size, a.error_m, atol=6e-4)
+                np.testing.assert_allclose(np.array(a["size_m"]) - size, a["error_m"], atol=6e-4)
 
 
 def test_the_script_runs_without_log2sim_and_without_the_client(scenario: Scenario, tmp_path: Path) -> None:
@@ -261,7 +261,7 @@ def test_settings_are_restored_and_actors_gone_after_ctrl_c(
 def test_a_server_without_the_asset_gets_the_next_one_or_a_clear_error(
     play: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    second = nearest_assets(left_turn())[1].blueprint
+    second = nearest_assets(left_turn())[1]["blueprint"]
     code, _ = play(
         of(left_turn()), prepare=lambda client: setattr(client.world.library, "sizes", {second: SIZES[second]})
     )

@@ -76,10 +76,7 @@ def test_settings_read_like_toml_or_as_text(setting: str, read: object) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        (
-            "track.max_gap=1",
-            r"unknown key 'track\.max_gap'; did you mean 'track\.max_gap_s'\?",
-        ),
+        ("track.max_gap=1", r"unknown key 'track\.max_gap'; did you mean 'track\.max_gap_s'\?"),
         ("trak.max_gap_s=1", r"unknown key 'trak'; did you mean 'track'\?"),
         ("zzz=1", r"unknown key 'zzz'; known: seed, "),
         ("track=1", r"'track' is 1, expected a table with birth_score, "),

@@ -17,7 +17,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 from cooperation_worlds.blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S, draw_blind_area  # noqa: E402
 from cooperation_worlds.curve import draw_range  # noqa: E402
-from cooperation_worlds.hidden_traffic import HiddenTraffic, row, seen  # noqa: E402
+from cooperation_worlds.hidden_traffic import HiddenTraffic, seen, sweeps  # noqa: E402
 from cooperation_worlds.hidden_traffic import _drawn as draw_traffic  # noqa: E402
 from cooperation_worlds.hidden_traffic import figures as traffic_figures  # noqa: E402
 from cooperation_worlds.overlap import draw_overlap  # noqa: E402
@@ -62,10 +62,10 @@ def test_true_boxes_of_random_traffic_score_1_and_those_of_the_vehicle_alone_les
     view = seen(traffic)
     stamps = view.log.streams[VEHICLE_LIDAR].t_ns
     boxes = [true_boxes(traffic, int(stamp) - 30_000_000) for stamp in stamps]
-    everything = row(view, stamps, boxes)
-    hidden = np.concatenate([s["hidden"] for s in everything["vehicle"]])
-    counted = ~np.concatenate([s["ignored"] for s in everything["vehicle"]])
-    figures = traffic_figures({"all": [everything], "nothing": [row(view, stamps, [Boxes3D.empty()] * len(stamps))]})
+    everything = sweeps(view, stamps, boxes)
+    hidden = np.concatenate([s["vehicle"][2] for s in everything])
+    counted = ~np.concatenate([s["vehicle"][1].ignored for s in everything])
+    figures = traffic_figures({"all": everything, "nothing": sweeps(view, stamps, [Boxes3D.empty()] * len(stamps))})
     assert figures["ap"]["vehicle"] == {"all": 1.0, "nothing": 0.0}
     assert (hidden & counted).sum() < counted.sum()
 

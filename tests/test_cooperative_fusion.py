@@ -24,13 +24,7 @@ from log2sim.perception.cooperative import (
     refine_by_views,
     take_off_offset,
 )
-from log2sim.perception.lidar.cloud import (
-    Cloud,
-    CloudSensor,
-    assemble_views,
-    join_parts,
-    obstacles_of,
-)
+from log2sim.perception.lidar.cloud import Cloud, CloudSensor, assemble_views, join_parts, obstacles_of
 from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level

@@ -10,14 +10,7 @@ import pytest
 from log2sim.datatypes import GROUP_OF, Detections
 from log2sim.geometry import box_iou
 from log2sim.perception.detect.layouts import InputSpec, Preprocessing
-from log2sim.perception.detect.onnx_detector import (
-    OVERLAP,
-    Tile,
-    join_riders,
-    merge,
-    plan_tiles,
-    suppress,
-)
+from log2sim.perception.detect.onnx_detector import OVERLAP, Tile, join_riders, merge, plan_tiles, suppress
 
 
 def detections(*rows: tuple[str, float, tuple[float, float, float, float]]) -> Detections:

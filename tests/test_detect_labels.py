@@ -9,9 +9,7 @@ import pytest
 
 from log2sim.datatypes import Detections, Frame, ImageLabels, Labels, Log
 from log2sim.geometry import Camera, transform
-from log2sim.perception.detect.detectors import (
-    create_detector,
-)
+from log2sim.perception.detect.detectors import create_detector
 
 # Looks along map x from the origin, 1000 px focal length.
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -16,9 +16,7 @@ from export_worlds import REAR_M, ROOT, circling, moved, peer, world
 from log2sim import open_log
 from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.export.exporters import Options, export
-from log2sim.export.viewers import (
-    MAX_SWEEP_POINTS,
-)
+from log2sim.export.viewers import MAX_SWEEP_POINTS
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse, points_in_box
 
 SAMPLE = ROOT / "samples" / "crossing"

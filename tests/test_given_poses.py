@@ -251,12 +251,6 @@ def test_a_gap_that_is_too_long_is_told_with_its_start_and_length() -> None:
     assert known.tolist() == [True, False, True]
 
 
-# --- the log
-
-
-# --- the fit
-
-
 # --- what is placed by the poses
 
 

@@ -105,13 +105,7 @@ def test_a_cloud_holds_the_world_wherever_it_lies(far):
 
 def test_sweeps_of_two_lidars_become_one_cloud_on_one_clock():
     a, b = transform(np.eye(3), np.array([0, 0, 2.0])), transform(rotation_from_rpy(0, 0, 1.0), np.array([4.0, 0, 1.0]))
-    log = Log(
-        "log",
-        "test",
-        {},
-        {"a": Lidar("a", "map", a), "b": Lidar("b", "map", b)},
-        {},
-    )
+    log = Log("log", "test", {}, {"a": Lidar("a", "map", a), "b": Lidar("b", "map", b)}, {})
     world = np.random.default_rng(0).uniform([-20, -20, 0], [20, 20, 2], (60, 3))
     later = T0_NS + 30_000_000
     sweeps = {

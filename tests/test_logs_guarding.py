@@ -18,9 +18,7 @@ from log_encoders.world import world_log
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import RecordError
 from log2sim.logs.records import MAX_NPY_HEADER_BYTES, guard_log, list_numbered_files, read_sweep
-from log2sim.logs.stamps import (
-    compute_turn_share,
-)
+from log2sim.logs.stamps import compute_turn_share
 
 RAISED = [
     ValueError("odd"), TypeError("odd"), OverflowError("too large"), KeyError("x"), IndexError(), AttributeError("odd"),

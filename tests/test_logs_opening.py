@@ -14,14 +14,7 @@ from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
-from log2sim.geometry import (
-    NS_PER_S,
-    inverse,
-    quaternion_from_rotation,
-    rotation_from_rpy,
-    transform,
-    wrap_angle,
-)
+from log2sim.geometry import NS_PER_S, inverse, quaternion_from_rotation, rotation_from_rpy, transform, wrap_angle
 from log2sim.logs.opening import open_log
 
 

@@ -18,13 +18,7 @@ from log2sim.errors import RecordError
 from log2sim.geometry import NS_PER_S, apply, inverse, project, rotation_from_rpy, transform
 from log2sim.logs.ros.frames import FrameTree
 from log2sim.logs.ros.messages import LidarTopic, sweep_from_livox
-from log2sim.logs.ros.sensors import (
-    ENCODINGS,
-    camera_from_info,
-    image_from,
-    offsets_ns,
-    sweep_from,
-)
+from log2sim.logs.ros.sensors import ENCODINGS, camera_from_info, image_from, offsets_ns, sweep_from
 
 STAMP_NS, PERIOD_NS = 1_700_000_000_123_456_789, 1e8
 PLAIN = LidarTopic(topic="/points")

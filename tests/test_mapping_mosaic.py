@@ -7,13 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from log2sim.geometry import (
-    Array,
-    Camera,
-    rotation_from_rpy,
-    transform,
-    undistort,
-)
+from log2sim.geometry import Array, Camera, rotation_from_rpy, transform, undistort
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.pictures import ColorRaster, View, warp_onto
 from log2sim.road.surface import Surface

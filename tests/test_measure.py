@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import KDTree
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
-from log2sim.datatypes import Detections
+from log2sim.datatypes import Boxes3D, Detections
 from log2sim.geometry import Camera, apply, inverse, transform
 from log2sim.perception.boxes import rotate
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
@@ -293,3 +293,26 @@ def test_a_flank_goes_on_where_rays_are_far_apart_and_ends_where_none_hits_it():
     kept = continued_sides(near, far, 10.0)
     assert far[kept, 0].max() <= near[:, 0].min() + 10.0 + 1e-9
     assert 0 < len(kept) < len(far)
+
+
+@pytest.mark.parametrize(
+    ("name", "behind", "category", "reaches_m"),
+    [
+        ("nothing behind", None, "bus", 12.0),
+        ("a car a bit more than a gap behind it", standing(20.4, 3.9), "bus", 12.0),
+        ("a car's box ends where a car does", None, "car", 8.4),
+        ("a wall that is longer than vehicles are", standing(29.0, 4.25, 0.0, (24.0, 2.6, 3.0)), "bus", 8.4),
+    ],
+)
+def test_the_points_of_a_long_vehicle_go_on_beyond_a_box_that_is_too_short(name, behind, category, reaches_m):
+    """The bus is 12 m long and begins at 5 m; the box of the detector holds its first 8 m."""
+    bus = standing(11.0, 4.2, 0.0, (12.0, 2.5, 3.0))
+    world, owner = scan([bus, *([] if behind is None else [behind])], azimuth_deg=(0.0, 60.0), steps=(720, 48))
+    box = Boxes3D(
+        np.array([T0_NS]), np.array([[9.0, 4.2, 1.5]]), np.array([[8.0, 2.5, 3.0]]), np.zeros(1), np.full(1, 0.9),
+        np.array([category]), np.full(1, 0.9), np.array([100]),
+    )  # fmt: skip
+    rows = measure([], box, cloud_of(world))
+    found = rows.cluster[0][:, :3]
+    assert (owners(found, world, owner) == 0).all(), name
+    assert found[:, 0].max() - 5.0 == pytest.approx(reaches_m, abs=0.5), name

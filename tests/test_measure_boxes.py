@@ -10,9 +10,7 @@ from worlds import Solid, scan, standing
 
 from log2sim.agents.evidence import image_confidence
 from log2sim.agents.moving import heading_log_odds
-from log2sim.agents.size import (
-    independent,
-)
+from log2sim.agents.size import independent
 from log2sim.datatypes import Boxes3D, Measurements, Track
 from log2sim.geometry import NS_PER_S, rotation_from_rpy, wrap_angle
 from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center

@@ -7,12 +7,7 @@ import pytest
 
 from log2sim.datatypes import Labels, Lidar, Log, Stream, Sweep
 from log2sim.errors import RecordError
-from log2sim.evaluation.metrics.truth import (
-    image_shares,
-    is_static,
-    speed_along,
-    truth_from_log,
-)
+from log2sim.evaluation.metrics.truth import image_shares, is_static, speed_along, truth_from_log
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 
 NS = 1_000_000_000

@@ -17,13 +17,7 @@ from command_line import names, run
 from log2sim.errors import ConfigError
 from log2sim.files import outputs as output_folders
 from log2sim.files.documents import check_targets, replaced, write_json
-from log2sim.files.outputs import (
-    claim,
-    holding_claims,
-    replaced_folder,
-    temporary_beside,
-    together,
-)
+from log2sim.files.outputs import claim, holding_claims, replaced_folder, temporary_beside, together
 
 DIES = """
 import os, sys
@@ -74,12 +68,7 @@ def test_what_a_dead_run_left_is_removed_and_nothing_else(tmp_path: Path) -> Non
     assert died.returncode == 9
     left = names(tmp_path)
     assert len(left) == 2
-    others = [
-        ".a.json",
-        ".a.0123abcd.json",
-        ".a.00000000-1-00000000.json",
-        ".ab.json",
-    ]
+    others = [".a.json", ".a.0123abcd.json", ".a.00000000-1-00000000.json", ".ab.json"]
     living = temporary_beside(tmp_path / "a.json")
     for path in (living, *(tmp_path / name for name in others)):
         path.write_text("x")

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from entry import commands_in
 
 from log2sim.cli import entry
 from log2sim.logs.ros.messages import read_settings
@@ -28,6 +29,15 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "samples/cookbook").glob("*.md"))}
 README = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
 GROUP = typer.main.get_command(entry.app)
+
+
+def test_documents_name_tools_that_exist() -> None:
+    pages = [*ROOT.glob("*.md"), ROOT / "log2sim/README.md", *(ROOT / "samples/cookbook").glob("*.md")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    named = {"bench": set(commands_in("benchmarks")), "fit": set(commands_in("fits"))}
+    found = re.findall(r"\b(bench|fit)\.py (\w+)", text)
+    assert all(name in named[tool] or name == "NAME" for tool, name in found)
+    assert all((ROOT / f"tools/{name}").is_file() for name in re.findall(r"tools/(\w+\.(?:py|sh))", text))
 
 
 def blocks() -> Iterator[str]:

@@ -12,14 +12,7 @@ from worlds import camera_ahead, scan, standing, tiny_log
 
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
 from log2sim.geometry import PoseTrack, transform
-from log2sim.perception.records import (
-    CameraWatch,
-    LidarWatch,
-    RecordWatch,
-    shows_nothing,
-    shrink,
-    sketch_sweep,
-)
+from log2sim.perception.records import CameraWatch, LidarWatch, RecordWatch, shows_nothing, shrink, sketch_sweep
 from log2sim.perception.sync import synchronize
 
 STEP_NS = 100_000_000

@@ -16,13 +16,7 @@ from log2sim.errors import CheckFailed
 from log2sim.geometry import rectangles_overlap, wrap_angle
 from log2sim.simulation import Controls, Observation
 from log2sim.simulation.metrics.all_metrics import require_strict, summarize
-from log2sim.simulation.metrics.collisions import (
-    MAX_STEPS,
-    BoxTracks,
-    RelativeMotion,
-    collisions,
-    first_contact,
-)
+from log2sim.simulation.metrics.collisions import MAX_STEPS, BoxTracks, RelativeMotion, collisions, first_contact
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 

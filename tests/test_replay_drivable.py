@@ -7,16 +7,8 @@ import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
 
 from log2sim.datatypes import Trajectory
-from log2sim.simulation.feasible_trajectory import (
-    FeasibilityLimits,
-    _cost,
-    _LeastSquares,
-    _normal_equations,
-)
-from log2sim.simulation.reference import (
-    feasible_trajectory_of,
-    vehicle_reference,
-)
+from log2sim.simulation.feasible_trajectory import FeasibilityLimits, _cost, _LeastSquares, _normal_equations
+from log2sim.simulation.reference import feasible_trajectory_of, vehicle_reference
 
 LIMITS = FeasibilityLimits(offset_m=1.3, max_curvature_1pm=0.27, max_curvature_rate_1pmps=0.37, max_accel_mps2=10.0)
 

@@ -13,13 +13,7 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 from log2sim.agents.smooth.fixed_interval import smooth_interval
-from log2sim.agents.smooth.motion_model import (
-    MotionModel,
-    broken_limits,
-    course_is_known,
-    yaw_of_motion,
-    yaw_sigma,
-)
+from log2sim.agents.smooth.motion_model import MotionModel, broken_limits, course_is_known, yaw_of_motion, yaw_sigma
 from log2sim.agents.smooth.quadratic import (
     ACCELERATION_PRIOR_MPS2,
     VELOCITY_PRIOR_MPS,

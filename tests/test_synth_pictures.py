@@ -13,12 +13,7 @@ from log2sim.geometry import Camera, apply, inverse, rotation_from_rpy, transfor
 from log2sim.synth.actors import MovingScene
 from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.ground import ASPHALT, GROUND_M_PER_PX, MARKING, MEADOW, TILE_PX, Ground, GroundPlan
-from log2sim.synth.light import (
-    BEAM_HALF_WIDTH,
-    HEADLIGHT_REACH_M,
-    Lamp,
-    lamplight,
-)
+from log2sim.synth.light import BEAM_HALF_WIDTH, HEADLIGHT_REACH_M, Lamp, lamplight
 from log2sim.synth.raycast import AIR, BUILDING, USUAL_REFLECTANCE, cast_sweep
 from log2sim.synth.render import SceneInstant, render
 from log2sim.synth.returns import BACKSCATTER_SHARE, MIN_SIGNAL, REFERENCE_RANGE_M

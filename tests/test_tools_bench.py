@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 from pathlib import Path
 
 import numpy as np
@@ -33,10 +32,10 @@ def test_one_command_lists_the_benchmarks_runs_them_and_refuses_unknown_ones(
 ) -> None:
     assert run_named("benchmarks", []) == 0
     listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
-    assert {"agents", "lanes", "large_vehicles", "homography"} <= {name for name, _ in listed}
+    assert {"lanes", "homography", "kitti"} <= {name for name, _ in listed}
     assert all(len(title) > 10 for _, title in listed)
     assert run_named("benchmarks", ["tracks"]) == 2
-    assert {"kitti", "confidence"} <= set(commands_in("fits"))
+    assert {"outline", "confidence"} <= set(commands_in("fits"))
 
 
 @pytest.mark.parametrize("folder", ["benchmarks", "fits"])
@@ -44,13 +43,13 @@ def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFix
     for name in commands_in(folder):
         with pytest.raises(SystemExit, match="0"):
             run_named(folder, [name, "--help"])
-        assert "usage" in capsys.readouterr().out
+        assert "usage" in capsys.readouterr().out.lower()
 
 
 def test_every_tool_can_be_imported() -> None:
     pytest.importorskip("torch")
     modules = {".".join(path.relative_to(TOOLS).with_suffix("").parts) for path in TOOLS.rglob("*.py")}
-    assert len(modules) > 50
+    assert len(modules) > 40
     for name in modules:
         importlib.import_module(name.removesuffix(".__init__"))
 
@@ -69,12 +68,12 @@ def test_poses_are_compared_by_surfaces_and_parked_vehicles(tmp_path: Path, caps
     sparse = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}
     log, _ = drive(HOUSES, BEND, duration_s=1.5, sigma_m=0.4, angle_deg=0.2, lidars=[sparse], observe=True)
     write_log(log, tmp_path / "log")
-    out = tmp_path / "figures.json"
-    assert poses.main([str(tmp_path / "log"), "--every", "--out", str(out)]) == 0
-    found = json.loads(out.read_text())
-    assert found["surfaces"]["lidar"]["apart_m"] < found["surfaces"]["given"]["apart_m"]
-    assert len(found["parked"]) == 4
-    assert "4 of them were labeled once" in capsys.readouterr().out  # synthetic labels are exact
+    poses.main(tmp_path / "log")
+    rows = [line.split("|")[1:4] for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    found = {name.strip(): (float(given), float(lidar)) for name, given, lidar in rows[2:]}
+    given, lidar = found["surfaces, sweeps 2 s apart, m"]
+    assert lidar < given
+    assert found["4 parked, median scatter, m"][0] == 0.0  # synthetic labels are exact
 
 
 def test_the_equations_of_vehicles_given_to_all_are_the_published_ones() -> None:
@@ -112,7 +111,7 @@ def test_warnings_of_labels_of_kitti_are_counted_a_minute(tmp_path: Path, capsys
     for name, text in files.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "0003.txt").write_text(text)
-    warnings.main([str(tmp_path)])
+    warnings.main([tmp_path])
     assert "3 s driven: 0 warnings, 0.00 a minute" in capsys.readouterr().out
 
 

@@ -90,7 +90,7 @@ def test_the_network_of_cells_and_votes_is_trained_from_shards_and_exported(tmp_
     sample = Sample(xyz, boxes.astype(np.float32), category, np.full(4, 1500))
     (tmp_path / "data").mkdir()
     write_shard(tmp_path / "data" / "roadside-1-0000.npz", [sample, sample])
-    path = zou2021.train([tmp_path / "data"], tmp_path / "out", steps=2, seed=1, start=None, share=0.1)
+    path = zou2021.main([tmp_path / "data"], tmp_path / "out", steps=2, share=0.1)
     info = load_network(path).info
     assert info.card == {"steps": 2, "seed": 1, "share": 0.1, "samples": 2}
     assert info.stride == 1
@@ -154,7 +154,7 @@ def test_two_streams_learn_one_pair_are_exported_and_find_its_objects(tmp_path: 
     fitting.fit(network, step, fitting.FitPlan(70, peak_rate=5e-3))
     assert losses[-1] < 0.1 * losses[0]
     two_stream.export_two_stream(network, tmp_path / "two.onnx")
-    search = two_stream.TwoStreamDetector.open(tmp_path / "two.onnx")
+    search = two_stream.search_by_network(tmp_path / "two.onnx")
     found = search(pair)
     best = found.take(np.argsort(-found.score)[: len(NAMES)])
     assert sorted(best.category.tolist()) == sorted(NAMES)

@@ -24,13 +24,7 @@ from log2sim.synth.polytopes import Material, box, meshes_of
 from log2sim.synth.raster import nearest_of
 from log2sim.synth.raycast import BUILDING, cast_sweep
 from log2sim.synth.render import DEPTH_M, LENS_SPACING_M, WIDTH_M, Body, SceneInstant, samples_of, segment, signals_of
-from log2sim.synth.returns import (
-    LidarModel,
-    ReturnModel,
-    Weather,
-    lidar_model,
-    reflected,
-)
+from log2sim.synth.returns import LidarModel, ReturnModel, Weather, lidar_model, reflected
 from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic import TrafficScene, draw_scene, labeled_cloud, rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, write_traffic

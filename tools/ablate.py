@@ -1,8 +1,7 @@
 """Switch off every rule, option and constant of the method, one at a time, and measure what becomes of the results.
 
-    python tools/ablate.py LOG|SCENE.toml ... --out FILE.jsonl [--stages tracking,agents] [--kinds constants,options,rules]
-                           [--only PATTERN] [--idle] [--detector labels] [--seeds 3] [--stop SECONDS] [--jobs N]
-    python tools/ablate.py --out FILE.jsonl --table           # tables of what was measured so far
+    python tools/ablate.py LOG|SCENE.toml ... --out FILE.jsonl [--stages tracking,agents] [--idle] [--detector labels]
+    python tools/ablate.py --out FILE.jsonl           # tables of what was measured so far
 
 Constants are numbers, or tables of numbers, that modules assign to names in capitals, and numeric settings: each is taken 0.7
 and 1.3 times, and at the value that switches it off (0, infinite for an upper limit). Options are the other choices of settings.
@@ -15,7 +14,6 @@ to the file as they come; what is there already is not measured again.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import dataclasses
 import hashlib
@@ -24,22 +22,21 @@ import inspect
 import json
 import math
 import multiprocessing
-import os
 import pkgutil
 import re
 import signal
 import sys
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
-from entry import parser_of
+import typer
+from entry import run
 
 from log2sim import pipeline
 from log2sim.config import Config, Section
@@ -72,7 +69,7 @@ FIGURES = {
     "nees": (0.1, False), "line_recall": (0.02, True), "line_precision": (0.02, True), "lane_recall": (0.02, True),
     "lane_precision": (0.02, True), "color_right": (0.05, True),
 }  # fmt: skip
-NOISE_SIGMAS = 2.0
+NOISE_SIGMAS, SEEDS = 2.0, 3  # further runs of each log measure its noise
 FAILURE = -100.0
 UNITS = {
     "M": "m", "S": "s", "MPS": "m/s", "MPS2": "m/s2", "MPS3": "m/s3", "PX": "px", "RAD": "rad", "DEG": "deg", "HZ": "Hz",
@@ -120,55 +117,37 @@ class Case:
     called: set[CodeType] = field(default_factory=set)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("logs", nargs="*", help="log folders and scene files")
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines, appended to")
-    parser.add_argument("--stages", default=",".join(STAGES))
-    parser.add_argument("--kinds", default="constants,options,rules")
-    parser.add_argument("--only", default="", help="regular expression of name and change")
-    parser.add_argument("--idle", action="store_true", help="only what changes nothing beyond noise in the file so far")
-    parser.add_argument("--detector", default="labels")
-    parser.add_argument("--seeds", type=int, default=3, help="further runs of each log that measure its noise")
-    parser.add_argument("--stop", type=float, help="seconds of each log that are used")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    parser.add_argument("--table", action="store_true", help="print tables of the file and measure nothing")
-    options = parser.parse_args(arguments)
-    if not options.table:
-        measure(options)
-    print(tables(rows_of(options.out)))
-    return 0
+def main(
+    logs: Annotated[list[str] | None, typer.Argument(metavar="LOG|SCENE.toml")] = None, out: Path = Path("ablation.jsonl"),
+    stages: str = ",".join(STAGES), idle: bool = False, detector: str = "labels",
+) -> None:  # fmt: skip
+    """Measure what is missing in the file, with `idle` only of what changes nothing beyond noise so far, and print its tables."""
+    if logs:
+        measure(logs, out, stages.split(","), Config.load(detect={"name": detector}), idle=idle)
+    print(tables(rows_of(out)))
 
 
-def measure(options: argparse.Namespace) -> None:
-    """Measure what is missing in the file."""
-    config = Config.load(detect={"name": options.detector}, stop_s=options.stop)
-    stages, kinds = options.stages.split(","), options.kinds.split(",")
+def measure(logs: Sequence[str], out: Path, stages: Sequence[str], config: Config, *, idle: bool) -> None:
+    """Append rows to the file."""
     # Lists of the method's modules are complete before anything runs.
-    found = [v for v in variations(config) if v.stage in stages and v.kind in kinds]
-    chosen = [v for v in found if re.search(options.only, f"{v.label} {v.change}")]
-    if options.idle:
-        matter = matters(rows_of(options.out))
-        chosen = [v for v in chosen if v.label not in matter]
-    done = {(r["case"], r["label"], r["change"]) for r in rows_of(options.out)}
-    cases = [recorded(case_of(name, options.detector), config) for name in options.logs]
+    matter = matters(rows_of(out)) if idle else set()
+    chosen = [v for v in variations(config) if v.stage in stages and v.label not in matter]
+    done = {(r["case"], r["label"], r["change"]) for r in rows_of(out)}
+    cases = [recorded(case_of(name, config.detect.name), config) for name in logs]
     called = set().union(*(case.called for case in cases))
     graph = Imports(method_modules())
     for v in chosen:
         if v.module and not graph.is_called(v.module, v.name, called) and ("", v.label, v.change) not in done:
-            append(options.out, v, "", {}, "not called")
+            append(out, v, "", {}, "not called")
             done |= {(case.name, v.label, v.change) for case in cases}
-    seeds = [Variation("options", "localization", "", "seed", str(k), k) for k in range(options.seeds + 1)]
+    seeds = [Variation("options", "localization", "", "seed", str(k), k) for k in range(SEEDS + 1)]
     tasks = [(c, v) for v in (*seeds, *chosen) for c in cases if (c.name, v.label, v.change) not in done]
     print(f"{len(chosen)} variations, {len(cases)} logs, {len(tasks)} runs", file=sys.stderr, flush=True)
     WORK[:] = [config, graph, tasks]
-    begin = time.monotonic()
-    with multiprocessing.get_context("fork").Pool(options.jobs, maxtasksperchild=1) as pool:
-        for k, (index, figures, outcome) in enumerate(pool.imap_unordered(run_one, range(len(tasks)))):
+    with multiprocessing.get_context("fork").Pool(maxtasksperchild=1) as pool:
+        for index, figures, outcome in pool.imap_unordered(run_one, range(len(tasks))):
             case, v = tasks[index]
-            append(options.out, v, case.name, figures, outcome)
-            if k % 100 == 0:
-                print(f"{time.monotonic() - begin:6.0f} s  {k} of {len(tasks)}", file=sys.stderr, flush=True)
+            append(out, v, case.name, figures, outcome)
 
 
 # Tasks hold what cannot be sent to a process; forked ones find them here.
@@ -416,11 +395,7 @@ def rules_in(module: ModuleType, stage: str) -> Iterator[Variation]:
         elif returns.endswith("| None"):
             changes = {"off": lambda *_, **__: None}
         elif annotations and plain_of(annotations[0]) == plain_of(returns) and not PLAIN.match(returns):
-            changes = (
-                {"off": lambda x, *_, **__: x}
-                if not returns.startswith("list")
-                else {"off": lambda x, *_, **__: list(x)}
-            )
+            changes = {"off": (lambda x, *_, **__: list(x)) if returns.startswith("list") else (lambda x, *_, **__: x)}
         elif returns.startswith("list"):
             changes = {"off": lambda *_, **__: []}
         yield from (replace(made, change=change, value=value) for change, value in changes.items())
@@ -619,4 +594,4 @@ def short(value: Any) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main, __doc__)

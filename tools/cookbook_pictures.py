@@ -1,6 +1,6 @@
 """Makes the pictures of the cookbook with log2sim's own commands, from synthetic logs alone.
 
-    python tools/cookbook_pictures.py WORK [--only NAME ...]
+    python tools/cookbook_pictures.py WORK [--only NAME]
 
 WORK is a folder for logs and scenarios; what is there is not made again (all of it takes some ten minutes of two cores). Pictures become JPEGs of at most
 42 kB in samples/pictures/. The pages in a browser need a Chromium with its driver.
@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 import cv2
-from entry import parser_of
+from entry import run
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "samples/pictures"
@@ -135,12 +135,9 @@ def screenshots(work: Path, sample: Path, names: set[str]) -> None:
             photograph(browser, "batch", (work / "batch/table.html").as_uri(), name)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("work", type=Path)
-    parser.add_argument("--only", nargs="*", help="names of pictures")
-    options = parser.parse_args(arguments)
-    work, chosen = options.work.resolve(), set(options.only or (*COMMANDS, "pictures", "corrections", "batch"))
+def main(work: Path, only: list[str] = []) -> None:
+    """Make the pictures of these names, or all."""
+    work, chosen = work.resolve(), set(only or (*COMMANDS, "pictures", "corrections", "batch"))
     work.mkdir(parents=True, exist_ok=True)
     sample = prepare(work)
     for name in chosen & COMMANDS.keys():
@@ -163,8 +160,7 @@ def main(arguments: list[str] | None = None) -> int:
                 break
         (TARGET / f"{name}.jpg").write_bytes(data.tobytes())
         print(f"{name}.jpg: {len(data) / 1000:.0f} kB, quality {quality}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main, __doc__)

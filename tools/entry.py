@@ -1,4 +1,4 @@
-"""What `bench.py`, `fit.py` and others have in common: one command that runs the modules of a folder by name."""
+"""What `bench.py`, `fit.py` and the other tools have in common: a command line that is read off the signature of `main`."""
 
 from __future__ import annotations
 
@@ -6,12 +6,36 @@ import argparse
 import ast
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
+from typing import Any
+
+import typer
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 
 
-def run_named(folder: str, arguments: Sequence[str] | None = None) -> int:
-    """Run `main` of the module of a folder beside this file that the first argument names; without one list them."""
+def run(main: Callable[..., Any], doc: str | None, arguments: list[str] | None = None, name: str = "") -> Any:
+    """Run a `main` with the arguments of the command line: parameters with a default are options, the docstring is the help.
+
+    It ends the process with what `main` returns.
+    """
+    if next(iter(main.__code__.co_varnames), "") in ("arguments", "argv"):
+        sys.exit(main(arguments) or 0)
+
+    @wraps(main)
+    def command(**values: Any) -> None:
+        sys.exit(main(**values) or 0)
+
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    # Paragraphs stay as they are.
+    app.command(help="\b\n" + (doc or "").strip().replace("\n\n", "\n\n\b\n"))(command)
+    app(arguments, prog_name=f"{Path(sys.argv[0]).name} {name}".strip())
+
+
+def run_named(folder: str, arguments: list[str] | None = None) -> int:
+    """Run the module of a folder beside this file that the first argument names; without one list them."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ("",)
     commands = commands_in(folder)
     if name in ("", "-h", "--help"):
@@ -21,8 +45,8 @@ def run_named(folder: str, arguments: Sequence[str] | None = None) -> int:
     if name not in commands:
         print(f"unknown name '{name}'; known: {', '.join(commands)}", file=sys.stderr)
         return 2
-    sys.argv[0] = f"{Path(sys.argv[0]).name} {name}"
-    return importlib.import_module(f"{folder}.{name}").main(rest) or 0
+    module = importlib.import_module(f"{folder}.{name}")
+    return int(run(module.main, module.__doc__, rest, name) or 0)
 
 
 def commands_in(folder: str) -> dict[str, str]:

@@ -7,25 +7,23 @@ Usage: python tools/imports.py [CHECKOUT] [--edges]
 
 from __future__ import annotations
 
-import argparse
 import ast
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Annotated
+
+import typer
+from entry import SAMPLES, run
 
 MAX_PARAMETERS = 5
 Graph = Mapping[str, set[str]]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("checkout", nargs="?", type=Path, default=Path(__file__).resolve().parents[1])
-    parser.add_argument(
-        "--edges", action="store_true", help="print every import between rooms and every long signature"
-    )
-    options = parser.parse_args()
-    modules = module_graph(options.checkout / "log2sim")
+def main(checkout: Annotated[Path, typer.Argument()] = SAMPLES.parent, edges: bool = False) -> None:
+    """Print the figures of a checkout, with `edges` also every import between rooms and every long signature."""
+    modules = module_graph(checkout / "log2sim")
     rooms = room_graph(modules)
-    signatures = sorted(long_signatures(options.checkout / "log2sim"))
+    signatures = sorted(long_signatures(checkout / "log2sim"))
     print(f"rooms                                     {len(rooms)}")
     print(f"imports between rooms (room -> room)      {sum(map(len, rooms.values()))}")
     print(
@@ -35,10 +33,10 @@ def main() -> None:
     print(f"import cycles of rooms                    {len(cycles(rooms))}")
     print(f"functions with more than {MAX_PARAMETERS} parameters     {len(signatures)}")
     for folder in ("log2sim", "tests", "tools"):
-        files = sorted((options.checkout / folder).rglob("*.py"))
+        files = sorted((checkout / folder).rglob("*.py"))
         lines = sum(len(f.read_text(encoding="utf-8").splitlines()) for f in files)
         print(f"{folder:<10}{len(files):>4} modules {lines:>7} lines")
-    if options.edges:
+    if edges:
         for room, targets in rooms.items():
             print(f"{room}: {', '.join(sorted(targets))}")
         for group in (*cycles(modules), *cycles(rooms)):
@@ -122,4 +120,4 @@ def long_signatures(package: Path) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

@@ -4,12 +4,11 @@ Each mutant replaces one expression in a copy of the checkout: a sign, an index,
 stage. A mutant that no test fails on shows behavior that nothing holds.
 
     python tools/mutants.py                      # all, each with the files of tests named beside it: seconds each
-    python tools/mutants.py --only gain,yaw --tests tests      # with the whole default suite
+    python tools/mutants.py --only gain,yaw --tests tests      # words of names, with commas; with the whole default suite
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -17,6 +16,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+from entry import run as run_command
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -83,22 +84,17 @@ def copy_with(mutant: tuple[str, ...], folder: Path) -> Path:
     return checkout
 
 
-def main() -> int:
+def main(only: str = "", tests: list[str] = [], jobs: int = os.cpu_count() or 1) -> int:
     """Print which mutants are caught and by which test; 1 where one is not."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", help="words of names, with commas")
-    parser.add_argument("--tests", nargs="*", help="files or folders of tests instead of those of each mutant")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    options = parser.parse_args()
-    words = [w for w in options.only.split(",") if w]
+    words = [w for w in only.split(",") if w]
     missed = 0
     for mutant in (m for m in MUTANTS if not words or any(w in m[0] for w in words)):
         with tempfile.TemporaryDirectory() as folder:
             checkout, begin = copy_with(mutant, Path(folder)), time.monotonic()
-            tests = options.tests or [f"tests/test_{name}.py" for name in mutant[4].split()]
-            command = [sys.executable, "-m", "pytest", "-x", "--no-header", "-p", "no:cacheprovider", *tests]
-            if options.tests and options.jobs > 1:
-                command += ["--numprocesses", str(options.jobs), "--dist", "loadfile"]
+            files = tests or [f"tests/test_{name}.py" for name in mutant[4].split()]
+            command = [sys.executable, "-m", "pytest", "-x", "--no-header", "-p", "no:cacheprovider", *files]
+            if tests and jobs > 1:
+                command += ["--numprocesses", str(jobs), "--dist", "loadfile"]
             run = subprocess.run(
                 command, cwd=checkout, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
             )
@@ -111,4 +107,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main, __doc__)

@@ -1,6 +1,6 @@
 """Where the time of a run goes, beside the floor: decoding its pictures and reading its clouds once.
 
-    OPENBLAS_NUM_THREADS=1 python tools/profile_ticks.py LOG [LOG ...] [--detector NAME ...] [--ticks N] [--repeats N] [--json]
+    OPENBLAS_NUM_THREADS=1 python tools/profile_ticks.py LOG ... --detector NAME
 
 Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
 with as many as there are cores. Processor time is told apart as seconds of the log (a fixed number of records is looked at: poses, clocks,
@@ -9,8 +9,6 @@ mounts, what is loaded), milliseconds of a tick, and seconds of 100 m of way (ma
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
 import sys
@@ -22,10 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from benchmarks.table import markdown
+from entry import run
 
 from log2sim.config import Config
 from log2sim.datatypes import Log
@@ -92,9 +88,9 @@ def floor_of(log: Log, wanted: Sequence[tuple[str, int]], threads: int) -> Times
     return times_of(read_all)[1]
 
 
-def measure(open_anew: Callable[[], Log], config: Config, jobs: int | None = None) -> tuple[Measured, Schedule]:
+def measure(path: Path, config: Config, jobs: int | None = None) -> tuple[Measured, Schedule]:
     """Run all stages on a log that is opened anew."""
-    log = open_anew()
+    log = open_log(path)
 
     def reconstruct() -> Run:
         run = start(log, config, cache=False, jobs=jobs)
@@ -127,27 +123,28 @@ def config_of(log: Log, detector: str, ticks: int, settings: Sequence[str]) -> C
     return config
 
 
-def profile(open_anew: Callable[[], Log], options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def profile(
+    path: Path, detectors: Sequence[str], ticks: int, repeats: int, jobs: int | None, settings: Sequence[str]
+) -> Iterator[dict[str, Any]]:
     """Figures of a log with each detector."""
-    log, threads = open_anew(), len(os.sched_getaffinity(0))
+    log, threads = open_log(path), sorted({1, len(os.sched_getaffinity(0))})
     configs: dict[str, Config] = {}
-    for detector in options.detector or DETECTORS:
+    for detector in detectors:
         try:
-            measure(open_anew, config_of(log, detector, WARM_UP_TICKS, options.set))
-            configs[detector] = config_of(log, detector, options.ticks, options.set)
+            measure(path, config_of(log, detector, WARM_UP_TICKS, settings))
+            configs[detector] = config_of(log, detector, ticks, settings)
         except Log2SimError as problem:
             print(f"{log.name}, {detector}: left out: {problem}", file=sys.stderr)
     runs: dict[str, list[Measured]] = {name: [] for name in configs}
-    floors: dict[tuple[str, int], list[Times]] = {}
-    for _ in range(options.repeats):
+    floors: dict[str, dict[int, list[Times]]] = {name: {n: [] for n in threads} for name in configs}
+    for _ in range(repeats):
         for name, config in configs.items():
-            measured, schedule = measure(open_anew, config, options.jobs)
+            measured, schedule = measure(path, config, jobs)
             runs[name].append(measured)
-            for count in sorted({1, threads}):
-                floor = floor_of(open_anew(), records_of(schedule), count)
-                floors.setdefault((name, count), []).append(floor)
-    for name, measured in runs.items():
-        yield figures(log, name, measured, {n: floors[name, n] for n in sorted({1, threads})})
+            for count, of in floors[name].items():
+                of.append(floor_of(open_log(path), records_of(schedule), count))
+    for name, of_name in runs.items():
+        yield figures(log, name, of_name, floors[name])
 
 
 def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, list[Times]]) -> dict[str, Any]:
@@ -207,31 +204,14 @@ def show(found: list[dict[str, Any]]) -> str:
     return "\n".join([markdown(head, rates), *rest])
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG")
-    parser.add_argument("--sequence", help="of the log")
-    parser.add_argument("--detector", action="append", metavar="NAME", help=f"repeat it; by default {DETECTORS}")
-    parser.add_argument("--ticks", type=int, default=0, metavar="N", help="the first ones; by default all")
-    parser.add_argument("--repeats", type=int, default=3, metavar="N")
-    parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes that share the work; by default the usable cores"
-    )
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of reconstruct")
-    parser.add_argument("--json", action="store_true", help="all figures as JSON")
-    options = parser.parse_args()
+def main(
+    logs: list[Path], detector: list[str] = list(DETECTORS), ticks: int = 0, repeats: int = 3, jobs: int | None = None, set: list[str] = [],
+) -> None:  # fmt: skip
+    """Print the tables of the first ticks of logs, or of all, by so many processes; `set` SECTION.KEY=VALUE as of reconstruct."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         print("OPENBLAS_NUM_THREADS is not 1: times will swing", file=sys.stderr)
-    found: list[dict[str, Any]] = []
-    for path in options.logs:
-
-        def open_anew(path: Path = path) -> Log:
-            return open_log(path, sequence=options.sequence)
-
-        found += profile(open_anew, options)
-    print(json.dumps(found, indent=1) if options.json else show(found))
-    return 0
+    print(show([found for path in logs for found in profile(path, detector, ticks, repeats, jobs, set)]))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main, __doc__)

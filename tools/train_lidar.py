@@ -1,12 +1,15 @@
 """Train the LiDAR detector on simulated clouds and on labeled logs: generate, fit, export, check, in one command that resumes.
 
-pip install 'log2sim[train]'
-python tools/train_lidar.py vehicle --out DIR             # everything, with the settings of the shipped weights
-python tools/train_lidar.py vehicle --out DIR --scenes 200 --steps 300     # a toy
-python tools/train_lidar.py vehicle --out DIR --scenes 200 --steps 300 --start FILE.onnx   # goes on from a network that is there
-python tools/train_lidar.py vehicle --out DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
-python tools/train_lidar.py vehicle --out DIR --data LOGS --scenes 0 --steps 2000          # from these alone
-python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
+    pip install 'log2sim[train]'
+    python tools/train_lidar.py vehicle DIR             # everything, with the settings of the shipped weights; or roadside
+    python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300                           # a toy
+    python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
+    python tools/train_lidar.py vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
+    python tools/train_lidar.py vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
+    python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
+
+--data, of which every n-th sweep is taken, may be given several times; --only does one of generate, fit and finish; --seed holds with --scenes or
+--steps; --bfloat16 takes a third less time where the processor has it; scores are calibrated and tested with so many --examples.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from subprocess import Popen
 
 import numpy as np
 import torch
-from entry import parser_of
+from entry import run
 from lidar_training import fitting
 from lidar_training.clouds import (
     REPORTED_KINDS,
@@ -49,6 +52,7 @@ from log2sim.config import LidarConfig
 from log2sim.errors import ConfigError, LogError
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.detectors import open_network
+from log2sim.synth.traffic import Mount
 
 PAPERS = ("zou2021", "two_stream")
 PER_SHARD = 100
@@ -245,55 +249,37 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
     print(f"{path.stat().st_size / 1e6:.2f} MB", json.dumps(card), flush=True)
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(
+    mount: Mount, out: Path, data: list[Path] = [], scenes: int | None = None, steps: int | None = None, seed: int = 1, every: int = 1,
+    only: str = "", start: Path | None = None, bfloat16: bool = False, examples: int = 150,
+) -> None:  # fmt: skip
     """Run the steps that are asked for."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] and arguments[0] in PAPERS:
-        importlib.import_module(f"lidar_training.{arguments[0]}").main(arguments[1:])
-        return
-    parser = parser_of(__doc__)
-    parser.add_argument("mount", choices=("vehicle", "roadside"))
-    parser.add_argument("--out", type=Path, required=True, help="folder of shards, checkpoints and results")
-    parser.add_argument("--scenes", type=int, help="a single round with as many scenes; 0 with --data alone")
-    parser.add_argument("--steps", type=int, help="a single round with as many steps")
-    parser.add_argument("--seed", type=int, default=1, help="with --scenes or --steps")
-    parser.add_argument(
-        "--data", type=Path, nargs="+", default=[], help="labeled logs, or folders of them, of any format"
-    )
-    parser.add_argument("--every", type=int, default=1, help="of the sweeps of --data take every n-th")
-    parser.add_argument("--only", choices=("generate", "fit", "finish"))
-    parser.add_argument("--start", type=Path, help="ONNX file of a network of this tool to start from")
-    parser.add_argument("--bfloat16", action="store_true", help="a third less time where the processor has it")
-    parser.add_argument("--examples", type=int, default=150, help="scenes to calibrate with, and as many to test with")
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    rounds = ROUNDS[options.mount]
-    if options.steps or options.scenes is not None:
+    out.mkdir(parents=True, exist_ok=True)
+    rounds: Sequence[Round] = ROUNDS[mount]
+    if steps or scenes is not None:
         first = rounds[0]
-        scenes = first.scenes if options.scenes is None else options.scenes
-        rounds = (Round(options.seed, scenes, options.steps or first.steps),)
-    data = options.out / "data"
-    if options.scenes == 0 and not options.data:
-        parser.error("--scenes 0 needs --data")
-    reads = bool(options.data) and options.only != "generate"
-    own, held_out = read_own(options.data, data, options.every) if reads else ([], [])
-    if options.only == "generate":
+        rounds = (Round(seed, first.scenes if scenes is None else scenes, steps or first.steps),)
+    if scenes == 0 and not data:
+        raise ConfigError("--scenes 0 needs --data")
+    shards = out / "data"
+    own, held_out = read_own(data, shards, every) if data and only != "generate" else ([], [])
+    if only == "generate":
         for this in rounds:
-            generate(options.mount, data, this.scenes, this.seed)
+            generate(mount, shards, this.scenes, this.seed)
     # Drawing scenes takes as long as training on them, so both are done side by side.
-    generator = None if options.only else Popen([sys.executable, __file__, *arguments, "--only", "generate"])
+    generator = None if only else Popen([sys.executable, *sys.argv, "--only", "generate"])
     try:
-        for number in range(1, len(rounds) + 1) if options.only in (None, "fit") else ():
-            fit(
-                options.mount, data, options.out, rounds[:number], own,
-                start=options.start, bfloat16=options.bfloat16, generator=generator,
-            )  # fmt: skip
+        for number in range(1, len(rounds) + 1) if only in ("", "fit") else ():
+            fit(mount, shards, out, rounds[:number], own, start=start, bfloat16=bfloat16, generator=generator)
     finally:
         if generator is not None:
             generator.terminate()
-    if options.only in (None, "finish"):
-        finish(options.mount, options.out, rounds, options.examples, held_out)
+    if only in ("", "finish"):
+        finish(mount, out, rounds, examples, held_out)
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] and sys.argv[1] in PAPERS:
+        module = importlib.import_module(f"lidar_training.{sys.argv[1]}")
+        run(module.main, module.__doc__, sys.argv[2:], sys.argv[1])
+    run(main, __doc__)

@@ -1,6 +1,6 @@
 """Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.
 
-Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --logs 120 --seed 11`: 4501 candidates of 120 simulated logs.
+Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs FOLDER --logs 120 --seed 11`: 4501 candidates of 120 simulated logs.
 `THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right
 where something is; `VARIANCES` weigh the terms of variances.
 """

@@ -12,17 +12,9 @@ from log2sim.batch.discovery import FoundLog, find_logs
 from log2sim.batch.folder import LOGS, SCENARIO_FILE, BatchFolder
 from log2sim.datatypes import Scenario
 from log2sim.errors import Log2SimError, LogError
+from log2sim.evaluation.metrics import table
 from log2sim.evaluation.metrics.comparison import mota
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.evaluation.metrics.table import (
-    MAX_NAMED,
-    columns_text,
-    counted_text,
-    error_text,
-    percent,
-    recall_text,
-    verdict_text,
-)
 from log2sim.files.documents import rounded
 
 Figures = dict[str, Any]
@@ -71,13 +63,10 @@ def evaluate_batch(
             entries.append(entry | {"error": str(error)})
         progress(k + 1, len(known))
     return {
-        "batch_metrics_version": VERSION,
-        "max_range_m": max_range_m,
-        "categories": None if categories is None else sorted(categories),
-        "without_truth": len(rows) - len(known),
-        "total": pool([entry for entry in entries if "error" not in entry]),
-        "logs": entries,
-    }
+        "batch_metrics_version": VERSION, "max_range_m": max_range_m,
+        "categories": None if categories is None else sorted(categories), "without_truth": len(rows) - len(known),
+        "total": pool([entry for entry in entries if "error" not in entry]), "logs": entries,
+    }  # fmt: skip
 
 
 def pool(entries: Sequence[Figures]) -> Figures:
@@ -134,23 +123,25 @@ def format_batch_verdict(document: Figures) -> str:
     total, compared = document["total"], [e for e in document["logs"] if "error" not in e]
     lines = [("logs", f"{total['logs']} compared")] if total["logs"] else []
     if "coverage" in total:
-        lines += [("counted", counted_text(total["coverage"])), ("recall", recall_text(total))]
+        lines += [("counted", table.counted_text(total["coverage"])), ("recall", table.recall_text(total))]
     counts = total["counts"]
     if counts:
         ticks = counts["matched_ticks"] + counts["false_ticks"]
-        lines.append(("precision", f"{percent(total['precision'])} of {ticks} reconstructed agent-ticks"))
+        lines.append(("precision", f"{table.percent(total['precision'])} of {ticks} reconstructed agent-ticks"))
     if total["position_rmse_m"] is not None:
         figures = {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in POOLED_BY_SQUARE}}
-        lines.append(("errors", error_text(figures)))
+        lines.append(("errors", table.error_text(figures)))
     if total["wrong_share"] is not None:
-        lines.append(("wrong", f"{percent(total['wrong_share'])} of the reconstructed agents' ticks"))
+        lines.append(("wrong", f"{table.percent(total['wrong_share'])} of the reconstructed agents' ticks"))
     low = sorted((e["recall"], e["log"]) for e in compared if e["recall"] is not None and e["recall"] < 1)
     if low and len(compared) > 1:
-        lines.append(("lowest", "; ".join(f"{log} recall {percent(recall)}" for recall, log in low[:MAX_NAMED])))
+        lines.append(
+            ("lowest", "; ".join(f"{log} recall {table.percent(recall)}" for recall, log in low[: table.MAX_NAMED]))
+        )
     missing = document["without_truth"]
     notes = [f"{missing} logs are not below the folder with the truth"] if missing else []
     notes += [f"{entry['log']}: {entry['error']}" for entry in document["logs"] if "error" in entry]
-    return verdict_text([*lines, *(("note:", note) for note in notes)])
+    return table.verdict_text([*lines, *(("note:", note) for note in notes)])
 
 
 def format_batch_table(document: Figures, *, max_rows: int) -> str:
@@ -164,7 +155,7 @@ def format_batch_table(document: Figures, *, max_rows: int) -> str:
     lines = [("all", {**whole, "counts": total["counts"]}), *((entry["log"], entry) for entry in rows[:max_rows])]
     cells = [["", "agents", *_TITLES], *(_cells(name, figures) for name, figures in lines)]
     notes = [f"and {len(rows) - max_rows} more logs with higher recall"] if len(rows) > max_rows else []
-    return "\n".join([*columns_text(cells), *notes, "medians and HOTA of all are medians over the logs"])
+    return "\n".join([*table.columns_text(cells), *notes, "medians and HOTA of all are medians over the logs"])
 
 
 _TITLES = ("recall %", "precis. %", "rms m", "med m", "yaw deg", "m/s", "size m", "id sw", "MOTA", "HOTA")

@@ -22,29 +22,24 @@ MAX_NAMED = 5
 def batch(
     root: Annotated[Path, typer.Argument(metavar="ROOT", help="Folder with logs of any formats below it.")],
     out: Annotated[Path, opt.write_to("DIR", "Folder for the results; the same command goes on there.")],
-    jobs: Annotated[
-        int | None, opt.option("Worker processes on this machine.", "N", min=1, default="one for each core")
-    ] = None,
-    scheduler: Annotated[
-        str | None, opt.option("Use the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")
-    ] = None,
+    jobs: Annotated[int | None, opt.option(
+        "Worker processes on this machine.", "N", min=1, default="one for each core")] = None,
+    scheduler: Annotated[str | None, opt.option(
+        "Use the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     format: opt.Format = "auto",
-    detector: Annotated[
-        str | None, opt.option("Detector, see reconstruct.", "NAME|MODEL.onnx|labels|lidar:NAME")
-    ] = None,
+    detector: Annotated[str | None, opt.option(
+        "Detector, see reconstruct.", "NAME|MODEL.onnx|labels|lidar:NAME")] = None,
     poses: opt.Poses = None,
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     seed: Annotated[int | None, opt.option("Seed of all random numbers.")] = None,
-    replay: Annotated[
-        bool, opt.option("Replay each scenario, too: replay.json, and its figures in the tables.", None, "--replay")
-    ] = False,
+    replay: Annotated[bool, opt.option(
+        "Replay each scenario, too: replay.json, and its figures in the tables.", None, "--replay")] = False,
     no_cache: opt.NoCache = False,
-    overwrite: Annotated[
-        bool, opt.option("Start over: first remove the results that DIR holds.", None, "--overwrite", "-f")
-    ] = False,
+    overwrite: Annotated[bool, opt.option(
+        "Start over: first remove the results that DIR holds.", None, "--overwrite", "-f")] = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Reconstruct all logs below a folder, several at once.
 
     Each log gets a folder in DIR/logs with scenario.json and report.json, with --replay also replay.json, or error.txt where it failed; table.html and

@@ -11,18 +11,11 @@ from log2sim.cli import options as opt
 def bench(
     log: opt.LogPath,
     out: Annotated[Path, opt.write_to("DIR", "Folder for bench.json and bench.png.")],
-    truth: Annotated[
-        Path | None,
-        opt.option("Ground truth: a scenario file or a log with labels; default: LOG, if it has labels.", "TRUTH"),
-    ] = None,
-    detector: Annotated[
-        list[str] | None,
-        opt.option(
-            "Detector, see reconstruct; repeat the option to compare several.",
-            "NAME|MODEL.onnx|labels",
-            completes=opt.complete_detectors,
-        ),
-    ] = None,
+    truth: Annotated[Path | None, opt.option(
+        "Ground truth: a scenario file or a log with labels; default: LOG, if it has labels.", "TRUTH")] = None,
+    detector: Annotated[list[str] | None, opt.option(
+        "Detector, see reconstruct; repeat the option to compare several.", "NAME|MODEL.onnx|labels",
+        completes=opt.complete_detectors)] = None,
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     cameras: opt.Cameras = None,
@@ -34,7 +27,7 @@ def bench(
     settings: opt.Settings = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Compare methods and settings by error and run time.
 
     Examples

@@ -13,18 +13,11 @@ if TYPE_CHECKING:
 
 def cache(
     clear: Annotated[bool, opt.option("Remove all that is kept.", None, "--clear")] = False,
-    max_mb: Annotated[
-        int | None,
-        opt.option(
-            "Size of the cache from now on, for all runs; what was not used for longest is dropped. At first 2048.",
-            "MB",
-            default="as it is",
-            min=0,
-            max=2**30,
-        ),
-    ] = None,
+    max_mb: Annotated[int | None, opt.option(
+        "Size of the cache from now on, for all runs; what was not used for longest is dropped. At first 2048.", "MB",
+        default="as it is", min=0, max=2**30)] = None,
     as_json: opt.AsJson = False,
-) -> None:
+) -> None:  # fmt: skip
     """Show what is kept of earlier runs, so that nothing is detected and measured twice; limit it or remove it.
 
     The environment variable LOG2SIM_CACHE moves the folder.
@@ -59,13 +52,10 @@ def summarize_cache(store: DiskCache) -> dict[str, Any]:
     ]
     found, kept = last.get("found"), last.get("kept")
     return {
-        "folder": str(store.folder),
-        "max_mb": store.max_mb,
-        "bytes": sum(size for _, size in usage.values()),
-        "parts": sum(count for count, _ in usage.values()),
-        "detectors": detectors,
+        "folder": str(store.folder), "max_mb": store.max_mb, "bytes": sum(size for _, size in usage.values()),
+        "parts": sum(count for count, _ in usage.values()), "detectors": detectors,
         "last_run": {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None,
-    }
+    }  # fmt: skip
 
 
 def describe_cache(found: dict[str, Any]) -> list[str]:

@@ -12,15 +12,10 @@ from log2sim.cli import options as opt
 def detect(
     log: opt.LogPath,
     out: Annotated[Path, opt.write_to("FILE", "Boxes file to write.")],
-    detector: Annotated[
-        str,
-        opt.option(
-            "Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
-            "the log).",
-            "lidar:NAME|lidar:MODEL.onnx",
-            completes=opt.complete_plugins("lidar_detector", prefix="lidar:"),
-        ),
-    ] = "lidar:vehicle",
+    detector: Annotated[str, opt.option(
+        "Detector in LiDAR sweeps: lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, or lidar:labels (boxes of "
+        "the log).", "lidar:NAME|lidar:MODEL.onnx",
+        completes=opt.complete_plugins("lidar_detector", prefix="lidar:"))] = "lidar:vehicle",
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     start: opt.Start = None,
@@ -31,7 +26,7 @@ def detect(
     settings: opt.Settings = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Detect road users in the LiDAR sweeps of a log.
 
     Examples

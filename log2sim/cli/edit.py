@@ -19,36 +19,27 @@ def edit(
     out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
     shift: Annotated[Changes, opt.option("Delay an agent; negative: advance it.", "AGENT=SECONDS")] = None,
     speed: Annotated[Changes, opt.option("Multiply the speed of an agent.", "AGENT=FACTOR")] = None,
-    lateral: Annotated[
-        Changes, opt.option("Move an agent to its left; negative: to its right.", "AGENT=METERS")
-    ] = None,
-    begin: Annotated[
-        float | None, opt.option("Change speed and lateral position from this time on, within --over.", "S", "--from")
-    ] = None,
-    over: Annotated[
-        float | None, opt.option("Seconds that the change takes, with --from; 3 if not given.", "S")
-    ] = None,
-    cut_in: Annotated[
-        Changes, opt.option("At --from, bring an agent onto the ego's path, GAP meters ahead.", "AGENT[=GAP]")
-    ] = None,
+    lateral: Annotated[Changes, opt.option(
+        "Move an agent to its left; negative: to its right.", "AGENT=METERS")] = None,
+    begin: Annotated[float | None, opt.option(
+        "Change speed and lateral position from this time on, within --over.", "S", "--from")] = None,
+    over: Annotated[float | None, opt.option(
+        "Seconds that the change takes, with --from; 3 if not given.", "S")] = None,
+    cut_in: Annotated[Changes, opt.option(
+        "At --from, bring an agent onto the ego's path, GAP meters ahead.", "AGENT[=GAP]")] = None,
     add: Annotated[Changes, opt.option("Add an agent, at the place that --at gives.", "CATEGORY")] = None,
-    at: Annotated[
-        Changes,
-        opt.option(
-            "Place of --add in the map, its heading and speed; or meters ahead of an agent, at its pace.",
-            "X,Y[,DEG[,MPS]]|AGENT+M",
-        ),
-    ] = None,
-    replace: Annotated[
-        Changes, opt.option("Replace an agent by one of another category and size.", "AGENT=CATEGORY")
-    ] = None,
+    at: Annotated[Changes, opt.option(
+        "Place of --add in the map, its heading and speed; or meters ahead of an agent, at its pace.",
+        "X,Y[,DEG[,MPS]]|AGENT+M")] = None,
+    replace: Annotated[Changes, opt.option(
+        "Replace an agent by one of another category and size.", "AGENT=CATEGORY")] = None,
     remove: Annotated[Changes, opt.option("Remove agents.", "A,B")] = None,
     only: Annotated[Changes, opt.option("Keep only these agents; the ego is 'ego'.", "A,B")] = None,
     drop_doubtful: opt.DropDoubtful = False,
     strict: Annotated[bool, opt.option("Exit 6 when a check fails.", None, "--strict")] = False,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Edit the agents of a scenario: their presence, category, timing, speed and lateral position.
 
     Options with values but --out, --from and --over may be given several times. They are applied in this order: only, remove,

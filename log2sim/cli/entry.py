@@ -4,40 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from typing import Annotated, Any, NoReturn
 
 import typer
 
-from log2sim.cli import (
-    batch,
-    bench,
-    cache,
-    config,
-    convert,
-    correct,
-    detect,
-    doctor,
-    edit,
-    evaluate,
-    export,
-    find,
-    help,
-    import_,
-    inspect,
-    map,
-    plot,
-    predict,
-    reconstruct,
-    replay,
-    resimulate,
-    studio,
-    synth,
-    tag,
-    test_,
-    validate,
-    vary,
-    view,
-)
 from log2sim.cli.options import fail, printable, say
 from log2sim.cli.shared import (
     DEBUG,
@@ -93,15 +64,13 @@ def root(
         raise typer.Exit
 
 
-for command in (
-    reconstruct.reconstruct, batch.batch, inspect.inspect, validate.validate, convert.convert, detect.detect, evaluate.evaluate,
-    bench.bench, plot.plot, view.view, studio.studio, replay.replay, predict.predict, edit.edit, resimulate.resimulate, correct.correct, tag.tag, find.find, vary.vary, export.export, synth.synth, config.config, cache.cache, doctor.doctor,
+# Each is the function of its own name in the module of its name; "_" stands after what is a word of Python.
+for name in (
+    "reconstruct", "batch", "inspect", "validate", "convert", "detect", "evaluate", "bench", "plot", "view", "studio", "replay",
+    "predict", "edit", "resimulate", "correct", "tag", "find", "vary", "export", "synth", "config", "cache", "doctor",
+    "help", "import_", "test_", "map",
 ):  # fmt: skip
-    add_command(app, command)
-add_command(app, help.help_, "help")
-add_command(app, import_.import_, "import")
-add_command(app, test_.run_test, "test")
-add_command(app, map.map_, "map")
+    add_command(app, getattr(import_module(f"log2sim.cli.{name}"), name))
 
 
 def main() -> None:

@@ -20,45 +20,29 @@ MAX_LOGS = 20  # of a batch that are printed; the document has all
 
 
 def evaluate(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE_OR_DIR", help="A scenario.json, a boxes.json of `detect`, or the folder of a `batch`."
-        ),
-    ],
-    truth: Annotated[
-        Path,
-        opt.option(
-            "Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
-            "TRUTH",
-        ),
-    ],
+    path: Annotated[Path, typer.Argument(
+        metavar="FILE_OR_DIR", help="A scenario.json, a boxes.json of `detect`, or the folder of a `batch`.")],
+    truth: Annotated[Path, opt.option(
+        "Ground truth: a log with labels or, for a scenario, a scenario file; of a batch the folder with its logs.",
+        "TRUTH")],
     labels: opt.LabelFile = None,
     sequence: opt.SequenceName = None,
     poses: opt.Poses = None,
     range: opt.Range = None,
     categories: opt.Categories = None,
-    protocol: Annotated[
-        str | None,
-        opt.option(
-            "Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
-            "(nuScenes).",
-            "kitti|dair|center",
-            completes=opt.complete("kitti", "dair", "center"),
-            default=PROTOCOL,
-        ),
-    ] = None,
-    score: Annotated[
-        float | None, opt.option("Of boxes: score from which precision and recall count them.", "S", default="0.5")
-    ] = None,
-    plot: Annotated[
-        Path | None, opt.option("Reliability diagram of confidences or scores to write.", "FILE.png")
-    ] = None,
+    protocol: Annotated[str | None, opt.option(
+        "Of boxes: KITTI's classes, difficulties and IoU; DAIR-V2X's classes and IoU; or distance of centers "
+        "(nuScenes).", "kitti|dair|center", completes=opt.complete("kitti", "dair", "center"),
+        default=PROTOCOL)] = None,
+    score: Annotated[float | None, opt.option(
+        "Of boxes: score from which precision and recall count them.", "S", default="0.5")] = None,
+    plot: Annotated[Path | None, opt.option(
+        "Reliability diagram of confidences or scores to write.", "FILE.png")] = None,
     out: Annotated[Path | None, opt.write_to("FILE", "Metrics file to write.")] = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Compare a scenario, or detected boxes, with the ground truth.
 
     Examples

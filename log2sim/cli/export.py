@@ -15,38 +15,23 @@ def export(
     scenario: opt.ScenarioPath,
     to: Annotated[str, opt.option(f"One of {FORMATS}.", "FORMAT", "--to", completes=opt.complete_plugins("export"))],
     out: Annotated[Path, opt.write_to("DIR", "Folder to write into.")],
-    revision: Annotated[
-        str | None, opt.choose("--revision", "1.0|1.1|1.2", "openscenario: its version.", default="the newest")
-    ] = None,
-    map: Annotated[
-        Path | None, opt.option("openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")
-    ] = None,
+    revision: Annotated[str | None, opt.choose(
+        "--revision", "1.0|1.1|1.2", "openscenario: its version.", default="the newest")] = None,
+    map: Annotated[Path | None, opt.option(
+        "openscenario, carla: OpenDRIVE file to use instead of a generated one.", "FILE")] = None,
     mode: Annotated[str | None, opt.choose("--mode", "exact|pid", "carla: how agents move.", default="exact")] = None,
-    log: Annotated[
-        Path | None,
-        opt.option(
-            "mcap, rerun: log whose images and points are included; openlabel: whose pictures have boxes.", "LOG"
-        ),
-    ] = None,
-    ego: Annotated[
-        str | None,
-        opt.option(
-            "Agent to take as the ego, where the scenario has none; openscenario: external, another program drives the ego.",
-            "AGENT|external",
-        ),
-    ] = None,
-    doubtful: Annotated[
-        str,
-        opt.choose(
-            "--doubtful",
-            "keep|drop|all",
-            "Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.",
-        ),
-    ] = "keep",
+    log: Annotated[Path | None, opt.option(
+        "mcap, rerun: log whose images and points are included; openlabel: whose pictures have boxes.", "LOG")] = None,
+    ego: Annotated[str | None, opt.option(
+        "Agent to take as the ego, where the scenario has none; openscenario: external, another program drives the ego.",
+        "AGENT|external")] = None,
+    doubtful: Annotated[str, opt.choose(
+        "--doubtful", "keep|drop|all",
+        "Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.")] = "keep",
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Write a scenario in the format of a simulator or viewer.
 
     Examples

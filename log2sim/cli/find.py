@@ -21,36 +21,26 @@ MAX_LISTED = 40
 
 
 def find(
-    path: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch, or one scenario.json."),
-    ],
-    condition: Annotated[
-        str,
-        typer.Argument(
-            metavar="CONDITION",
-            help="Such as 'cut_in and ttc_s < 2 and ego.speed_mps > 10'; without one, all tags are counted.",
-        ),
-    ] = "",
+    path: Annotated[Path, typer.Argument(
+        metavar="FOLDER", help="Folder with scenarios, such as that of batch, or one scenario.json.")],
+    condition: Annotated[str, typer.Argument(
+        metavar="CONDITION",
+        help="Such as 'cut_in and ttc_s < 2 and ego.speed_mps > 10'; without one, all tags are counted.")] = "",
     out: Annotated[Path | None, opt.write_to("FILE.html", "Page of the hits to write, with pictures.")] = None,
     table: Annotated[Path | None, opt.option("Parquet file of the hits to write.", "FILE.parquet")] = None,
-    open_: Annotated[
-        int | None, opt.option("Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)
-    ] = None,
+    open_: Annotated[int | None, opt.option(
+        "Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)] = None,
     probability: opt.LeastProbability = 0.3,
     fields: Annotated[bool, opt.option("List the fields of these scenarios' tags.", None, "--fields")] = False,
-    fresh: Annotated[
-        bool, opt.option("Read all scenarios again, not only those that are new or changed.", None, "--fresh")
-    ] = False,
+    fresh: Annotated[bool, opt.option(
+        "Read all scenarios again, not only those that are new or changed.", None, "--fresh")] = False,
     jobs: Annotated[int | None, opt.option("Processes that tag.", "N", min=1, default="one for each core")] = None,
-    scheduler: Annotated[
-        str | None,
-        opt.option("Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT"),
-    ] = None,
+    scheduler: Annotated[str | None, opt.option(
+        "Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     as_json: opt.AsJson = False,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Find situations in many scenarios by a condition on their tags.
 
     FOLDER/tags.parquet keeps the tags. A condition has tags, fields, numbers and texts with and, or, not, < <= > >= == !=, in and

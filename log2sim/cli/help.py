@@ -20,13 +20,10 @@ def pages() -> dict[str, str]:
     return {page.stem: page.read_text(encoding="utf-8") for page in sorted(folder.glob("*.md"))}
 
 
-def _topics() -> list[str]:
-    return list(pages())
-
-
-def help_(
+def help(
     topic: Annotated[
-        str | None, typer.Argument(help="Page to show; without one the pages are listed.", autocompletion=_topics)
+        str | None,
+        typer.Argument(help="Page to show; without one the pages are listed.", autocompletion=lambda: list(pages())),
     ] = None,
 ) -> None:
     """Show a page of the cookbook: a task, its commands, and what can go wrong.

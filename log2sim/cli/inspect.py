@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,7 +27,8 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
     facts = [("ego", _ego(log["ego"])), ("labels", _labels(log["labels"])), ("map", _map(log["map"]))]
     for name, title in (("image_labels", "boxes in images"), ("ignored_regions", "ignored regions")):
         if log[name]:
-            facts.append((title, ", ".join(f"{sensor} {_total(n)}" for sensor, n in log[name].items())))
+            counts = {s: n if isinstance(n, int) else sum(n.values()) for s, n in log[name].items()}
+            facts.append((title, ", ".join(f"{sensor} {count}" for sensor, count in counts.items())))
     facts += [(key, str(value)) for key, value in log["details"].items() if isinstance(value, str | int | float)]
     return [*lines, *format_rows(facts), *_topics(log["details"]), *_notes(log["notes"], verbose=verbose)]
 
@@ -114,10 +115,6 @@ def _counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda entry: (-entry[1], entry[0])))
 
 
-def _total(counts: Mapping[str, int] | int) -> int:
-    return counts if isinstance(counts, int) else sum(counts.values())
-
-
 def _notes(notes: Sequence[str], *, verbose: bool) -> list[str]:
     """Return the first notes, or all of them, and how many more there are."""
     shown = notes if verbose else notes[:MAX_NOTES]
@@ -131,18 +128,15 @@ def inspect(
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     as_json: opt.AsJson = False,
-    overlay: Annotated[
-        Path | None,
-        opt.option("Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png"),
-    ] = None,
-    at: Annotated[
-        float | None, opt.option("Time to draw, in s after the first tick.", "S", default="in the middle")
-    ] = None,
+    overlay: Annotated[Path | None, opt.option(
+        "Instead draw one tick: LiDAR points and labeled boxes on all images, and from above.", "FILE.png")] = None,
+    at: Annotated[float | None, opt.option(
+        "Time to draw, in s after the first tick.", "S", default="in the middle")] = None,
     cameras: opt.Cameras = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Describe the content of a log, or of a scenario.json, or draw one tick of a log.
 
     Examples
@@ -161,27 +155,25 @@ def inspect(
 
     if overlay is None and (at is not None or cameras is not None):
         raise ConfigError("--at and --cameras choose what --overlay FILE.png draws; name the picture too")
+    describe: Callable[..., list[str]] = describe_log
     if log.suffix.lower() == ".json":
         if overlay is not None:
             raise ConfigError(f"{log}: is a scenario, which --overlay does not draw; log2sim plot does")
         from log2sim.datatypes import Scenario
         from log2sim.road.lane_keeping import summarize_scenario
 
-        document = summarize_scenario(Scenario.load(log))
-        lines = [json.dumps(document, indent=2)] if as_json else describe_scenario(document, verbose=verbose)
-        opt.say("\n".join(lines), quiet=quiet)
-        return
-    names = opt.camera_names(cameras)
-    check_targets(overlay, overwrite=overwrite)
-    with progress(quiet=quiet) as report_progress:
-        report_progress(OPENING, 0, 0)
-        opened = open_log(log, format=format, sequence=sequence)
-    if overlay is None:
-        document = summarize(opened)
-        lines = [json.dumps(document, indent=2)] if as_json else describe_log(document, verbose=verbose)
-        opt.say("\n".join(lines), quiet=quiet)
-        return
-    from log2sim.visualization.overlay import read_moment, write_overlay
+        describe, document = describe_scenario, summarize_scenario(Scenario.load(log))
+    else:
+        names = opt.camera_names(cameras)
+        check_targets(overlay, overwrite=overwrite)
+        with progress(quiet=quiet) as report_progress:
+            report_progress(OPENING, 0, 0)
+            opened = open_log(log, format=format, sequence=sequence)
+        if overlay is not None:
+            from log2sim.visualization.overlay import read_moment, write_overlay
 
-    write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-    opt.report_written(overlay, quiet=quiet)
+            write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
+            opt.report_written(overlay, quiet=quiet)
+            return
+        document = summarize(opened)
+    opt.say(json.dumps(document, indent=2) if as_json else "\n".join(describe(document, verbose=verbose)), quiet=quiet)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
 
 
-def map_(
+def map(
     log: opt.LogPath,
     out: Annotated[Path, opt.write_to("FILE", "Map to write: .tif (GeoTIFF), .png or .jpg (with a world file).")],
     scenario: Annotated[

@@ -65,63 +65,41 @@ Overwrite = Annotated[bool, option("Replace files that exist.", None, "--overwri
 OverwriteFolder = Annotated[bool, option("Replace the folder of an earlier run.", None, "--overwrite", "-f")]
 ScenarioFolder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with scenarios, such as that of batch.")]
 Condition = Annotated[str, typer.Argument(metavar="CONDITION", help="As that of find; it finds tags of one kind.")]
-LeastProbability = Annotated[
-    float, option("Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)
-]
-PageLog = Annotated[
-    Path | None, option("Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")
-]
-DropDoubtful = Annotated[
-    bool, option("Leave out agents that the scenario itself doubts; the ego stays.", None, "--drop-doubtful")
-]
+LeastProbability = Annotated[float, option(
+    "Least probability of the tags, unless the condition has one.", "P", min=0.0, max=1.0)]  # fmt: skip
+PageLog = Annotated[Path | None, option(
+    "Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")]  # fmt: skip
+DropDoubtful = Annotated[bool, option(
+    "Leave out agents that the scenario itself doubts; the ego stays.", None, "--drop-doubtful")]  # fmt: skip
 Quiet = Annotated[bool, option("Print nothing but errors.", None, "--quiet", "-q")]
 Verbose = Annotated[bool, option("Print everything, not only the first of many.", None, "--verbose", "-v")]
 AsJson = Annotated[bool, option("Print JSON, for programs, instead of a table.", None, "--json")]
-Format = Annotated[
-    str,
-    option(
-        f"Log format: auto, {', '.join(BUILT_IN['log'])}.",
-        "FORMAT",
-        completes=lambda incomplete: [*complete("auto")(incomplete), *complete_plugins("log")(incomplete)],
-    ),
-]
-SequenceName = Annotated[
-    str | None, option("Sequence to open, when the folder has several.", "NAME", default="the only one")
-]
+Format = Annotated[str, option(
+    f"Log format: auto, {', '.join(BUILT_IN['log'])}.", "FORMAT",
+    completes=lambda incomplete: [*complete("auto")(incomplete), *complete_plugins("log")(incomplete)])]  # fmt: skip
+SequenceName = Annotated[str | None, option(
+    "Sequence to open, when the folder has several.", "NAME", default="the only one")]  # fmt: skip
 Settings = Annotated[list[str] | None, option("Change a setting; see log2sim config.", "SECTION.KEY=VALUE", "--set")]
 Cameras = Annotated[str | None, option("Use only these cameras.", "A,B", default="all")]
 ConfigFile = Annotated[Path | None, option("File with settings; see log2sim config.", "FILE.toml", "--config")]
 Start = Annotated[float | None, option("First time to use, in s from the start of the log.", "S", default="the start")]
 Stop = Annotated[float | None, option("Last time to use, in s from the start of the log.", "S", default="the end")]
-Range = Annotated[
-    float | None, option("Compare agents or boxes up to this distance from the ego, in m.", "M", default="no limit")
-]
-Categories = Annotated[
-    str | None, option("Compare only these categories or groups, e.g. vehicle.", "A,B", default="all")
-]
+Range = Annotated[float | None, option(
+    "Compare agents or boxes up to this distance from the ego, in m.", "M", default="no limit")]  # fmt: skip
+Categories = Annotated[str | None, option(
+    "Compare only these categories or groups, e.g. vehicle.", "A,B", default="all")]  # fmt: skip
 Truth = Annotated[Path | None, option("Ground truth: a scenario file or a log with labels.", "TRUTH")]
-LabelFile = Annotated[
-    Path | None,
-    option(
-        "True boxes in place of those of the log: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
-        "FILE",
-        "--labels",
-    ),
-]
-Poses = Annotated[
-    str | None,
-    choose(
-        "--poses",
-        "given|lidar|camera|auto",
-        "Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the sensors best.",
-        default="the log's own; what fits best for a log without any",
-    ),
-]
+LabelFile = Annotated[Path | None, option(
+    "True boxes in place of those of the log: KITTI tracking, nuScenes JSON, OpenLABEL, or CSV as labels/boxes_3d.csv.",
+    "FILE", "--labels")]  # fmt: skip
+Poses = Annotated[str | None, choose(
+    "--poses", "given|lidar|camera|auto",
+    "Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the sensors best.",
+    default="the log's own; what fits best for a log without any")]  # fmt: skip
 
 
-NoCache = Annotated[
-    bool, option("Search every picture again, and keep nothing of it; see log2sim cache.", None, "--no-cache")
-]
+NoCache = Annotated[bool, option(
+    "Search every picture again, and keep nothing of it; see log2sim cache.", None, "--no-cache")]  # fmt: skip
 
 
 def printable(text: str) -> str:

@@ -13,40 +13,28 @@ def plot(
     out: Annotated[Path, opt.write_to("FILE", "Picture (.png .svg .pdf) or film (.mp4 .webm .gif) to write.")],
     replay: Annotated[Path | None, opt.option("Replay to draw over the scenario.", "REPLAY")] = None,
     truth: opt.Truth = None,
-    background: Annotated[
-        Path | None,
-        opt.option("Log whose map of the ground is the background, or a map of log2sim map.", "LOG|MAP.png"),
-    ] = None,
-    predict: Annotated[
-        float | None, opt.option("Draw where movers were expected to go for this long, in s.", "S")
-    ] = None,
-    start: Annotated[
-        float | None, opt.option("First time of the scenario to show, in s.", "S", default="the start")
-    ] = None,
-    stop: Annotated[
-        float | None, opt.option("Last time of the scenario to show, in s.", "S", default="the end")
-    ] = None,
-    extent: Annotated[
-        str | None, opt.option("Two corners of the part of the map to show, in m.", "X0,Y0,X1,Y1", default="what moves")
-    ] = None,
+    background: Annotated[Path | None, opt.option(
+        "Log whose map of the ground is the background, or a map of log2sim map.", "LOG|MAP.png")] = None,
+    predict: Annotated[float | None, opt.option(
+        "Draw where movers were expected to go for this long, in s.", "S")] = None,
+    start: Annotated[float | None, opt.option(
+        "First time of the scenario to show, in s.", "S", default="the start")] = None,
+    stop: Annotated[float | None, opt.option(
+        "Last time of the scenario to show, in s.", "S", default="the end")] = None,
+    extent: Annotated[str | None, opt.option(
+        "Two corners of the part of the map to show, in m.", "X0,Y0,X1,Y1", default="what moves")] = None,
     agents: Annotated[str | None, opt.option("Show these agents alone.", "ID,ID", default="all")] = None,
     label_static: Annotated[bool, opt.option("Write the ids of static agents too.", None, "--label-static")] = False,
-    size: Annotated[
-        str | None, opt.option("Size in pixels, such as 1280x720; not of .svg and .pdf.", "WxH", default="what fits")
-    ] = None,
+    size: Annotated[str | None, opt.option(
+        "Size in pixels, such as 1280x720; not of .svg and .pdf.", "WxH", default="what fits")] = None,
     fps: Annotated[float | None, opt.option("Frames of a film a second.", "N", default="25, of a .gif 10")] = None,
-    speed: Annotated[
-        float | None,
-        opt.option(
-            "Times faster than real time that a film plays.",
-            "X",
-            default="1, or what fits into a minute, half a minute for a .gif",
-        ),
-    ] = None,
+    speed: Annotated[float | None, opt.option(
+        "Times faster than real time that a film plays.", "X",
+        default="1, or what fits into a minute, half a minute for a .gif")] = None,
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Draw a scenario from above: a picture or a film.
 
     An .mp4 is H.264 (extra video); without that it becomes a .webm.

@@ -39,24 +39,20 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
         *(("doubtful", line) for line in doubt_lines(scenario, result.findings, verbose=verbose) or ["none"]),
         ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
         *(("missing", line) for line in missing_lines(scenario)),
-        *(("used", line) for line in (stage_lines(scenario) if verbose else ())),
     ]
+    if verbose:
+        stages = [f"{'with' if s['kept'] else 'no'} {s['stage']}: {s['reason']}" for s in scenario.stages]
+        rows += [("used", line) for line in stages]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
     table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
-    made = ", ".join([f"made in {speed}", *known_ticks(result.report)])
+    known = (result.report["detection_cache"] or {"found": 0})["found"]
+    made = f"made in {speed}" + (f", {opt.counted(known, 'tick')} known from earlier runs" if known else "")
     # Never broken into lines: it is there to be copied.
     return [
         f"{out}: {ids} over {scenario.duration_s:.1f} s, {made}",
         *table,
         f"  {'next':<{len('doubtful')}}  {next_line}",
     ]
-
-
-def known_ticks(report: dict[str, Any]) -> list[str]:
-    """Say how many ticks were not looked at, since an earlier run had done it."""
-    cache = report["detection_cache"]
-    found = 0 if cache is None else cache["found"]
-    return [f"{opt.counted(found, 'tick')} known from earlier runs"] if found else []
 
 
 def described(scenario: Scenario) -> list[str]:
@@ -100,18 +96,6 @@ def missing_lines(scenario: Scenario) -> list[str]:
     return [*(f"{', '.join(stages)}: {reason}" for reason, stages in left_out.items()), *notes]
 
 
-def stage_lines(scenario: Scenario) -> list[str]:
-    """Say of every stage whether it was run, and why."""
-    return [f"{'with' if stage['kept'] else 'no'} {stage['stage']}: {stage['reason']}" for stage in scenario.stages]
-
-
-def view_command(log: Path, sequence: str | None, out: Path) -> str:
-    """Return the command that shows the scenario with the pictures and the ground of its log."""
-    chosen = [] if sequence is None else ["--sequence", sequence]
-    page = str(out.with_suffix(".html"))
-    return shlex.join(["log2sim", "view", str(out), "--log", str(log), *chosen, "-o", page])
-
-
 def pose_reasons(poses: dict[str, Any]) -> list[str]:
     """Say which poses were used and why; nothing of the log's own where no others were asked for."""
     own = poses["source"] == "none" or poses["source"] == poses["requested"] == "given"
@@ -123,75 +107,43 @@ def reconstruct(
     out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
-    detector: Annotated[
-        str | None,
-        opt.option(
-            "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
-            "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
-            "NAME|MODEL.onnx|labels|lidar:NAME",
-            completes=opt.complete_detectors,
-            default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow",
-        ),
-    ] = None,
+    detector: Annotated[str | None, opt.option(
+        "Detector in images: ssd-mobilenet-v2, a path to an ONNX model, or labels (boxes of the log); in LiDAR sweeps: "
+        "lidar:vehicle, lidar:roadside, lidar:MODEL.onnx, lidar:labels; both: NAME+lidar:NAME.",
+        "NAME|MODEL.onnx|labels|lidar:NAME", completes=opt.complete_detectors,
+        default="ssd-mobilenet-v2+lidar:vehicle, or what of it the log and the installation allow")] = None,
     cameras: opt.Cameras = None,
     start: opt.Start = None,
     stop: opt.Stop = None,
     poses: opt.Poses = None,
-    static_for_all: Annotated[
-        bool | None,
-        opt.option(
-            "Static agents exist all the time unless the log shows their place free, or only while observed.",
-            None,
-            "--static-for-all/--as-observed",
-            default="--static-for-all",
-        ),
-    ] = None,
-    fix_time: Annotated[
-        bool, opt.option("Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")
-    ] = False,
-    fix_calibration: Annotated[
-        bool, opt.option("Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")
-    ] = False,
-    ends: Annotated[
-        str | None,
-        opt.choose(
-            "--ends",
-            "both|vehicle|road",
-            "Use only the sensors on the vehicle, or only those at the road.",
-            default="both",
-        ),
-    ] = None,
-    fusion: Annotated[
-        str | None,
-        opt.choose(
-            "--fusion",
-            "points|boxes|tracks",
-            "What of the vehicle's and the road's LiDARs is joined.",
-            default="see log2sim config",
-        ),
-    ] = None,
-    corrections: Annotated[
-        Path | None, opt.option("Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")
-    ] = None,
+    static_for_all: Annotated[bool | None, opt.option(
+        "Static agents exist all the time unless the log shows their place free, or only while observed.", None,
+        "--static-for-all/--as-observed", default="--static-for-all")] = None,
+    fix_time: Annotated[bool, opt.option(
+        "Correct stamps of sensors by the offsets that the log shows.", None, "--fix-time")] = False,
+    fix_calibration: Annotated[bool, opt.option(
+        "Correct mounts of sensors by the rotations that the log shows.", None, "--fix-calibration")] = False,
+    ends: Annotated[str | None, opt.choose(
+        "--ends", "both|vehicle|road", "Use only the sensors on the vehicle, or only those at the road.",
+        default="both")] = None,
+    fusion: Annotated[str | None, opt.choose(
+        "--fusion", "points|boxes|tracks", "What of the vehicle's and the road's LiDARs is joined.",
+        default="see log2sim config")] = None,
+    corrections: Annotated[Path | None, opt.option(
+        "Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")] = None,
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     seed: Annotated[int | None, opt.option("Seed of all random numbers.", "N", default="0")] = None,
     report: Annotated[Path | None, opt.option("Report file to write.", "FILE.json")] = None,
     topdown: Annotated[Path | None, opt.option("Bird's-eye image of all cameras to write.", "FILE.png")] = None,
-    jobs: Annotated[
-        int | None,
-        opt.option(
-            "Processes that share the work; the result is the same for any number.",
-            "N",
-            min=1,
-            default="the usable cores",
-        ),
-    ] = None,
+    jobs: Annotated[int | None, opt.option(
+        "Processes that share the work; the result is the same for any number.", "N", min=1,
+        default="the usable cores")] = None,
     no_cache: opt.NoCache = False,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Reconstruct the scenario of a log.
 
     Examples
@@ -208,14 +160,11 @@ def reconstruct(
     check_targets(out, report, topdown, overwrite=overwrite)
     fixes = {"fix_time": fix_time, "fix_mounts": fix_calibration}
     changes: dict[str, Any] = {
-        "cameras": None if cameras is None else opt.camera_names(cameras),
-        "start_s": start,
-        "stop_s": stop,
-        "seed": seed,
-        "track": None if static_for_all is None else {"static_for_all": static_for_all},
+        "cameras": None if cameras is None else opt.camera_names(cameras), "start_s": start, "stop_s": stop,
+        "seed": seed, "track": None if static_for_all is None else {"static_for_all": static_for_all},
         "cooperation": {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None},
         "calibration": {name: True for name, chosen in fixes.items() if chosen},
-    }
+    }  # fmt: skip
     with progress(quiet=quiet) as report_progress:
         report_progress(OPENING, 0, 0)
         from log2sim.edit.corrections import correct, load_corrections
@@ -255,7 +204,11 @@ def reconstruct(
     opt.say_all("poses", pose_reasons(result.report["poses"]), quiet=quiet)
     opt.say_all("note", findings, quiet=quiet)
     opt.report_written(report, topdown, quiet=quiet)
-    for line in summarize_run(result, view_command(log, sequence, out), out, verbose=verbose):
+    # The next command shows the scenario with the pictures and the ground of its log.
+    sequences = [] if sequence is None else ["--sequence", sequence]
+    page = str(out.with_suffix(".html"))
+    view = shlex.join(["log2sim", "view", str(out), "--log", str(log), *sequences, "-o", page])
+    for line in summarize_run(result, view, out, verbose=verbose):
         opt.say(line, quiet=quiet)
 
 

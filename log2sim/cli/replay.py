@@ -15,92 +15,51 @@ if TYPE_CHECKING:
 def replay(
     scenario: opt.ScenarioPath,
     out: Annotated[Path | None, opt.write_to("FILE", "Replay file to write.")] = None,
-    mode: Annotated[
-        str,
-        opt.choose(
-            "--mode", "pid|exact", "pid: vehicles follow their trajectories by a controller; exact: no controller."
-        ),
-    ] = "pid",
-    model: Annotated[
-        str,
-        opt.choose(
-            "--model",
-            "auto|kinematic|dynamic|single-track",
-            "Vehicle model, or a plug-in; auto: by how hard each vehicle drives.",
-        ),
-    ] = "auto",
+    mode: Annotated[str, opt.choose(
+        "--mode", "pid|exact",
+        "pid: vehicles follow their trajectories by a controller; exact: no controller.")] = "pid",
+    model: Annotated[str, opt.choose(
+        "--model", "auto|kinematic|dynamic|single-track",
+        "Vehicle model, or a plug-in; auto: by how hard each vehicle drives.")] = "auto",
     dt: Annotated[float, opt.option("Time step in s, from 0.0005 to 1.", "S")] = 0.01,
-    ego: Annotated[
-        str | None,
-        opt.option(
-            "Policy that drives the ego: a plug-in, or of a module or file.", "NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE"
-        ),
-    ] = None,
-    log: Annotated[
-        Path | None,
-        opt.option("--ego: what the policy sees by its observations' sweep and image comes from this log.", "LOG"),
-    ] = None,
-    recorded: Annotated[
-        Path | None,
-        opt.option(
-            "--log: what was reconstructed from it, where the scenario is an edit. [default: the scenario]", "FILE"
-        ),
-    ] = None,
-    warn: Annotated[
-        str | None,
-        opt.choose(
-            "--warn",
-            "vehicle|road|both",
-            "Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.",
-        ),
-    ] = None,
+    ego: Annotated[str | None, opt.option(
+        "Policy that drives the ego: a plug-in, or of a module or file.",
+        "NAME|MODULE:ATTRIBUTE|FILE.py:ATTRIBUTE")] = None,
+    log: Annotated[Path | None, opt.option(
+        "--ego: what the policy sees by its observations' sweep and image comes from this log.", "LOG")] = None,
+    recorded: Annotated[Path | None, opt.option(
+        "--log: what was reconstructed from it, where the scenario is an edit. [default: the scenario]",
+        "FILE")] = None,
+    warn: Annotated[str | None, opt.choose(
+        "--warn", "vehicle|road|both",
+        "Warn the ego, or without one each vehicle, of collisions by what the sensors at these ends observe.")] = None,
     brake: Annotated[bool, opt.option("With --warn: the ego brakes when it is warned.", None, "--brake")] = False,
     horizon: Annotated[float, opt.option("--warn: predict collisions for so long, in s.", "S")] = 5.0,
     reaction: Annotated[float, opt.option("--warn: from the warning until the brakes work, in s.", "S")] = 1.0,
     deceleration: Annotated[float, opt.option("--warn: how hard the ego brakes, in m/s2.", "MPS2")] = 8.0,
-    agents: Annotated[
-        str,
-        opt.choose(
-            "--agents",
-            "scenario|reactive",
-            "Behavior of the other agents: as the scenario says, or braking to avoid collisions.",
-        ),
-    ] = "scenario",
+    agents: Annotated[str, opt.choose(
+        "--agents", "scenario|reactive",
+        "Behavior of the other agents: as the scenario says, or braking to avoid collisions.")] = "scenario",
     react: Annotated[str | None, opt.option("Make only these agents reactive.", "ID,ID")] = None,
-    foresight: Annotated[
-        str,
-        opt.choose(
-            "--foresight",
-            "path|motion",
-            "What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.",
-        ),
-    ] = "path",
-    confidence: Annotated[
-        float | None,
-        opt.option(
-            "Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.", "MIN"
-        ),
-    ] = None,
+    foresight: Annotated[str, opt.choose(
+        "--foresight", "path|motion",
+        "What reactive agents expect of others: path: where the scenario has them go; motion: as they moved so far.")] = "path",
+    confidence: Annotated[float | None, opt.option(
+        "Leave out agents with a lower confidence instead of the quarantined; 0: none. The ego stays.", "MIN")] = None,
     drop_doubtful: opt.DropDoubtful = False,
-    simulator: Annotated[
-        str, opt.choose("--simulator", "own|carla", "own, or carla: agents move in a CARLA server.")
-    ] = "own",
+    simulator: Annotated[str, opt.choose(
+        "--simulator", "own|carla", "own, or carla: agents move in a CARLA server.")] = "own",
     host: Annotated[str | None, opt.option("carla: address of the server.", "NAME", default="127.0.0.1")] = None,
     port: Annotated[int | None, opt.option("carla: port of the server.", "N", min=1, max=65535, default="2000")] = None,
     map: Annotated[str | None, opt.option("carla: map to load first.", "TOWN|FILE.xodr")] = None,
-    strict: Annotated[
-        bool,
-        opt.option(
-            "Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path.", None, "--strict"
-        ),
-    ] = False,
-    limit: Annotated[
-        list[str] | None, opt.option("Report agents beyond this limit, e.g. min_ttc_s=1; see --strict.", "METRIC=VALUE")
-    ] = None,
+    strict: Annotated[bool, opt.option(
+        "Exit 6 when a limit is exceeded: --limit, new collisions, distance from the path.", None, "--strict")] = False,
+    limit: Annotated[list[str] | None, opt.option(
+        "Report agents beyond this limit, e.g. min_ttc_s=1; see --strict.", "METRIC=VALUE")] = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Simulate a scenario.
 
     Examples

@@ -187,12 +187,13 @@ Debug = Annotated[bool, typer.Option(DEBUG, help="Show where in the program an e
 FollowLinks = Annotated[bool, typer.Option(OPTION, help="Follow links in logs that lead out of their folders.")]
 
 
-def add_command(app: typer.Typer, command: Callable[..., None], name: str | None = None) -> None:
+def add_command(app: typer.Typer, command: Callable[..., None]) -> None:
     """Add a command to the program, with the shared options, and the examples of its docstring below its options.
 
-    `command`: its docstring is the help. What stands below the heading "Examples" are lines for the shell. `name`:
-    default: that of the function.
+    `command`: its name, without a "_" at the end, is that of the command, and its docstring the help. What stands below
+    the heading "Examples" are lines for the shell.
     """
+    name = command.__name__.rstrip("_")
     text, _, examples = (inspect.getdoc(command) or "").partition("\nExamples\n--------\n")
     # With defaults of its own, since those of the program for its option `--help` are not those of a command `help`.
     settings: dict[str, Any] | None = {"default_map": {}} if name == "help" else None
@@ -211,11 +212,9 @@ def add_shared_options(command: Callable[..., None]) -> Callable[..., None]:
         command(*args, **options)
 
     signature = inspect.signature(command, eval_str=True)
-    shared = [
-        inspect.Parameter("debug", KEYWORD, default=False, annotation=Debug),
-        inspect.Parameter("follow_links", KEYWORD, default=False, annotation=FollowLinks),
-    ]
-    parameters = [*signature.parameters.values(), *shared]
+    shared = (("debug", Debug), ("follow_links", FollowLinks))
+    added = [inspect.Parameter(name, KEYWORD, default=False, annotation=kind) for name, kind in shared]
+    parameters = [*signature.parameters.values(), *added]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run

@@ -14,23 +14,17 @@ from log2sim.cli import options as opt
 def studio(
     scenario: opt.ScenarioPath,
     log: opt.PageLog = None,
-    corrections: Annotated[
-        Path | None,
-        opt.option(
-            "File of corrections to write, and to go on with where it is there.",
-            "FILE.json",
-            default="beside the scenario",
-        ),
-    ] = None,
+    corrections: Annotated[Path | None, opt.option(
+        "File of corrections to write, and to go on with where it is there.", "FILE.json",
+        default="beside the scenario")] = None,
     cameras: opt.Cameras = None,
     max_mb: Annotated[float, opt.option("Size of the page, in millions of bytes.", "MB", default="40")] = 40.0,
-    port: Annotated[
-        int, typer.Option(metavar="N", min=0, max=65535, help="Port of this computer.", show_default="a free one")
-    ] = 0,
+    port: Annotated[int, typer.Option(
+        metavar="N", min=0, max=65535, help="Port of this computer.", show_default="a free one")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     sequence: opt.SequenceName = None,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Correct a scenario on a page: the doubtful agents first, merging, moving, turning, sizes, categories; with undo.
 
     The page is served to this computer alone, until Ctrl-C. Every correction is kept in a file at once, which `log2sim correct` and

@@ -15,38 +15,26 @@ from log2sim.errors import ConfigError
 def synth(
     out: Annotated[Path, opt.write_to("DIR", "Folder to write.")],
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
-    traffic: Annotated[
-        Literal["vehicle", "roadside"] | None,
-        opt.option("Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside."),
-    ] = None,
+    traffic: Annotated[Literal["vehicle", "roadside"] | None, opt.option(
+        "Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside.")] = None,
     scenes: Annotated[int, opt.option("Number of random scenes.", min=1, max=1_000_000)] = 10,
-    sensor: Annotated[
-        str | None,
-        opt.option(
-            "LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]", "NAME"
-        ),
-    ] = None,
-    layout: Annotated[
-        Literal["kitti", "log2sim"] | None,
-        opt.option(
-            "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
-            "pictures]"
-        ),
-    ] = None,
+    sensor: Annotated[str | None, opt.option(
+        "LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]",
+        "NAME")] = None,
+    layout: Annotated[Literal["kitti", "log2sim"] | None, opt.option(
+        "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
+        "pictures]")] = None,
     duration: Annotated[float, opt.option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
-    light: Annotated[
-        Literal["noon", "overcast", "dusk", "night"] | None, opt.option("Light; random scenes draw it otherwise.")
-    ] = None,
-    weather: Annotated[
-        Literal["clear", "rain", "fog"] | None, opt.option("Weather; random scenes draw it otherwise.")
-    ] = None,
-    no_pictures: Annotated[
-        bool, opt.option("Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")
-    ] = False,
+    light: Annotated[Literal["noon", "overcast", "dusk", "night"] | None, opt.option(
+        "Light; random scenes draw it otherwise.")] = None,
+    weather: Annotated[Literal["clear", "rain", "fog"] | None, opt.option(
+        "Weather; random scenes draw it otherwise.")] = None,
+    no_pictures: Annotated[bool, opt.option(
+        "Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")] = False,
     seed: Annotated[int, opt.option("Seed of all random numbers.", min=0)] = 0,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Generate a synthetic log with exact ground truth, or random traffic for training and tests.
 
     Examples

@@ -12,17 +12,13 @@ from log2sim.cli.shared import format_rows
 def tag(
     scenario: opt.ScenarioPath,
     out: Annotated[Path | None, opt.write_to("FILE", "Scenario file to write, with the tags in it.")] = None,
-    criticality: Annotated[
-        Path | None,
-        opt.option(
-            "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
-            "FILE.csv",
-        ),
-    ] = None,
+    criticality: Annotated[Path | None, opt.option(
+        "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
+        "FILE.csv")] = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
-) -> None:
+) -> None:  # fmt: skip
     """Find lane changes, cut-ins, overtaking, near misses and more, of the ego and of all others.
 
     Each tag has a probability, out of the standard deviations and the confidence of the agents, and quantities in SI units. Lanes that

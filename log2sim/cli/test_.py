@@ -14,29 +14,25 @@ if TYPE_CHECKING:
     from log2sim.scenarios.failure import Outcome
 
 
-def run_test(
+def test_(
     policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy for the ego, as replay --ego takes it.")],
     path: opt.ScenarioFolder,
     condition: opt.Condition,
     out: Annotated[Path, opt.write_to("DIR", "Folder for the report and the worst runs.")],
     runs: Annotated[int, opt.option("Runs in all.", "N", min=40, max=100_000)] = 400,
-    limit: Annotated[
-        list[str] | None,
-        opt.option("A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE"),
-    ] = None,
+    limit: Annotated[list[str] | None, opt.option(
+        "A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE")] = None,
     agents: Annotated[str, opt.choose("--agents", "scenario|reactive", "Behavior of the other agent.")] = "scenario",
-    latency: Annotated[
-        str, opt.option("How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")
-    ] = "0",
-    noise: Annotated[
-        float, opt.option("Standard deviation of where it sees them, m, on each axis.", "M", min=0.0, max=10.0)
-    ] = 0.0,
+    latency: Annotated[str, opt.option(
+        "How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")] = "0",
+    noise: Annotated[float, opt.option(
+        "Standard deviation of where it sees them, m, on each axis.", "M", min=0.0, max=10.0)] = 0.0,
     worst: Annotated[int, opt.option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
     seed: Annotated[int, opt.option("Seed of all draws.", min=0)] = 0,
     jobs: Annotated[int | None, opt.option("Processes.", "N", min=1, default="one for each core")] = None,
     overwrite: opt.OverwriteFolder = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Test a policy in variations of a situation: where it fails, how critical, how likely.
 
     The situation is varied as by vary; runs are drawn ever nearer to where the policy fails, and the probability of failure over the

@@ -17,17 +17,13 @@ SCHEMAS = {
 
 
 def validate(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE_OR_LOG",
-            help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.",
-        ),
-    ],
+    path: Annotated[Path, typer.Argument(
+        metavar="FILE_OR_LOG",
+        help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Validate a file, or every record of a log.
 
     Exits with 3 and lists the problems, if there are any. Gaps between records are no problem; they are

@@ -12,35 +12,23 @@ def view(
     scenario: opt.ScenarioPath,
     out: Annotated[Path, opt.write_to("FILE.html", "Page to write.")],
     log: opt.PageLog = None,
-    max_mb: Annotated[
-        float | None,
-        opt.option(
-            "Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.",
-            "MB",
-            default="40",
-        ),
-    ] = None,
+    max_mb: Annotated[float | None, opt.option(
+        "Size of a page with --log, in millions of bytes; pictures and points are chosen to fit.", "MB",
+        default="40")] = None,
     cameras: opt.Cameras = None,
     truth: opt.Truth = None,
     replay: Annotated[Path | None, opt.option("Replay to show as a layer.", "REPLAY")] = None,
-    metrics: Annotated[
-        Path | None, opt.option("Metrics file of log2sim evaluate, to show beside the map.", "METRICS")
-    ] = None,
-    predict: Annotated[
-        float | None, opt.option("Show where agents were expected to go for this long, in s.", "S")
-    ] = None,
-    background: Annotated[
-        Path | None,
-        opt.option(
-            "Log whose map of the ground is shown below, or a map of log2sim map.",
-            "LOG|MAP.png",
-            default="that of --log",
-        ),
-    ] = None,
+    metrics: Annotated[Path | None, opt.option(
+        "Metrics file of log2sim evaluate, to show beside the map.", "METRICS")] = None,
+    predict: Annotated[float | None, opt.option(
+        "Show where agents were expected to go for this long, in s.", "S")] = None,
+    background: Annotated[Path | None, opt.option(
+        "Log whose map of the ground is shown below, or a map of log2sim map.", "LOG|MAP.png",
+        default="that of --log")] = None,
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
     quiet: opt.Quiet = False,
-) -> None:
+) -> None:  # fmt: skip
     """Write an interactive HTML page of a scenario.
 
     Examples

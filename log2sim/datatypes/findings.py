@@ -172,8 +172,9 @@ SENSOR_KINDS: Mapping[str, Kind] = {
     ),
     "time_offset": Kind(
         "the stamps of a sensor are off against the poses",
-        "stamps are off by {offset_ms:+.0f} ms (+: late) against the poses of the ego (sigma {offset_sigma_ms:.0f} ms); {done}",
-        ("offset_s", "offset_sigma_s", "pose_error_m"),
+        "stamps are off by {offset_ms:+.0f} ms (+: late) against the poses of the ego (sigma {offset_sigma_ms:.0f} ms), by which what "
+        "the sensor sees is up to {moved_m:.1f} m out of place; {done}",
+        ("offset_s", "offset_sigma_s", "pose_error_m", "moved_m"),
         "--fix-time",
     ),
     "unknown_offset": Kind(

@@ -48,13 +48,10 @@ BRIDGE_ACCELERATION = 1.5
 PAINT_WIDTH_M = 0.15
 # What each kind of correction settles.
 SETTLED = {
-    "flip": {"heading_ambiguous", "reversing"},
-    "size": {"unlikely_size"},
-    "category": {"unlikely_size", "speed"},
-    "split": {"jump"},
-    "merge": {"jump", "passes_through"},
+    "flip": {"heading_ambiguous", "reversing"}, "size": {"unlikely_size"}, "category": {"unlikely_size", "speed"},
+    "split": {"jump"}, "merge": {"jump", "passes_through"},
     "move": {"jump", "empty", "in_ego", "passes_through", "sideways"},
-}
+}  # fmt: skip
 SINGLE = ("category", "size", "color", "flip")
 
 

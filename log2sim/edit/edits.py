@@ -11,19 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Finding, Span, Waypoints, retime_spans
-from log2sim.edit.motion import (
-    STEP_S,
-    along_path,
-    chords,
-    doubts_shifted,
-    lane_changed,
-    parallel_fails,
-    retimed_doubts,
-    shifted_in_time,
-    shifted_left,
-    sped_up,
-    sped_up_between,
-)
+from log2sim.edit import motion
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
@@ -190,12 +178,12 @@ class Speed(_WaypointEdit):
         if agent.static:
             raise ConfigError(f"speed: agent '{agent.id}' is static and has no speed to change; leave it out")
         if self.window is not None:
-            return sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[0]
-        return sped_up(agent.waypoints, self.factor)
+            return motion.sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[0]
+        return motion.sped_up(agent.waypoints, self.factor)
 
     def doubts(self, agent: Agent) -> tuple[Finding, ...]:
         """Return the doubts at scaled times."""
-        return retimed_doubts(agent.doubts, self._retime(agent))
+        return motion.retimed_doubts(agent.doubts, self._retime(agent))
 
     def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
         """Return the spans at scaled times."""
@@ -204,7 +192,7 @@ class Speed(_WaypointEdit):
     def _retime(self, agent: Agent) -> Callable[[float], float]:
         """Return the change of times."""
         if self.window is not None:
-            new_s = sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[1]
+            new_s = motion.sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[1]
             return lambda t_s: float(new_s(np.array([t_s]))[0])
         begin_s = float(agent.waypoints.t_s[0])
         return lambda t_s: begin_s + (t_s - begin_s) / self.factor
@@ -225,11 +213,11 @@ class Lateral(_WaypointEdit):
     def moved(self, agent: Agent) -> Waypoints:
         """Return the waypoints of the parallel path."""
         w = agent.waypoints
-        fails = parallel_fails(w, self.meters)
+        fails = motion.parallel_fails(w, self.meters)
         if self.window is not None:
             fails &= w.t_s[1:] > self.window.begin_s
         if fails.any():
-            chord, turn = chords(w)
+            chord, turn = motion.chords(w)
             radius_m = np.where(fails, np.abs(chord / np.where(fails, turn, 1.0)), np.inf)
             k = int(np.argmin(radius_m))
             raise ConfigError(
@@ -237,8 +225,8 @@ class Lateral(_WaypointEdit):
                 f"cannot be shifted to that side by {abs(self.meters):g} m; choose less than {radius_m[k]:.2f} m"
             )
         if self.window is not None:
-            return lane_changed(agent, self.meters, *self.window.of(agent, self.kind))
-        return shifted_left(w, self.meters)
+            return motion.lane_changed(agent, self.meters, *self.window.of(agent, self.kind))
+        return motion.shifted_left(w, self.meters)
 
 
 @dataclass(frozen=True)
@@ -258,7 +246,9 @@ class CutIn(_AgentEdit):
             raise ConfigError(f"cut_in: needs another agent, and an ego that is there at {end_s:g} s")
         if self.gap_m is not None:
             wanted_m = self.gap_m + (ego.size_m[0] + agent.size_m[0]) / 2
-            times = agent.waypoints.t_s[0] + STEP_S * np.arange(int(np.ptp(agent.waypoints.t_s) / STEP_S) + 1)
+            times = agent.waypoints.t_s[0] + motion.STEP_S * np.arange(
+                int(np.ptp(agent.waypoints.t_s) / motion.STEP_S) + 1
+            )
             ahead_m = self._ahead(ego, agent, times, end_s)[0]
             k = int(np.argmin(np.abs(ahead_m - wanted_m)))
             if abs(ahead_m[k] - wanted_m) > 1.0:
@@ -275,7 +265,7 @@ class CutIn(_AgentEdit):
 
     def _ahead(self, ego: Agent, agent: Agent, t_s: Array, end_s: float) -> tuple[Array, Array]:
         """Return how far an agent is at times (T,) ahead of where the ego is at `end_s`, along the ego's path, and left of it."""
-        path, at = along_path(ego, 0.0), agent.at(t_s)
+        path, at = motion.along_path(ego, 0.0), agent.at(t_s)
         station = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(path.x_m), np.diff(path.y_m)))])
         k = np.argmin(np.hypot(at.x_m[:, None] - path.x_m, at.y_m[:, None] - path.y_m), axis=1)
         dx, dy = at.x_m - path.x_m[k], at.y_m - path.y_m[k]
@@ -316,7 +306,7 @@ class Add(Edit):
         end_s = max(float(a.waypoints.t_s[-1]) for a in agents.values())
         if self.ahead_of:
             leader = agents[self.ahead_of]
-            w = along_path(leader, self.meters)
+            w = motion.along_path(leader, self.meters)
             w = replace(w, z_m=w.z_m + (size[2] - leader.size_m[2]) / 2)
         else:
             t_s = np.linspace(0.0, end_s, int(end_s / MAX_STEP_S) + 2) if self.speed_mps and end_s > 0 else np.zeros(1)
@@ -366,7 +356,7 @@ class Shift(_WaypointEdit):
 
     def moved(self, agent: Agent) -> Waypoints:
         """Return the waypoints at shifted times."""
-        w = shifted_in_time(agent, self.seconds)
+        w = motion.shifted_in_time(agent, self.seconds)
         if len(w) == 0:
             end_s = float(agent.waypoints.t_s[-1])
             raise ConfigError(
@@ -377,7 +367,7 @@ class Shift(_WaypointEdit):
 
     def doubts(self, agent: Agent) -> tuple[Finding, ...]:
         """Return the doubts at shifted times."""
-        return doubts_shifted(agent, self.seconds)
+        return motion.doubts_shifted(agent, self.seconds)
 
     def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
         """Return the spans at shifted times, cut at the scenario's start."""

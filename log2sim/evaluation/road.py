@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -113,6 +113,7 @@ MATCH_M = 0.3
 LATERAL_REACH_M = 1.0
 
 Line = Marking | RoadBorder
+Counts = Callable[[Array], NDArray[np.bool_]]  # which of places (N, 2) count
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,20 +124,21 @@ class RoadSamples:
     length_m: Array  # (S,) that each stands for
     line: NDArray[np.int64]  # (S,) index of its line
 
+    heading_rad: Array  # (S,)
+
     @classmethod
-    def of(cls, lines: Sequence[Line]) -> RoadSamples:
-        """Sample lines."""
+    def of(cls, lines: Sequence[Line | MapLane], counts: Counts) -> RoadSamples:
+        """Sample lines; places that do not count are left out."""
         parts = [sampled(line.points_m) for line in lines]
-        counts = [len(xy) for xy, _, _ in parts]
-        return cls(
-            np.concatenate([np.zeros((0, 2)), *(xy for xy, _, _ in parts)]),
-            np.repeat([length for _, _, length in parts], counts),
-            np.repeat(np.arange(len(lines)), counts),
-        )
+        each = [len(xy) for xy, _, _ in parts]
+        xy = np.concatenate([np.zeros((0, 2)), *(xy for xy, _, _ in parts)])
+        length, line = np.repeat([length for _, _, length in parts], each), np.repeat(np.arange(len(lines)), each)
+        heading = np.concatenate([np.zeros(0), *(heading for _, heading, _ in parts)])
+        return cls(xy, length, line, heading).where(counts(xy))
 
     def where(self, chosen: NDArray[np.bool_]) -> RoadSamples:
         """Select samples (S,)."""
-        return RoadSamples(self.xy_m[chosen], self.length_m[chosen], self.line[chosen])
+        return RoadSamples(*(column[chosen] for column in vars(self).values()))
 
 
 def nearest_road(samples: RoadSamples, lines: Sequence[Line]) -> tuple[NDArray[np.int64], Array]:
@@ -160,50 +162,30 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
     lateral errors are distances of found points to the nearest true line within `LATERAL_REACH_M`. None where there is
     nothing to compute a figure from.
     """
-    ours = RoadSamples.of(found)
-    ours = ours.where(area.counts(ours.xy_m))
-    theirs = RoadSamples.of(true)
-    theirs = theirs.where(area.expects(theirs.xy_m))
+    ours, theirs = RoadSamples.of(found, area.counts), RoadSamples.of(true, area.expects)
     nearest_true, away = nearest_road(ours, true)
     _, missed_by = nearest_road(theirs, found)
     right = away <= MATCH_M
     found_m, true_m = float(ours.length_m.sum()), float(theirs.length_m.sum())
     false_m = float(ours.length_m[~right].sum())
     close = area.is_close(theirs.xy_m)
+    # Shares of the matched length whose kind, and whose color where both sides state one, is right.
+    matched, agreement = ours.where(right), {}
+    for name in ("kind", "color"):
+        lines = [(found[i], true[k]) for i, k in zip(matched.line, nearest_true[right])]
+        pairs = [(getattr(a, name, None), getattr(b, name, None)) for a, b in lines]
+        stated = np.array([None not in pair for pair in pairs], dtype=bool)
+        same = np.array([a == b for a, b in pairs], dtype=bool)
+        agreement[f"{name}_accuracy"] = share(matched.length_m[stated], same[stated])
     beside = away <= LATERAL_REACH_M
     return {
-        "true_m": true_m,
-        "found_m": found_m,
-        "precision": share(ours.length_m, right),
+        "true_m": true_m, "found_m": found_m, "precision": share(ours.length_m, right),
         "recall": share(theirs.length_m, missed_by <= MATCH_M),
         "recall_20_m": share(theirs.length_m[close], missed_by[close] <= MATCH_M),
         "lateral_median_m": _quantile(away[beside], ours.length_m[beside], 0.5),
         "lateral_p95_m": _quantile(away[beside], ours.length_m[beside], 0.95),
-        "false_m_per_100_m": None if area.path_m < 1 else 100 * false_m / area.path_m,
-        **_agreement(found, true, ours.where(right), nearest_true[right]),
-    }
-
-
-def _agreement(
-    found: Sequence[Line], true: Sequence[Line], ours: RoadSamples, matched: NDArray[np.int64]
-) -> dict[str, float | None]:
-    """Shares of the matched length whose kind, and whose color where both sides state one, is right."""
-    kinds = _same([line.kind for line in found], [line.kind for line in true], ours.line, matched)
-    colors, theirs = ([getattr(line, "color", None) for line in lines] for lines in (found, true))
-    stated = np.array([colors[i] is not None and theirs[k] is not None for i, k in zip(ours.line, matched)], dtype=bool)
-    same = _same(colors, theirs, ours.line, matched)
-    return {
-        "kind_accuracy": share(ours.length_m, kinds),
-        "color_accuracy": share(ours.length_m[stated], same[stated]),
-    }
-
-
-def _same(
-    ours: Sequence[str | None], theirs: Sequence[str | None], i: NDArray[np.int64], k: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    if len(i) == 0:
-        return np.zeros(0, dtype=bool)
-    return np.asarray(np.array(ours, dtype=object)[i] == np.array(theirs, dtype=object)[k], dtype=bool)
+        "false_m_per_100_m": None if area.path_m < 1 else 100 * false_m / area.path_m, **agreement,
+    }  # fmt: skip
 
 
 def share(weight: Array, chosen: NDArray[np.bool_]) -> float | None:
@@ -283,13 +265,15 @@ def lane_figures(found: Sequence[MapLane], true: Sequence[MapLane], area: Area) 
     ours = [lane for lane in found if lane.junction is None]
     theirs = [lane for lane in true if lane.junction is None]
     # In junctions a found lane may be any; what lies on a true junction lane counts neither way.
-    crossed = shapely.union_all([_band(lane) for lane in true if lane.junction is not None])
-    away, weight = _distances(ours, true, area.counts)
-    xy, _, _ = _samples(ours, area.counts)
-    at_junction = np.asarray(shapely.contains_xy(crossed, xy[:, 0], xy[:, 1]), dtype=bool)
-    away, weight = away[~at_junction], weight[~at_junction]
-    missed, true_weight = _distances(theirs, found, area.expects)
-    near = away <= CENTER_REACH_M
+    junctions = [lane for lane in true if lane.junction is not None]
+    middles = [shapely.LineString(lane.points_m[:, :2]) for lane in junctions]
+    half_m = [float(np.mean(lane.width_m)) / 2 for lane in junctions]
+    crossed = shapely.union_all([line.buffer(half, cap_style="flat") for line, half in zip(middles, half_m)])
+    found_at, true_at = RoadSamples.of(ours, area.counts), RoadSamples.of(theirs, area.expects)
+    found_at = found_at.where(~np.asarray(shapely.contains_xy(crossed, *found_at.xy_m.T), dtype=bool))
+    away, _ = _to_lanes(found_at.xy_m, found_at.heading_rad, true)
+    missed, _ = _to_lanes(true_at.xy_m, true_at.heading_rad, found)
+    weight, true_weight, near = found_at.length_m, true_at.length_m, away <= CENTER_REACH_M
     return {
         "true_m": float(true_weight.sum()),
         "found_m": float(weight.sum()),
@@ -316,26 +300,6 @@ def path_figures(found: Sequence[MapLane], truth: Scenario, area: Area) -> dict[
         inside_m += float(step[used][distance <= limit].sum())
         all_m += float(step[used].sum())
     return {"path_m": all_m, "inside": inside_m / all_m if all_m > 0 else None}
-
-
-def _samples(lanes: Sequence[MapLane], counts: Any) -> tuple[Array, Array, Array]:
-    parts = [sampled(lane.points_m) for lane in lanes]
-    xy = np.concatenate([np.zeros((0, 2)), *(p[0] for p in parts)])
-    heading = np.concatenate([np.zeros(0), *(p[1] for p in parts)])
-    weight = np.repeat([p[2] for p in parts], [len(p[0]) for p in parts])
-    kept = counts(xy)
-    return xy[kept], heading[kept], weight[kept]
-
-
-def _distances(lanes: Sequence[MapLane], others: Sequence[MapLane], counts: Any) -> tuple[Array, Array]:
-    """Distances (S,) of points of lanes to the nearest other lane of their direction, and the length (S,) of each."""
-    xy, heading, weight = _samples(lanes, counts)
-    distance, _ = _to_lanes(xy, heading, others)
-    return distance, weight
-
-
-def _band(lane: MapLane) -> Any:
-    return shapely.LineString(lane.points_m[:, :2]).buffer(float(np.mean(lane.width_m)) / 2, cap_style="flat")
 
 
 def _to_lanes(xy: Array, heading: Array, lanes: Sequence[MapLane]) -> tuple[Array, Array]:
@@ -387,14 +351,11 @@ def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str
             if color["name"] != true_color["name"]:
                 confused[f"{true_color['name']} as {color['name']}"] += 1
     return {
-        "vehicles": len(matched),
-        "with_color": with_color,
-        "named": named,
-        "right": right,
+        "vehicles": len(matched), "with_color": with_color, "named": named, "right": right,
         "accuracy": right / named if named else None,
         "ciede2000_median": float(np.median(distance)) if distance else None,
         "confused": dict(sorted(confused.items())),
-    }
+    }  # fmt: skip
 
 
 def _difference(a: Any, b: Any) -> float:

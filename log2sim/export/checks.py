@@ -36,9 +36,13 @@ _NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 def require_exportable(scenario: Scenario) -> None:
     """Raise `ScenarioError` with all defects of a scenario, naming the agents."""
-    wrong = [problem for agent in scenario.agents for problem in _problems(agent)]
-    if not scenario.agents:
-        wrong = ["it has no agents"]
+    wrong = [] if scenario.agents else ["it has no agents"]
+    for agent in scenario.agents:
+        problem = agent.waypoints.problem()
+        found = [] if problem is None else [problem]
+        if not (np.isfinite(agent.size_m).all() and min(agent.size_m) > 0):
+            found.append(f"size {agent.size_m} m, expected positive lengths")
+        wrong += [f"agent '{agent.id}': {text}" for text in found or _back_to_front(agent)]
     wrong += [
         f"name or id {text!a}: holds half a surrogate pair, which no file can; give it another"
         for text in (scenario.name, *(a.id for a in scenario.agents))
@@ -47,7 +51,11 @@ def require_exportable(scenario: Scenario) -> None:
     projection = scenario.map.projection
     if projection is not None and _NO_XML.search(projection):
         wrong.append(f"map.projection {projection[:60]!a}: holds characters that no XML file can; write a PROJ string")
-    wrong += _duplicate_ids(scenario) or ([] if wrong else _too_far_apart(scenario))
+    ids = [a.id for a in scenario.agents]
+    twice = sorted({name for name in ids if ids.count(name) > 1})
+    wrong += [f"agent '{name}': the id occurs twice; ids must be unique" for name in twice]
+    if not wrong:
+        wrong = _too_far_apart(scenario)
     if wrong:
         raise ScenarioError(f"scenario '{scenario.name}' cannot be exported:\n  " + "\n  ".join(wrong))
 
@@ -178,15 +186,6 @@ def _states(agents: Sequence[Agent], t_s: Array) -> Array:
     return np.concatenate([table.center_m, table.yaw_rad[..., None]], axis=2).transpose(2, 1, 0)
 
 
-def _problems(agent: Agent) -> list[str]:
-    where = f"agent '{agent.id}'"
-    problem = agent.waypoints.problem()
-    wrong = [] if problem is None else [f"{where}: {problem}"]
-    if not (np.isfinite(agent.size_m).all() and min(agent.size_m) > 0):
-        wrong.append(f"{where}: size {agent.size_m} m, expected positive lengths")
-    return wrong or list(_back_to_front(agent))
-
-
 def _back_to_front(agent: Agent) -> Iterator[str]:
     """Describe an agent that mostly moves against its heading although its speed is positive."""
     w = agent.waypoints
@@ -200,17 +199,9 @@ def _back_to_front(agent: Agent) -> Iterator[str]:
     reach = np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))  # the steps of a box that jitters add up without getting anywhere
     if reach >= MOVED_M and wrong > moved / 2:
         yield (
-            f"agent '{agent.id}': goes backward on {wrong:.1f} of {moved:.1f} m while its speed says forward; if its box is"
+            f"goes backward on {wrong:.1f} of {moved:.1f} m while its speed says forward; if its box is"
             " labeled back to front, turn yaw_rad by half a turn, and if it reverses, make speed_mps negative"
         )
-
-
-def _duplicate_ids(scenario: Scenario) -> list[str]:
-    ids = [a.id for a in scenario.agents]
-    return [
-        f"agent '{name}': the id occurs twice; ids must be unique"
-        for name in sorted({n for n in ids if ids.count(n) > 1})
-    ]
 
 
 def _too_far_apart(scenario: Scenario) -> list[str]:

@@ -67,7 +67,8 @@ class CommonRoad:
         if stop - start < STEP_S:
             raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
         t_s = step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
-        name = f"ZAM_{_camel_case(scenario.name)}-1_1_T-1"
+        words = "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", scenario.name))[:50]
+        name = f"ZAM_{words or 'Scenario'}-1_1_T-1"  # benchmark ids have letters and digits alone
         # The document with its header, dated by the start of the scenario so that the same scenario gives the same bytes.
         root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
         root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
@@ -79,9 +80,8 @@ class CommonRoad:
         location = _texts(element("location"), **place)
         if frame.projection is not None:
             x, y, _ = frame.offset_m  # from projected coordinates to those of the file
-            transformation = _texts(
-                element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection)
-            )
+            reference = xml_text.escaped(frame.projection)
+            transformation = _texts(element("geoTransformation", location), geoReference=reference)
             shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
             _texts(element("additionalTransformation", transformation), **shift)
         root.append(location)
@@ -114,11 +114,6 @@ class CommonRoad:
 def _trust(agent: Agent) -> tuple[float, str]:
     """Return the confidence of an agent and the reasons to doubt it."""
     return agent.confidence, ", ".join(doubt.sentence for doubt in agent.doubts)
-
-
-def _camel_case(text: str) -> str:
-    """Return a name of letters and digits only, as benchmark ids need it."""
-    return "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", text))[:50] or "Scenario"
 
 
 def _decimal(value: float) -> str:
@@ -201,14 +196,9 @@ def _state(tag: str, move: SampledMotion, k: int, step: int) -> Element:
     state = element(tag)
     _point(element("position", state), move.position_m[k, :2])
     speed, acceleration = (_along(v[k], yaw) for v in (move.velocity_mps, move.acceleration_mps2))
-    exact = {
-        "orientation": _decimal(yaw),
-        "time": str(step),
-        "velocity": _decimal(speed),
-        "acceleration": _decimal(acceleration),
-    }
-    for key, value in exact.items():
-        _texts(element(key, state), exact=value)
+    rows = (("orientation", yaw), ("time", step), ("velocity", speed), ("acceleration", acceleration))
+    for key, value in rows:
+        _texts(element(key, state), exact=str(value) if isinstance(value, int) else _decimal(value))
     return state
 
 
@@ -228,14 +218,10 @@ def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
     _texts(area, length=_decimal(GOAL_LENGTH_M), width=width, orientation=_decimal(yaw))
     x, y, _ = map(_decimal, move.position_m[last])
     _texts(element("center", area), x=x, y=y)
-    _interval(goal, "orientation", yaw, GOAL_YAW_RAD)
-    _interval(goal, "velocity", speed, GOAL_SPEED_MPS)
+    for tag, middle, reach in (("orientation", yaw, GOAL_YAW_RAD), ("velocity", speed, GOAL_SPEED_MPS)):
+        _texts(element(tag, goal), intervalStart=_decimal(middle - reach), intervalEnd=_decimal(middle + reach))
     _texts(element("time", goal), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
     return problem
-
-
-def _interval(parent: Element, tag: str, middle: float, reach: float) -> None:
-    _texts(element(tag, parent), intervalStart=_decimal(middle - reach), intervalEnd=_decimal(middle + reach))
 
 
 EXPORTER = CommonRoad()

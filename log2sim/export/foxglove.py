@@ -31,15 +31,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from log2sim.datatypes import Agent, explain_doubt
-from log2sim.export.viewers import (
-    AgentSteps,
-    CameraFrame,
-    ThinnedSweep,
-    UnreadableRecord,
-    ViewerRecord,
-    ego_pose,
-    rgb_of,
-)
+from log2sim.export import viewers
 from log2sim.geometry import NS_PER_S, Array, quaternion_from_rotation, transform
 
 MAP = "map"
@@ -51,7 +43,7 @@ PLUMB_BOB = 5  # number of coefficients of this model; with more it is called ra
 Message = tuple[int, str, Any]  # time in ns, topic and message
 
 
-def scene_messages(steps: AgentSteps, origin: Array) -> Iterator[Message]:
+def scene_messages(steps: viewers.AgentSteps, origin: Array) -> Iterator[Message]:
     """Yield the paths, then at every step the present boxes and the ego's frame; positions less `origin` (3,)."""
     yield int(steps.t_ns[0]), "/paths", SceneUpdate(entities=[_path(steps, k, origin) for k in range(len(steps.moves))])
     for k, t_ns in enumerate(steps.t_ns.tolist()):
@@ -60,17 +52,17 @@ def scene_messages(steps: AgentSteps, origin: Array) -> Iterator[Message]:
         yield t_ns, "/agents", SceneUpdate(deletions=[gone], entities=[_box(t_ns, *at) for at in here])
         for agent, position, yaw in here:
             if agent.id == "ego":
-                yield t_ns, "/tf", _frame(t_ns, "ego", ego_pose(agent, position, yaw))
+                yield t_ns, "/tf", _frame(t_ns, "ego", viewers.ego_pose(agent, position, yaw))
 
 
-def record_messages(record: ViewerRecord, origin: Array) -> Iterable[Message]:
+def record_messages(record: viewers.ViewerRecord, origin: Array) -> Iterable[Message]:
     """Return the messages of one record of the log."""
-    if isinstance(record, UnreadableRecord):
+    if isinstance(record, viewers.UnreadableRecord):
         text = LogMessage(
             timestamp=_stamp(record.t_ns), level=LogMessage.WARNING, name=record.stream, message=record.reason
         )
         return [(record.t_ns, "/log", text)]
-    if isinstance(record, ThinnedSweep):
+    if isinstance(record, viewers.ThinnedSweep):
         return [(record.t_ns, f"/lidar/{record.lidar}", _cloud(record, origin))]
     return _picture(record, origin)
 
@@ -80,7 +72,7 @@ def _stamp(t_ns: int) -> Timestamp:
 
 
 def _color(agent: Agent, alpha: float) -> Color:
-    r, g, b = (v / 255 for v in rgb_of(agent))
+    r, g, b = (v / 255 for v in viewers.rgb_of(agent))
     return Color(r=r, g=g, b=b, a=alpha)
 
 
@@ -90,7 +82,7 @@ def _pose(position: Array, yaw_rad: float) -> Pose:
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn)
 
 
-def _path(steps: AgentSteps, k: int, origin: Array) -> SceneEntity:
+def _path(steps: viewers.AgentSteps, k: int, origin: Array) -> SceneEntity:
     agent, _ = steps.moves[k]
     w = agent.waypoints
     ground = np.column_stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2]) - origin
@@ -135,7 +127,7 @@ def _frame(t_ns: int, child: str, map_T_child: Array) -> FrameTransform:
     )
 
 
-def _cloud(record: ThinnedSweep, origin: Array) -> PointCloud:
+def _cloud(record: viewers.ThinnedSweep, origin: Array) -> PointCloud:
     data = (record.points_map - origin).astype("<f4").tobytes()
     columns = [PackedElementField(name=n, offset=4 * i, type=PackedElementField.FLOAT32) for i, n in enumerate("xyz")]
     place = _pose(np.zeros(3), 0.0)
@@ -144,7 +136,7 @@ def _cloud(record: ThinnedSweep, origin: Array) -> PointCloud:
     )
 
 
-def _picture(record: CameraFrame, origin: Array) -> Iterator[Message]:
+def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
     name, t_ns = record.camera.name, record.t_ns
     stamp, topic = _stamp(t_ns), f"/camera/{name}"
     if record.map_T_cam is not None:
@@ -171,20 +163,14 @@ def _picture(record: CameraFrame, origin: Array) -> Iterator[Message]:
     yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
 
 
-def _calibration(record: CameraFrame) -> CameraCalibration:
+def _calibration(record: viewers.CameraFrame) -> CameraCalibration:
     camera = record.camera
     known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
     few = len(camera.distortion) <= PLUMB_BOB
     model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
     coefficients = [*camera.distortion, *[0.0] * count][:count]
+    K, P = camera.K.ravel().tolist(), np.column_stack([camera.K, np.zeros(3)]).ravel().tolist()
     return CameraCalibration(
-        timestamp=_stamp(record.t_ns),
-        frame_id=camera.name,
-        width=camera.width_px,
-        height=camera.height_px,
-        distortion_model=model,
-        D=coefficients,
-        K=camera.K.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.column_stack([camera.K, np.zeros(3)]).ravel().tolist(),
-    )
+        timestamp=_stamp(record.t_ns), frame_id=camera.name, width=camera.width_px, height=camera.height_px,
+        distortion_model=model, D=coefficients, K=K, R=np.eye(3).ravel().tolist(), P=P,
+    )  # fmt: skip

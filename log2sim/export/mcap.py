@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,17 +52,15 @@ class ScenarioMcap:
                 m for record in viewer_records(scenario, options.log) for m in foxglove.record_messages(record, origin)
             )
         with (folder / f"{file_name(scenario.name)}.mcap").open("wb") as file, Writer(file) as writer:
-            writer.add_metadata("log2sim", dict(_about(scenario, placement.origin_m)))
+            about = {
+                "position_offset_m": placement.origin_m,
+                "doubtful": {a.id: explain_doubt(a) for a in scenario.doubtful},
+            }
+            about |= {f"map.{key}": value for key, value in asdict(scenario.map).items()}
+            texts = {key: json.dumps(value) for key, value in about.items()}
+            writer.add_metadata("log2sim", {"scenario": scenario.name, **texts})
             for t_ns, topic, message in heapq.merge(*parts, key=lambda m: m[0]):
                 writer.write_message(topic, message, log_time=t_ns, publish_time=t_ns)
-
-
-def _about(scenario: Scenario, origin_m: tuple[float, float, float]) -> Iterator[tuple[str, str]]:
-    """Describe the map frame of the file, as text."""
-    yield "scenario", scenario.name
-    yield "position_offset_m", json.dumps(origin_m)
-    yield "doubtful", json.dumps({a.id: explain_doubt(a) for a in scenario.doubtful})
-    yield from ((f"map.{key}", json.dumps(value)) for key, value in asdict(scenario.map).items())
 
 
 EXPORTER = ScenarioMcap()

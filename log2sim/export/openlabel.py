@@ -54,19 +54,14 @@ class OpenLabel:
                 for camera, t_ns in shown.items():
                     for row, box in _boxes_px(scenario, log, camera, t_ns):
                         found.setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
-        content = {
-            str(k): {
-                "frame_properties": {
-                    "timestamp": str(t_ns),
-                    "transforms": _transforms(scenario, log, t_ns, moves, k),
-                    "streams": {
-                        name: {"stream_properties": {"timestamp": str(stamp)}} for name, stamp in shown.items()
-                    },
-                },
+        content = {}
+        for k, (t_ns, shown) in enumerate(zip(stamps.tolist(), pictures)):
+            streams = {name: {"stream_properties": {"timestamp": str(stamp)}} for name, stamp in shown.items()}
+            transforms = _transforms(scenario, log, t_ns, moves, k)
+            content[str(k)] = {
+                "frame_properties": {"timestamp": str(t_ns), "transforms": transforms, "streams": streams},
                 "objects": {uid: {"object_data": found} for uid, found in data[k].items()},
             }
-            for k, (t_ns, shown) in enumerate(zip(stamps.tolist(), pictures))
-        }
         document = {
             "metadata": {"schema_version": "1.0.0", "name": scenario.name, "annotator": "log2sim"},
             "coordinate_systems": _systems(scenario, log),
@@ -190,9 +185,7 @@ def _object(agent: Agent, frames: Sequence[int]) -> dict[str, Any]:
     if agent.color is not None:
         about["text"].append({"name": "color", "val": agent.color["name"]})
     about = {kind: values for kind, values in about.items() if values}
-    return {
-        "name": agent.id, "type": agent.category, "object_data": about, "frame_intervals": _intervals(frames),
-    }  # fmt: skip
+    return {"name": agent.id, "type": agent.category, "object_data": about, "frame_intervals": _intervals(frames)}
 
 
 def _intervals(frames: Sequence[int]) -> list[dict[str, int]]:

@@ -79,11 +79,11 @@ def _lane(osi: Any, lane: MapLane, number_of: dict[str, int], sides: Sequence[in
     kind = osi.Lane.Classification
     inside = lane.junction is not None
     before, after = ([number_of[name] for name in names] for names in (lane.predecessors, lane.successors))
-    open_end: list[int | None] = [None]
-    pairs = [(a, b) for a in before or open_end for b in after or open_end if before or after]
-    beside = [
-        [] if name is None else [osi.Identifier(value=number_of[name])] for name in (lane.left_lane, lane.right_lane)
-    ]
+    # Every way through the lane; a side without lanes is left out, and so is the pairing where both are.
+    ways_in, ways_out = [{"antecessor_lane_id": n} for n in before], [{"successor_lane_id": n} for n in after]
+    pairs = [pair for a in ways_in or [{}] for b in ways_out or [{}] if (pair := {**a, **b})]
+    sides_ids = (lane.left_lane, lane.right_lane)
+    beside = [[] if name is None else [osi.Identifier(value=number_of[name])] for name in sides_ids]
     return osi.Lane(
         id=osi.Identifier(value=number_of[lane.id]),
         classification=kind(
@@ -93,18 +93,12 @@ def _lane(osi: Any, lane: MapLane, number_of: dict[str, int], sides: Sequence[in
             centerline_is_driving_direction=True,
             left_adjacent_lane_id=beside[0],
             right_adjacent_lane_id=beside[1],
-            lane_pairing=[_pairing(osi, a, b) for a, b in pairs],
+            lane_pairing=[kind.LanePairing(**{k: osi.Identifier(value=n) for k, n in pair.items()}) for pair in pairs],
             left_lane_boundary_id=[osi.Identifier(value=sides[0])],
             right_lane_boundary_id=[osi.Identifier(value=sides[1])],
         ),
         source_reference=[osi.ExternalReference(type="io.log2sim.lane", identifier=[lane.id, lane.inferred_from])],
     )
-
-
-def _pairing(osi: Any, before: int | None, after: int | None) -> Any:
-    ends = {"antecessor_lane_id": before, "successor_lane_id": after}
-    known = {key: osi.Identifier(value=number) for key, number in ends.items() if number is not None}
-    return osi.Lane.Classification.LanePairing(**known)
 
 
 def _marking(osi: Any, number: int, points: Array, color: str | None) -> Any:
@@ -133,20 +127,13 @@ def traffic_lights(osi: Any, scenario: Scenario, first: int, t_s: float) -> list
     for number, signal in enumerate(scenario.signals, start=first):
         color, mode = LIGHT[str(signal.at(np.array([t_s]))[0])]
         turn = osi.Orientation3d(roll=0.0, pitch=0.0, yaw=float(signal.heading_rad or 0.0))
-        base = osi.BaseStationary(
-            position=_vector(osi, signal.position_m),
-            dimension=osi.Dimension3d(length=length, width=width, height=height),
-            orientation=turn,
-        )
-        classified = kind(
-            color=kind.Color[color], mode=kind.Mode[mode], icon=kind.Icon.NONE, is_out_of_service=mode == "OFF"
-        )
-        reference = osi.ExternalReference(type="io.log2sim.signal", identifier=[signal.id])
-        out.append(
-            osi.TrafficLight(
-                id=osi.Identifier(value=number), base=base, classification=classified, source_reference=[reference]
-            )
-        )
+        size = osi.Dimension3d(length=length, width=width, height=height)
+        out.append(osi.TrafficLight(
+            id=osi.Identifier(value=number),
+            base=osi.BaseStationary(position=_vector(osi, signal.position_m), dimension=size, orientation=turn),
+            classification=kind(color=kind.Color[color], mode=kind.Mode[mode], icon=kind.Icon.NONE, is_out_of_service=mode == "OFF"),
+            source_reference=[osi.ExternalReference(type="io.log2sim.signal", identifier=[signal.id])],
+        ))  # fmt: skip
     return out
 
 
@@ -193,35 +180,27 @@ class Osi:
         if scenario.ego is not None:
             head["host_vehicle_id"] = betterosi.Identifier(value=scenario.agents.index(scenario.ego) + 1)
         ground = static_map(betterosi, scenario, first=len(scenario.agents) + 1)
-        with betterosi.Writer(folder / _trace_name(betterosi, scenario, len(steps.t_ns))) as writer:
+        # The file name that the standard prescribes, with the scenario's start time.
+        start = datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
+        versions = betterosi.prepare_channel_metadata()
+        keys = (betterosi.OSI_CHANNEL_OSI_VERSION_KEY, betterosi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
+        standard, protobuf = (versions[key].replace(".", "") for key in keys)
+        name = f"{start}_gt_{standard}_{protobuf}_{len(steps.t_ns)}_{file_name(scenario.name)}.osi"
+        with betterosi.Writer(folder / name) as writer:
             for k, stamp_ns in enumerate(steps.t_ns.tolist()):
                 alive = [(n, a, m) for n, (a, m) in enumerate(steps.moves, start=1) if m.valid[k]]
-                truth = betterosi.GroundTruth(
-                    **head,
-                    lane=ground.lanes,
-                    lane_boundary=ground.boundaries,
-                    road_marking=ground.markings,
-                    traffic_light=traffic_lights(
-                        betterosi, scenario, ground.next_id, (stamp_ns - scenario.t0_ns) / NS_PER_S
-                    ),
+                t_s = (stamp_ns - scenario.t0_ns) / NS_PER_S
+                writer.add(betterosi.GroundTruth(
+                    **head, lane=ground.lanes, lane_boundary=ground.boundaries, road_marking=ground.markings,
+                    traffic_light=traffic_lights(betterosi, scenario, ground.next_id, t_s),
                     timestamp=betterosi.Timestamp(seconds=stamp_ns // NS_PER_S, nanos=stamp_ns % NS_PER_S),
-                    moving_object=[_moving(betterosi, n, a, m, k) for n, a, m in alive if not _stationary(a)],
-                    stationary_object=[_still(betterosi, n, a, m, k) for n, a, m in alive if _stationary(a)],
-                )
-                writer.add(truth)
+                    moving_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if not _stationary(a)],
+                    stationary_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if _stationary(a)],
+                ))  # fmt: skip
 
 
 def _stationary(agent: Agent) -> bool:
     return agent.static and agent.category == "other"
-
-
-def _trace_name(osi: Any, scenario: Scenario, frames: int) -> str:
-    """Return the file name that the standard prescribes, with the scenario's start time."""
-    start = datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
-    versions = osi.prepare_channel_metadata()
-    keys = (osi.OSI_CHANNEL_OSI_VERSION_KEY, osi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
-    standard, protobuf = (versions[key].replace(".", "") for key in keys)
-    return f"{start}_gt_{standard}_{protobuf}_{frames}_{file_name(scenario.name)}.osi"
 
 
 def _place(osi: Any, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any]:
@@ -246,36 +225,27 @@ def _identity(osi: Any, number: int, agent: Agent) -> dict[str, Any]:
     return identity
 
 
-def _moving(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
+def _object(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
+    """Return an agent as a moving object or, where it is stationary, as a stationary one."""
+    named, placed = _identity(osi, number, agent), _place(osi, agent, move, k)
+    if _stationary(agent):
+        kind = osi.StationaryObject.Classification
+        still = osi.BaseStationary(**placed)
+        return osi.StationaryObject(base=still, classification=kind(type=kind.Type.OTHER), **named)
     rates = {"velocity": move.velocity_mps[k], "acceleration": move.acceleration_mps2[k]}
-    vectors = {name: _vector(osi, (*rate, 0.0)) for name, rate in rates.items()}
-    base = osi.BaseMoving(**_place(osi, agent, move, k), **vectors)
-    return osi.MovingObject(base=base, **_identity(osi, number, agent), **_kind(osi, agent))
-
-
-def _kind(osi: Any, agent: Agent) -> dict[str, Any]:
+    base = osi.BaseMoving(**placed, **{name: _vector(osi, (*rate, 0.0)) for name, rate in rates.items()})
     moving = osi.MovingObject
     if agent.category not in VEHICLE_TYPE:
-        return {"type": moving.Type.PEDESTRIAN if agent.category == "pedestrian" else moving.Type.OTHER}
+        other = moving.Type.PEDESTRIAN if agent.category == "pedestrian" else moving.Type.OTHER
+        return moving(base=base, **named, type=other)
     kind = moving.VehicleClassification
-    axle_z = (AXLE_OF_HEIGHT - 0.5) * agent.size_m[2]
-    to_rear = _vector(osi, (-agent.rear_axle_offset_m, 0.0, axle_z))
-    return {
-        "type": moving.Type.VEHICLE,
-        "vehicle_attributes": moving.VehicleAttributes(bbcenter_to_rear=to_rear),
-        "vehicle_classification": kind(
-            type=kind.Type[VEHICLE_TYPE[agent.category]], role=kind.Role.CIVIL, has_trailer=False
-        ),
-    }
-
-
-def _still(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
-    kind = osi.StationaryObject.Classification
-    return osi.StationaryObject(
-        base=osi.BaseStationary(**_place(osi, agent, move, k)),
-        classification=kind(type=kind.Type.OTHER),
-        **_identity(osi, number, agent),
-    )
+    to_rear = _vector(osi, (-agent.rear_axle_offset_m, 0.0, (AXLE_OF_HEIGHT - 0.5) * agent.size_m[2]))
+    type_ = kind.Type[VEHICLE_TYPE[agent.category]]
+    return moving(
+        base=base, **named, type=moving.Type.VEHICLE,
+        vehicle_attributes=moving.VehicleAttributes(bbcenter_to_rear=to_rear),
+        vehicle_classification=kind(type=type_, role=kind.Role.CIVIL, has_trailer=False),
+    )  # fmt: skip
 
 
 EXPORTER = Osi()

@@ -13,17 +13,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Log, Scenario, explain_doubt
 from log2sim.errors import MissingExtra
+from log2sim.export import viewers
 from log2sim.export.exporters import Options, SampledMotion, file_name, near_origin
-from log2sim.export.viewers import (
-    AgentSteps,
-    CameraFrame,
-    ThinnedSweep,
-    UnreadableRecord,
-    ViewerRecord,
-    agent_steps,
-    rgb_of,
-    viewer_records,
-)
 from log2sim.geometry import Array
 
 TIMELINE = "time"
@@ -86,22 +77,25 @@ def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
     doubtful = {a.id: explain_doubt(a) for a in scenario.doubtful}
     yield (), None, rerun.ViewCoordinates.columns(xyz=[rerun.ViewCoordinates.RIGHT_HAND_Z_UP])
     yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps({**about, "doubtful": doubtful}, indent=1)])
-    steps = agent_steps(scenario)
+    steps = viewers.agent_steps(scenario)
     for agent, move in steps.moves:
         yield from _agent(agent, move, steps, origin)
     known: set[str] = set()
-    for record in viewer_records(scenario, log) if log is not None else ():
-        if isinstance(record, CameraFrame) and record.camera.name not in known:
-            known.add(record.camera.name)
-            yield _pinhole(record)
+    for record in viewers.viewer_records(scenario, log) if log is not None else ():
+        if isinstance(record, viewers.CameraFrame) and record.camera.name not in known:
+            camera = record.camera
+            known.add(camera.name)
+            size = [[camera.width_px, camera.height_px]]
+            lens = rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size)
+            yield ("cameras", camera.name), None, lens
         yield from _shown(record, origin)
 
 
-def _agent(agent: Agent, move: SampledMotion, steps: AgentSteps, origin: Array) -> Iterator[Part]:
+def _agent(agent: Agent, move: SampledMotion, steps: viewers.AgentSteps, origin: Array) -> Iterator[Part]:
     """Box and speed at every step of an agent's life, and its path."""
     import rerun
 
-    w, rgb, alive = agent.waypoints, [rgb_of(agent)], np.flatnonzero(move.valid)
+    w, rgb, alive = agent.waypoints, [viewers.rgb_of(agent)], np.flatnonzero(move.valid)
     t_ns, yaw = steps.t_ns[alive], move.yaw_rad[alive]
     nothing = np.zeros_like(yaw)
     boxes = rerun.Boxes3D.columns(
@@ -121,32 +115,20 @@ def _agent(agent: Agent, move: SampledMotion, steps: AgentSteps, origin: Array) 
     yield ("paths", agent.id), None, line
 
 
-def _shown(record: ViewerRecord, origin: Array) -> Iterator[Part]:
+def _shown(record: viewers.ViewerRecord, origin: Array) -> Iterator[Part]:
     import rerun
 
     t_ns = np.array([record.t_ns])
-    if isinstance(record, UnreadableRecord):
+    if isinstance(record, viewers.UnreadableRecord):
         yield ("log", record.stream), t_ns, rerun.TextLog.columns(text=[record.reason], level=["WARN"])
-    elif isinstance(record, ThinnedSweep):
+    elif isinstance(record, viewers.ThinnedSweep):
         points = rerun.Points3D.columns(positions=record.points_map - origin)
         yield ("lidar", record.lidar), t_ns, points.partition([len(record.points_map)])
     else:
         yield from _picture(record, t_ns, origin)
 
 
-def _pinhole(record: CameraFrame) -> Part:
-    import rerun
-
-    camera = record.camera
-    size = [[camera.width_px, camera.height_px]]
-    return (
-        ("cameras", camera.name),
-        None,
-        rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size),
-    )
-
-
-def _picture(record: CameraFrame, t_ns: NDArray[np.int64], origin: Array) -> Iterator[Part]:
+def _picture(record: viewers.CameraFrame, t_ns: NDArray[np.int64], origin: Array) -> Iterator[Part]:
     import rerun
 
     place = ("cameras", record.camera.name)
@@ -160,7 +142,7 @@ def _picture(record: CameraFrame, t_ns: NDArray[np.int64], origin: Array) -> Ite
         return
     strips = rerun.LineStrips2D.columns(
         strips=lines,
-        colors=[rgb_of(agent) for agent, outline in record.outlines for _ in outline],
+        colors=[viewers.rgb_of(agent) for agent, outline in record.outlines for _ in outline],
         labels=[agent.id if k == 0 else "" for agent, outline in record.outlines for k in range(len(outline))],
         radii=[rerun.Radius.ui_points(OUTLINE_PX)] * len(lines),
     )

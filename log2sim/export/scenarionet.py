@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import GROUP_OF, VERSION, Agent, MapFeatures, MapLane, Marking, Scenario
+from log2sim.datatypes import GROUP_OF, VERSION, Agent, MapFeatures, MapLane, Scenario
 from log2sim.errors import ScenarioError
 from log2sim.export.exporters import Options, SampledMotion, file_name, near_origin, sample_steps, step_times
 from log2sim.export.roads.opendrive import lanes, signal_lanes
@@ -34,8 +34,11 @@ def map_features(scenario: Scenario, origin_m: Array) -> dict[str, Any]:
     found = {lane.id: _lane(lane, origin_m) for lane in lanes(scenario)}
     features = scenario.map_features or MapFeatures()
     for marking in features.markings:
-        entry = _marking(marking, origin_m)
-        found |= {} if entry is None else {marking.id: entry}
+        points = marking.points_m - origin_m
+        if marking.kind == "crosswalk":
+            found[marking.id] = {"type": "CROSSWALK", "polygon": points}
+        elif marking.is_lane_line:
+            found[marking.id] = {"type": LINE_TYPE[marking.kind, marking.color or "white"], "polyline": points}
     for border in features.borders:
         found[border.id] = {"type": "ROAD_EDGE_BOUNDARY", "polyline": border.points_m - origin_m, "kind": border.kind}
     return found
@@ -47,25 +50,11 @@ def _lane(lane: MapLane, origin_m: Array) -> dict[str, Any]:
     width = np.interp(line.s_m / line.length_m * own[-1], own, lane.width_m)
     beside = {"left_neighbor": lane.left_lane, "right_neighbor": lane.right_lane}
     return {
-        "type": "LANE_SURFACE_STREET",
-        "polyline": line.points_m - origin_m,
-        "width": np.column_stack([width / 2, width / 2]),
-        "entry_lanes": list(lane.predecessors),
-        "exit_lanes": list(lane.successors),
-        **{key: [] if name is None else [name] for key, name in beside.items()},
-        "inferred_from": lane.inferred_from,
-        "confidence": lane.confidence,
-        "junction": lane.junction,
-    }
-
-
-def _marking(marking: Marking, origin_m: Array) -> dict[str, Any] | None:
-    points = marking.points_m - origin_m
-    if marking.kind == "crosswalk":
-        return {"type": "CROSSWALK", "polygon": points}
-    if marking.is_lane_line:
-        return {"type": LINE_TYPE[marking.kind, marking.color or "white"], "polyline": points}
-    return None
+        "type": "LANE_SURFACE_STREET", "polyline": line.points_m - origin_m,
+        "width": np.column_stack([width / 2, width / 2]), "entry_lanes": list(lane.predecessors),
+        "exit_lanes": list(lane.successors), **{key: [] if name is None else [name] for key, name in beside.items()},
+        "inferred_from": lane.inferred_from, "confidence": lane.confidence, "junction": lane.junction,
+    }  # fmt: skip
 
 
 # States of traffic lights, as Waymo names them.
@@ -139,83 +128,48 @@ def scenario_description(scenario: Scenario) -> Value:
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = map_features(scenario, origin)
     lights = dynamic_map_states(scenario, t_s, origin)
+    objects = {k: _object_summary(k, track) for k, track in tracks.items()}
     metadata = {
-        **_metadata(scenario, t_s),
-        "sdc_id": ego.id,
-        "position_offset_m": origin.tolist(),
-        "left_out": left_out,
-        "object_summary": {k: _object_summary(k, track) for k, track in tracks.items()},
-    }
-    objects = metadata["object_summary"]
+        "id": scenario.name, "scenario_id": scenario.name, "dataset": DATASET,
+        "history_metadata": dict(scenario.provenance), "metadrive_processed": False, "coordinate": "metadrive",
+        "ts": t_s - t_s[0], "sample_rate": STEP_S, "t0_ns": scenario.t0_ns + round(t_s[0] * NS_PER_S),
+        "timestamps_ns": scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64),
+        "map": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(scenario.map).items()},
+        "sdc_id": ego.id, "position_offset_m": origin.tolist(), "left_out": left_out, "object_summary": objects,
+    }  # fmt: skip
     lines = [feature["polyline" if "polyline" in feature else "polygon"] for feature in features.values()]
     moving = [o["type"] for o in objects.values() if o["moving_distance"] > MOVED_M]
     kinds = [o["type"] for o in objects.values()]
     states = Counter(state for light in lights.values() for state in light["state"]["object_state"])
     metadata["number_summary"] = {
-        "num_objects": len(objects),
-        "object_types": sorted(set(kinds)),
-        "num_objects_each_type": dict(Counter(kinds)),
-        "num_moving_objects": len(moving),
-        "num_moving_objects_each_type": dict(Counter(moving)),
-        "num_traffic_lights": len(lights),
-        "num_traffic_light_types": sorted(states),
-        "num_traffic_light_each_step": dict(states),
-        "num_map_features": len(features),
+        "num_objects": len(objects), "object_types": sorted(set(kinds)), "num_objects_each_type": dict(Counter(kinds)),
+        "num_moving_objects": len(moving), "num_moving_objects_each_type": dict(Counter(moving)),
+        "num_traffic_lights": len(lights), "num_traffic_light_types": sorted(states),
+        "num_traffic_light_each_step": dict(states), "num_map_features": len(features),
         "map_height_diff": float(np.ptp(np.concatenate(lines)[:, 2])),
-    }
+    }  # fmt: skip
     return {
-        "id": scenario.name,
-        "version": f"{DATASET}_{VERSION}",
-        "length": len(t_s),
-        "tracks": tracks,
-        "dynamic_map_states": lights,
-        "map_features": features,
-        "metadata": metadata,
-    }
-
-
-def _metadata(scenario: Scenario, t_s: Array) -> Value:
-    """Describe place, time and origin of a description with steps at times (T,)."""
-    return {
-        "id": scenario.name,
-        "scenario_id": scenario.name,
-        "dataset": DATASET,
-        "history_metadata": dict(scenario.provenance),
-        "metadrive_processed": False,
-        "coordinate": "metadrive",
-        "ts": t_s - t_s[0],
-        "sample_rate": STEP_S,
-        "t0_ns": scenario.t0_ns + round(t_s[0] * NS_PER_S),
-        "timestamps_ns": scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64),
-        "map": {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(scenario.map).items()},
-    }
+        "id": scenario.name, "version": f"{DATASET}_{VERSION}", "length": len(t_s), "tracks": tracks,
+        "dynamic_map_states": lights, "map_features": features, "metadata": metadata,
+    }  # fmt: skip
 
 
 def _track(agent: Agent, move: SampledMotion, origin: Array) -> Value:
     kind = TYPE_OF_GROUP[GROUP_OF[agent.category]]
     sizes = {key: np.where(move.valid, size, 0.0) for key, size in zip(("length", "width", "height"), agent.size_m)}
+    position = np.where(move.valid[:, None], move.position_m - origin, 0.0)
     return {
         "type": kind,
         "state": {
-            "position": np.where(move.valid[:, None], move.position_m - origin, 0.0),
-            "heading": move.yaw_rad,
-            "velocity": move.velocity_mps,
-            "valid": move.valid,
-            **sizes,
+            "position": position, "heading": move.yaw_rad, "velocity": move.velocity_mps, "valid": move.valid, **sizes,
         },
         "metadata": {
-            "type": kind,
-            "object_id": agent.id,
-            "track_length": len(move.valid),
-            "dataset": DATASET,
-            "category": agent.category,
-            "static": agent.static,
-            "color": dict(agent.color) if agent.color is not None else None,
-            "confidence": agent.confidence,
-            "doubts": [doubt.to_dict() for doubt in agent.doubts],
-            "rear_axle_offset_m": agent.rear_axle_offset_m,
+            "type": kind, "object_id": agent.id, "track_length": len(move.valid), "dataset": DATASET,
+            "category": agent.category, "static": agent.static,
+            "color": dict(agent.color) if agent.color is not None else None, "confidence": agent.confidence,
+            "doubts": [doubt.to_dict() for doubt in agent.doubts], "rear_axle_offset_m": agent.rear_axle_offset_m,
         },
-    }
+    }  # fmt: skip
 
 
 def _object_summary(name: str, track: Value) -> Value:
@@ -223,13 +177,10 @@ def _object_summary(name: str, track: Value) -> Value:
     path = track["state"]["position"][valid, :2]
     after_first = valid[int(valid.argmax()) :]
     return {
-        "type": track["type"],
-        "object_id": name,
-        "track_length": len(valid),
-        "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
-        "valid_length": int(valid.sum()),
+        "type": track["type"], "object_id": name, "track_length": len(valid),
+        "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()), "valid_length": int(valid.sum()),
         "continuous_valid_length": int(after_first.argmin()) if not after_first.all() else len(after_first),
-    }
+    }  # fmt: skip
 
 
 def _without_arrays(value: Any) -> Any:

@@ -8,20 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim import geometry
 from log2sim.datatypes import Agent, Log, Scenario, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.export.exporters import SampledMotion, sample_steps, step_times
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    apply,
-    box_corners,
-    box_lines,
-    inverse,
-    rotation_from_rpy,
-    transform,
-)
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
 
@@ -51,10 +41,10 @@ class CameraFrame:
     """A camera image with the boxes of agents."""
 
     t_ns: int
-    camera: Camera  # of the size of the image
-    map_T_cam: Array | None  # (4, 4) or None
+    camera: geometry.Camera  # of the size of the image
+    map_T_cam: geometry.Array | None  # (4, 4) or None
     jpeg: bytes
-    outlines: tuple[tuple[Agent, Array], ...]  # lines of each box, px
+    outlines: tuple[tuple[Agent, geometry.Array], ...]  # lines of each box, px
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +53,7 @@ class ThinnedSweep:
 
     t_ns: int
     lidar: str
-    points_map: Array  # (N, 3)
+    points_map: geometry.Array  # (N, 3)
 
 
 @dataclass(frozen=True)
@@ -87,14 +77,14 @@ def agent_steps(scenario: Scenario) -> AgentSteps:
     """Sample every agent every `STEP_S`, from the first waypoint of any agent to the last."""
     ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
     t_s = step_times(min(first for first, _ in ends), max(last for _, last in ends), STEP_S, len(ends))
-    t_ns = scenario.t0_ns + np.round(t_s * NS_PER_S).astype(np.int64)
+    t_ns = scenario.t0_ns + np.round(t_s * geometry.NS_PER_S).astype(np.int64)
     return AgentSteps(t_ns, tuple((agent, sample_steps(agent, t_s, STEP_S)) for agent in scenario.agents))
 
 
-def ego_pose(agent: Agent, position_m: Array, yaw_rad: float) -> Array:
+def ego_pose(agent: Agent, position_m: geometry.Array, yaw_rad: float) -> geometry.Array:
     """Return the ego frame (4, 4) of a box: at the rear axle, on the ground."""
-    map_T_box = transform(rotation_from_rpy(0.0, 0.0, yaw_rad), position_m)
-    return map_T_box @ transform(np.eye(3), [-agent.rear_axle_offset_m, 0.0, -agent.size_m[2] / 2])
+    map_T_box = geometry.transform(geometry.rotation_from_rpy(0.0, 0.0, yaw_rad), position_m)
+    return map_T_box @ geometry.transform(np.eye(3), [-agent.rear_axle_offset_m, 0.0, -agent.size_m[2] / 2])
 
 
 def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
@@ -102,7 +92,7 @@ def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
 
     Raises `ConfigError` when the log has no record in that time.
     """
-    start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * geometry.NS_PER_S)
     index = [
         (t_ns, name, i)
         for name, stream in log.streams.items()
@@ -138,11 +128,13 @@ def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -
         poses, known = log.map_T_sensor(camera.name, t_ns)
         if not known[0]:
             return CameraFrame(t_ns, small, None, jpeg, ())
-        return CameraFrame(t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, inverse(poses[0]), t_ns)))
+        return CameraFrame(
+            t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, geometry.inverse(poses[0]), t_ns))
+        )
     return ThinnedSweep(t_ns, name, _points_map(log, name, record))
 
 
-def _downscaled(camera: Camera, scale: float) -> Camera:
+def _downscaled(camera: geometry.Camera, scale: float) -> geometry.Camera:
     """Return the camera of the same image in another size; the center of the first pixel is (0, 0) in both."""
     if scale == 1.0:
         return camera
@@ -154,19 +146,21 @@ def _downscaled(camera: Camera, scale: float) -> Camera:
     return replace(camera, width_px=width, height_px=height, K=K)
 
 
-def _outlines(scenario: Scenario, camera: Camera, cam_T_map: Array, t_ns: int) -> Iterator[tuple[Agent, Array]]:
+def _outlines(
+    scenario: Scenario, camera: geometry.Camera, cam_T_map: geometry.Array, t_ns: int
+) -> Iterator[tuple[Agent, geometry.Array]]:
     """Edges of the boxes that a camera sees; the ego is not drawn around its own cameras."""
-    t_s = (t_ns - scenario.t0_ns) / NS_PER_S
+    t_s = (t_ns - scenario.t0_ns) / geometry.NS_PER_S
     for agent in scenario.others if camera.mount == "ego" else scenario.agents:
         at = agent.at(t_s)
         if at.valid[0]:
-            corners = box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
-            lines = box_lines(camera, apply(cam_T_map, corners))
+            corners = geometry.box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
+            lines = geometry.box_lines(camera, geometry.apply(cam_T_map, corners))
             if len(lines):
                 yield agent, lines
 
 
-def _points_map(log: Log, name: str, sweep: Sweep) -> Array:
+def _points_map(log: Log, name: str, sweep: Sweep) -> geometry.Array:
     """Transform every n-th point of a sweep to the map frame (N, 3); none when the pose of the LiDAR is unknown."""
     kept = slice(None, None, max(1, -(-len(sweep.xyz_m) // MAX_SWEEP_POINTS)))
     t_ns = None if sweep.t_ns is None else sweep.t_ns[kept]

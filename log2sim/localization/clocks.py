@@ -292,7 +292,9 @@ class Findings:
         faults = unseen_faults(self.lidar, self.found, asked)
         if self.offset_s:
             values = {"offset_s": -self.offset_s, "offset_sigma_s": float(self.found.sigma[OFFSET])}
-            values["pose_error_m"] = pose_error_m
+            velocity, known = velocities_at(self.seen.track, self.seen.t_ns)
+            fastest = float(np.linalg.norm(velocity[known, :3], axis=1).max(initial=0))
+            values |= {"pose_error_m": pose_error_m, "moved_m": abs(self.offset_s) * fastest}
             faults.append(Finding("time_offset", self.lidar, "corrected" if asked.fix_time else "kept", values=values))
         treatment: Treatment = "corrected" if asked.fix_mounts else "kept"
         off, sigma = -self.found.values, self.found.sigma

@@ -113,15 +113,12 @@ def prediction_document(
 ) -> dict[str, Any]:
     """Return the document of `schemas/prediction-1.json`; the predicted positions only where asked for."""
     document = {
-        "prediction_version": VERSION,
-        "scenario": scenario.name,
-        "scenario_sha256": scenario.digest,
-        "tick_s": predictions.table.tick_s,
-        "lead_s": [round(float(lead), _DIGITS) for lead in predictions.lead_s],
+        "prediction_version": VERSION, "scenario": scenario.name, "scenario_sha256": scenario.digest,
+        "tick_s": predictions.table.tick_s, "lead_s": [round(float(lead), _DIGITS) for lead in predictions.lead_s],
         "methods": {name: METHODS[name] for name in predictions.forecasts},
         "agents": [_constants(predictions, k) for k in range(len(predictions.table.agents))],
         "figures": measure_predictions(predictions),
-    }
+    }  # fmt: skip
     if not with_positions:
         return document
     return {**document, "predictions": [_positions(predictions, a.id) for a in predictions.table.agents]}
@@ -157,12 +154,9 @@ def _constants(predictions: Predictions, k: int) -> dict[str, Any]:
     chosen = predictions.constants_s[rows[-1]] if len(rows) else np.full(2, np.inf)
     velocity_s, turn_s = (float(c) if np.isfinite(c) else None for c in chosen)
     return {
-        "id": agent.id,
-        "category": agent.category,
-        "ticks": len(rows),
-        "velocity_constant_s": velocity_s,
+        "id": agent.id, "category": agent.category, "ticks": len(rows), "velocity_constant_s": velocity_s,
         "turn_constant_s": turn_s,
-    }
+    }  # fmt: skip
 
 
 def _positions(predictions: Predictions, agent: str) -> dict[str, Any]:

@@ -8,16 +8,6 @@ from log2sim.scenarios.query import ask
 from log2sim.scenarios.tagging import criticality_table, find_tags, tag, write_criticality
 
 __all__ = [
-    "Base",
-    "Logical",
-    "ask",
-    "choose_base",
-    "concrete",
-    "criticality_table",
-    "find_tags",
-    "fit",
-    "open_index",
-    "tag",
-    "write_criticality",
-    "write_openscenario",
-]
+    "Base", "Logical", "ask", "choose_base", "concrete", "criticality_table", "find_tags", "fit", "open_index", "tag",
+    "write_criticality", "write_openscenario",
+]  # fmt: skip

@@ -43,18 +43,12 @@ class Timing(NamedTuple):
 
 
 TIMING: Mapping[str, Timing | None] = {
-    "cut_in": Timing("gap_m", -1.0, "other"),
-    "cut_out": Timing("gap_m", -1.0, "other"),
-    "merging": Timing("gap_m", -1.0, "other"),
-    "following": Timing("gap_m", 1.0, "agent"),
-    "approaching": Timing("gap_m", 1.0, "agent"),
-    "crossing_path": Timing("pet_s", -1.0),
-    "stepping_out": Timing("ttc_s", -1.0),
-    "overtaking": None,
-    "lane_change": None,
-    "hard_braking": None,
+    "cut_in": Timing("gap_m", -1.0, "other"), "cut_out": Timing("gap_m", -1.0, "other"),
+    "merging": Timing("gap_m", -1.0, "other"), "following": Timing("gap_m", 1.0, "agent"),
+    "approaching": Timing("gap_m", 1.0, "agent"), "crossing_path": Timing("pet_s", -1.0),
+    "stepping_out": Timing("ttc_s", -1.0), "overtaking": None, "lane_change": None, "hard_braking": None,
     "turning": None,
-}
+}  # fmt: skip
 """Tags that can be varied, and what besides the speeds of both agents is."""
 
 

@@ -11,27 +11,7 @@ from log2sim.simulation.runner import external_simulator, open_world, replay
 from log2sim.simulation.warnings import BrakeWhenWarned, warn
 
 __all__ = [
-    "AgentReplay",
-    "BrakeWhenWarned",
-    "Commands",
-    "Controls",
-    "EgoState",
-    "Observation",
-    "Others",
-    "PathAhead",
-    "Policy",
-    "Replay",
-    "Route",
-    "WarningSettings",
-    "World",
-    "check_limits",
-    "check_strict",
-    "external_simulator",
-    "load_policy",
-    "open_world",
-    "parse_limits",
-    "replay",
-    "require_strict",
-    "to_scenario",
-    "warn",
-]
+    "AgentReplay", "BrakeWhenWarned", "Commands", "Controls", "EgoState", "Observation", "Others", "PathAhead",
+    "Policy", "Replay", "Route", "WarningSettings", "World", "check_limits", "check_strict", "external_simulator",
+    "load_policy", "open_world", "parse_limits", "replay", "require_strict", "to_scenario", "warn",
+]  # fmt: skip

@@ -164,25 +164,14 @@ def _distance_table(table: Array) -> Array:
     if len(whole) > 1:
         dx, dy = np.gradient(x), np.gradient(y)
         length = np.hypot(dx, dy)
-        cos, sin = (
-            np.divide(dx, length, out=np.ones_like(dx), where=length > 0),
-            np.divide(dy, length, out=np.zeros_like(dy), where=length > 0),
-        )
+        cos = np.divide(dx, length, out=np.ones_like(dx), where=length > 0)
+        sin = np.divide(dy, length, out=np.zeros_like(dy), where=length > 0)
     else:
         heading = yaw[0] if speed.sum() >= 0 else yaw[0] + np.pi
         cos, sin = np.array([np.cos(heading)]), np.array([np.sin(heading)])
     on = np.arange(1, int(EXTENSION_M / SPACING_M) + 1) * SPACING_M
-    beyond = np.stack(
-        [
-            x[-1] + on * cos[-1],
-            y[-1] + on * sin[-1],
-            np.full(len(on), cos[-1]),
-            np.full(len(on), sin[-1]),
-            np.full(len(on), np.nan),
-        ],
-        axis=1,
-    )
-    return np.concatenate([np.stack([x, y, cos, sin, t], axis=1), beyond])
+    ends = x[-1] + on * cos[-1], y[-1] + on * sin[-1], *(np.full(len(on), v) for v in (cos[-1], sin[-1], np.nan))
+    return np.concatenate([np.stack([x, y, cos, sin, t], axis=1), np.stack(ends, axis=1)])
 
 
 def _row_ranges(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -266,10 +255,8 @@ def leaders(
     row = np.arange(len(first))
     ahead_s, speed = HORIZON_S[first], (boxes.speed_mps * turn_cos)[row, first]
     now = gap[row, first] - np.maximum(speed, 0.0) * ahead_s
-    own_t_s = foot.t_s[row, first]
-    return Leaders(
-        np.where(stays | met.any(axis=1), now, np.inf), speed, ahead_s, np.where(np.isnan(own_t_s), np.inf, own_t_s)
-    )
+    gap_m, own_t_s = np.where(stays | met.any(axis=1), now, np.inf), foot.t_s[row, first]
+    return Leaders(gap_m, speed, ahead_s, np.where(np.isnan(own_t_s), np.inf, own_t_s))
 
 
 def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_width: Array, within: Array) -> Array:
@@ -286,10 +273,8 @@ def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_
     long_side = (forward == upward) == (corner_y < 0)
     across = np.where(long_side, np.abs(sin), np.abs(cos))
     ahead = np.where(long_side, np.abs(cos), np.abs(sin))
-    result: Array = corner_x + beside * np.divide(
-        ahead, across, out=np.zeros_like(across), where=(across > 0) & (beside > 0)
-    )
-    return result
+    slope = np.divide(ahead, across, out=np.zeros_like(across), where=(across > 0) & (beside > 0))
+    return np.asarray(corner_x + beside * slope)
 
 
 # A driven agent this near to its path in the scenario, and pointing along it, is expected to stay on it.

@@ -79,10 +79,9 @@ def roll_out(
     if model not in MODELS:
         raise ConfigError(f"model '{model}'{nearest(model, list(MODELS))}: expected one of {', '.join(MODELS)}")
     log, now = recorded(scenario, now_s, horizon_s)
+    past_place, past_yaw = np.repeat(log.position_m, count, axis=0), np.repeat(log.yaw_rad, count, axis=0)
     if model == "log":
-        return replace(
-            log, position_m=np.repeat(log.position_m, count, axis=0), yaw_rad=np.repeat(log.yaw_rad, count, axis=0)
-        )
+        return replace(log, position_m=past_place, yaw_rad=past_yaw)
     ticks = round(horizon_s / TICK_S)
     if model == "constant-velocity":
         present = observe(scenario, now_s)
@@ -95,10 +94,8 @@ def roll_out(
         place, yaw = crowd.run(ticks)
         if model != "drivers":
             place, yaw = np.repeat(place, count, axis=0), np.repeat(yaw, count, axis=0)
-    past = [np.repeat(c[:, :, : now + 1], count, axis=0) for c in (log.position_m, log.yaw_rad)]
-    return replace(
-        log, position_m=np.concatenate([past[0], place], axis=2), yaw_rad=np.concatenate([past[1], yaw], axis=2)
-    )
+    place = np.concatenate([past_place[:, :, : now + 1], place], axis=2)
+    return replace(log, position_m=place, yaw_rad=np.concatenate([past_yaw[:, :, : now + 1], yaw], axis=2))
 
 
 class Crowd:
@@ -142,16 +139,12 @@ class Crowd:
         i, j = self._near_pairs(0.0)
         overlap = self._overlapping(self.place, self.yaw, i, j)[1][0]
         self.touching = set(zip(i[overlap].tolist(), j[overlap].tolist()))  # which is the log's doing
-        if noisy:
-            self._fit_time_gaps()
-
-    def _fit_time_gaps(self) -> None:
-        """Give who follows another the time gap that it keeps now, in all rollouts up to a spread."""
-        _, leads, gap = self._demand(self._reach())
-        own_s = (gap - self.driver.gap_m) / np.maximum(self.speed, 2.0)
-        follows = (self.speed > 2.0) & (np.abs(leads - self.speed) < 0.3 * self.speed) & (own_s < 3.0)
-        fitted = np.clip(own_s, 0.4, 3.0) * self._spread(1.15, own_s.shape)
-        self.driver.time_gap_s[follows] = fitted[follows]
+        if noisy:  # who follows another keeps the time gap that it has now, in all rollouts up to a spread
+            _, leads, gap = self._demand(self._reach())
+            own_s = (gap - self.driver.gap_m) / np.maximum(self.speed, 2.0)
+            follows = (self.speed > 2.0) & (np.abs(leads - self.speed) < 0.3 * self.speed) & (own_s < 3.0)
+            fitted = np.clip(own_s, 0.4, 3.0) * self._spread(1.15, own_s.shape)
+            self.driver.time_gap_s[follows] = fitted[follows]
 
     def _reach(self) -> Array:
         """Return how far drivers (R, M) look ahead, m."""
@@ -206,10 +199,8 @@ class Crowd:
             for me, him, mine, his, sign in ((c.one, c.two, 0, 1, 1.0), (c.two, c.one, 1, 0, -1.0)):
                 half = self.size_m[self.rows[[me, him]], 0] / 2
                 gap = c.enters[:, mine] - self.way[:, me] - half[0]
-                his_gap, his_end = (
-                    c.enters[:, his] - self.way[:, him] - half[1],
-                    c.leaves[:, his] - self.way[:, him] + half[1],
-                )
+                his_gap = c.enters[:, his] - self.way[:, him] - half[1]
+                his_end = c.leaves[:, his] - self.way[:, him] + half[1]
                 pace, his_pace = np.maximum(self.speed[:, me], 1.0), np.maximum(self.speed[:, him], 0.3)
                 arrive, his_arrive, his_leave = gap / pace, np.maximum(his_gap, 0.0) / his_pace, his_end / his_pace
                 ahead = (his_gap <= 0) | (his_arrive < arrive - sign * c.patience_s)
@@ -218,10 +209,8 @@ class Crowd:
                 lead = np.where(c.merges, self.speed[:, him], 0.0)
                 room = np.where(c.merges, gap - np.maximum(his_gap, 0.0) - 2 * half[1] + d.gap_m[:, me], gap)
                 room = np.where(c.merges & (his_gap > gap), gap, room)
-                one = d.take(me)
-                taken[:, me] = np.maximum(
-                    taken[:, me], np.where(met, leader_demand(one, np.maximum(room, 0.3), self.speed[:, me], lead), 0.0)
-                )
+                demand = leader_demand(d.take(me), np.maximum(room, 0.3), self.speed[:, me], lead)
+                taken[:, me] = np.maximum(taken[:, me], np.where(met, demand, 0.0))
         wanted = np.maximum(free - d.accel_mps2 * taken, -d.brake_mps2)
         return np.where(self.waits, -d.brake_mps2, wanted)
 
@@ -249,15 +238,12 @@ class Crowd:
         cos, sin = np.abs(turn.real), np.abs(turn.imag)
         long = half_j[:, 0, None] * cos + half_j[:, 1, None] * sin
         wide = half_j[:, 0, None] * sin + half_j[:, 1, None] * cos
-        met = (np.abs(away.imag) < wide + half_i[:, 1, None] + SIDE_M) & (
-            np.abs(away.real) < long + reach[:, i, None] / LOOKAHEAD / 2
-        )
+        met = np.abs(away.imag) < wide + half_i[:, 1, None] + SIDE_M
+        met &= np.abs(away.real) < long + reach[:, i, None] / LOOKAHEAD / 2
         met &= ahead[:, i] + away.real > 0
         first = met.argmax(axis=2)[..., None]
-        gap, speed = (
-            np.take_along_axis(c, first, axis=2)[..., 0]
-            for c in (ahead[:, i] + away.real - long, (velocity[:, j, None] * direction[:, i].conj()).real)
-        )
+        columns = ahead[:, i] + away.real - long, (velocity[:, j, None] * direction[:, i].conj()).real
+        gap, speed = (np.take_along_axis(c, first, axis=2)[..., 0] for c in columns)
         gap = np.where(met.any(axis=2), gap - half_i[:, 0], np.inf)
         walkers = (self.group[i] == "pedestrian") & (self.now.group[j] == "pedestrian")
         gap = np.where(walkers & (speed < 0), np.inf, gap)
@@ -306,14 +292,9 @@ class Crowd:
         after = np.maximum(speed + np.clip(accel, -self.driver.brake_mps2, 4.0) * TICK_S, 0.0)
         way = self.way + (speed + after) / 2 * TICK_S
         u = np.clip((n + 1 - self.change[0]) * TICK_S / CHANGE_S, 0.0, 1.0)
-        shift = np.where(
-            np.isnan(u),
-            self.shift,
-            self.change[1] + (self.change[2] - self.change[1]) * u**3 * (10 - 15 * u + 6 * u**2),
-        )
-        lateral = (shift - self.shift) / TICK_S
-        before = self.shift
-        self.shift = shift
+        changed = self.change[1] + (self.change[2] - self.change[1]) * u**3 * (10 - 15 * u + 6 * u**2)
+        before, self.shift = self.shift, np.where(np.isnan(u), self.shift, changed)
+        lateral = (self.shift - before) / TICK_S
         at, direction = self.paths.at(way, self.shift)
         yaw = np.angle(direction) + self.offset + np.arctan2(lateral, np.maximum(after, 1.0))
         # A way of millimeters has no direction of its own.
@@ -340,16 +321,11 @@ class Crowd:
         for (m, side), (aside, missing) in self.paths.beside.items():
             k = self.rows[m]
             # Only lanes beside the first one are known, so who has changed may only change back.
-            free = (
-                ~((n - self.change[0, :, m]) * TICK_S < 2 * CHANGE_S)
-                & (self.speed[:, m] > 4.0)
-                & (self.shift[:, m] * side < 1.0)
-            )
+            free = ~((n - self.change[0, :, m]) * TICK_S < 2 * CHANGE_S)
+            free &= (self.speed[:, m] > 4.0) & (self.shift[:, m] * side < 1.0)
             free &= self.rng.random(self.count) < CHANGES_PER_S
-            here, later = (
-                np.clip(((self.way[:, m] + s * self.speed[:, m]) / self.paths.step_m[m]).astype(np.intp), 0, POINTS - 1)
-                for s in (0.0, 2 * CHANGE_S)
-            )
+            ways = (self.way[:, m] + s * self.speed[:, m] for s in (0.0, 2 * CHANGE_S))
+            here, later = (np.clip((w / self.paths.step_m[m]).astype(np.intp), 0, POINTS - 1) for w in ways)
             rollout = np.arange(self.count)
             free &= missing[rollout, later] == missing[rollout, here]
             away = (self.place - self.place[:, k, None]) * np.exp(-1j * self.yaw[:, k, None])
@@ -359,13 +335,10 @@ class Crowd:
             along = (velocity * np.exp(-1j * self.yaw[:, k, None])).real
             near_s = SAFE_S * along + 2.0 * np.maximum(along - self.speed[:, m, None], 0.0)
             safe = ~(there & (away.real <= 0) & (room < 2.0 + near_s)).any(axis=1)
-            one = self.driver.take(slice(m, m + 1))
-            demand = leader_demand(
-                one, np.where(there & (away.real > 0), room, np.inf), self.speed[:, m, None], along
-            ).max(axis=1)
+            one, gap = self.driver.take(slice(m, m + 1)), np.where(there & (away.real > 0), room, np.inf)
+            demand = leader_demand(one, gap, self.speed[:, m, None], along).max(axis=1)
             gain = self.driver.accel_mps2[:, m] * (np.minimum(taken[:, m], 4.0) - np.minimum(demand, 4.0))
             begins = free & safe & (gain > GAIN_MPS2)
             target = np.where(np.abs(self.shift[:, m]) < 1.0, side * aside, 0.0)
-            self.change[:, begins, m] = np.stack(
-                [np.full(begins.sum(), float(n)), self.shift[begins, m], target[begins]]
-            )
+            self.change[0, begins, m] = n
+            self.change[1:, begins, m] = self.shift[begins, m], target[begins]

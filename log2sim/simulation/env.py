@@ -137,9 +137,8 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
             size = np.stack([o.length_m, o.width_m], axis=1)
             yaw = np.full(len(o), ego.yaw_rad)
             level = np.abs(o.z_m - ego.z_m) < (o.height_m + ego.height_m) / 2
-            collides = bool(
-                (level & rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)).any()
-            )
+            overlap = rectangles_overlap(o.x_m - ego.x_m, o.y_m - ego.y_m, yaw, o.yaw_rad, own, size)
+            collides = bool((level & overlap).any())
             if collides or over:
                 break
         observation = self._observation
@@ -162,10 +161,8 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         """Convert the observation to arrays within the bounds of their spaces."""
         observation, ego = self._observation, self._observation.ego
         ahead = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M
-        path = (
-            *_in_ego_frame(ego, observation.path.x_m[ahead], observation.path.y_m[ahead]),
-            observation.path.speed_mps[ahead],
-        )
+        way = observation.path
+        path = (*_in_ego_frame(ego, way.x_m[ahead], way.y_m[ahead]), way.speed_mps[ahead])
         o, count = observation.others, self._rows
         velocity = _in_ego_axes(ego, o.velocity_x_mps, o.velocity_y_mps)
         columns = (

@@ -25,13 +25,9 @@ from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
 CHOICES = (*ENDS, "both")
 
 _RANGES = {
-    "horizon_s": (0.5, 10.0),
-    "margin_s": (0.0, 10.0),
-    "early_probability": (0.01, 1.0),
-    "min_probability": (0.01, 1.0),
-    "reaction_s": (0.0, 10.0),
-    "brake_mps2": (0.5, 20.0),
-}
+    "horizon_s": (0.5, 10.0), "margin_s": (0.0, 10.0), "early_probability": (0.01, 1.0), "min_probability": (0.01, 1.0),
+    "reaction_s": (0.0, 10.0), "brake_mps2": (0.5, 20.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -121,7 +117,14 @@ def known_agents(
     confirmed_s = (TENTATIVE_HITS - 1) * interval_s
     for k, agent in enumerate(agents):
         kept_s = np.inf if agent.static else max(CONFIRMED_AGE_S, 1.5 * interval_s)
-        for number, runs in enumerate(_pieces(spans[k], kept_s)):
+        # Spans in order of time whose gaps a tracker bridges are one piece.
+        pieces: list[list[Span]] = []
+        for span in sorted(spans[k]):
+            if pieces and span[0] - max(last for _, last in pieces[-1]) <= kept_s:
+                pieces[-1].append(span)
+            else:
+                pieces.append([span])
+        for number, runs in enumerate(pieces):
             start, end = runs[0][0], runs[-1][1]
             seen = np.zeros(len(t_s), dtype=bool)
             for first, last in runs:
@@ -138,17 +141,6 @@ def known_agents(
             there = (t_s >= start + confirmed_s - _MARGIN_S) & (latest >= 0) & (t_s <= end + kept_s + _MARGIN_S)
             source[k, there] = latest[there]
     return Known(since, source, observed, count, piece)
-
-
-def _pieces(spans: Sequence[Span], kept_s: float) -> list[list[Span]]:
-    """Join spans in order of time whose gaps a tracker bridges."""
-    pieces: list[list[Span]] = []
-    for span in sorted(spans):
-        if pieces and span[0] - max(last for _, last in pieces[-1]) <= kept_s:
-            pieces[-1].append(span)
-        else:
-            pieces.append([span])
-    return pieces
 
 
 def observed_spans(agent: Agent, ends: Sequence[str]) -> tuple[Span, ...]:
@@ -199,9 +191,7 @@ class ExpectedPaths:
 
     def take(self, index: NDArray[np.generic]) -> ExpectedPaths:
         """Return some of the boxes."""
-        return ExpectedPaths(
-            *(c[index] for c in (self.position_m, self.yaw_rad, self.course, self.sigma_m, self.size_m))
-        )
+        return ExpectedPaths(*(column[index] for column in vars(self).values()))
 
 
 class ExpectedAgents:
@@ -276,18 +266,15 @@ class ExpectedAgents:
 def _observed_table(table: MotionTable, known: Known, rows: Index) -> MotionTable:
     """Return some rows of a table with the states at ticks of observation alone; who was lost begins anew."""
     there = known.observed[rows] & table.present[rows]
-    blank = np.where(there, 1.0, np.nan)
+    blank, jumps = np.where(there, 1.0, np.nan), table.piece[rows]
+    # Pieces that differ where either piece number does.
+    pieces = known.piece[rows] * (int(jumps.max(initial=0)) + 1) + np.maximum(jumps, 0)
     return MotionTable(
         tuple(table.agents[k] for k in rows.tolist()), table.t_s,
         blank[..., None] * table.center_m[rows], blank * table.yaw_rad[rows], blank * table.speed_mps[rows],
         table.tick_s, np.where(there, table.velocity_mps[rows], np.nan), blank * table.sigma_m[rows], there,
-        np.where(there, _numbered(table.piece[rows], known.piece[rows]), -1),
+        np.where(there, pieces, -1),
     )  # fmt: skip
-
-
-def _numbered(jumps: Index, pieces: Index) -> Index:
-    """Return numbers (A, T) that differ where either piece number does."""
-    return np.asarray(pieces * (int(jumps.max(initial=0)) + 1) + np.maximum(jumps, 0))
 
 
 def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:
@@ -381,17 +368,11 @@ REACH_SIGMA = 2.0
 MIN_TRAVEL_M = 1e-6  # an ego that moves by less between leads stands
 
 
-class Contacts(NamedTuple):
-    """Expected contacts of C pairs of ways."""
-
-    probability: Array  # (C,) that they meet within the horizon
-    # (C,) until they do: as expected without error; where that does not meet, the median of the times of errors that
-    # do. Infinite where none does.
-    time_s: Array
-
-
-def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Contacts:
+def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> tuple[Array, Array]:
     """Compare C ways of the ego with one of another agent each, at leads (H,).
+
+    Returns the probabilities (C,) that they meet within the horizon, and the times (C,), s, until they do: as expected
+    without error; where that does not meet, the median of the times of errors that do. Infinite where none does.
 
     The errors of an agent at different leads are one: who is faster than expected is so throughout. They are normal along and
     across its course, with those of the ego added, and each takes `QUANTILES` values of equal probability; the probability is
@@ -416,7 +397,7 @@ def expected_contacts(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) 
         median = np.full(len(rows), np.inf)
         median[some] = np.nanmedian(np.where(met, times, np.nan)[some], axis=1)
         time[rows] = np.where(np.isfinite(middle), middle, median)
-    return Contacts(probability, time)
+    return probability, time
 
 
 def _contact_times(ego: ExpectedPaths, others: ExpectedPaths, lead_s: Array) -> Array:

@@ -205,10 +205,10 @@ class _LeastSquares:
 
 def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> ResidualTerm:
     """Build a term of each knot and the next, from its derivatives by the difference of one state and by means of others."""
-    halves = {k: slope / 2 for k, slope in per_mean.items()}
-    return ResidualTerm(
-        residual, {state: -per_rise, NEXT + state: per_rise, **halves, **{NEXT + k: s for k, s in halves.items()}}
-    )
+    slopes: Slopes = {state: -per_rise, NEXT + state: per_rise}
+    for step in (0, NEXT):
+        slopes |= {step + k: slope / 2 for k, slope in per_mean.items()}
+    return ResidualTerm(residual, slopes)
 
 
 def _cost(terms: list[ResidualTerm]) -> float:
@@ -251,7 +251,5 @@ def _solve(band: Array, gradient: Array, damping: float) -> NDArray[np.float64]:
     damped = band.copy()
     damped[:, :, 0] += damping * DAMPING_SCALE
     flat = damped.reshape(gradient.size, -1).T
-    result: NDArray[np.float64] = solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True).reshape(
-        gradient.shape
-    )
-    return result
+    solved = solveh_banded(flat, gradient.ravel(), lower=True, overwrite_ab=True)
+    return np.asarray(solved).reshape(gradient.shape)

@@ -12,16 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from log2sim.geometry import Array, cos_sin
-from log2sim.simulation.vehicles.vehicle import (
-    TINY,
-    Columns,
-    PointControls,
-    PointState,
-    VehicleControls,
-    VehicleParameters,
-    VehicleState,
-    rows,
-)
+from log2sim.simulation.vehicles import vehicle
 
 
 @dataclass(frozen=True)
@@ -59,7 +50,7 @@ def control_step(dt_s: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ControllerMemory(Columns):
+class ControllerMemory(vehicle.Columns):
     """State of the controllers of vehicles, rows along and across the path, (2, A) each."""
 
     integral: Array  # (2, A) in m/s2 and 1/m
@@ -73,12 +64,12 @@ class ControllerMemory(Columns):
 
 def follow_vehicles(
     row: Array,
-    state: VehicleState,
+    state: vehicle.VehicleState,
     memory: ControllerMemory,
-    parameters: VehicleParameters,
+    parameters: vehicle.VehicleParameters,
     dt_s: float,
     gains: ControllerGains = GAINS,
-) -> tuple[VehicleControls, ControllerMemory]:
+) -> tuple[vehicle.VehicleControls, ControllerMemory]:
     """Compute the controls of vehicles that follow their references.
 
     `row` (C, A): the references now, as `VEHICLE_COLUMNS`.
@@ -90,7 +81,7 @@ def follow_vehicles(
     p, reference_gear, stands = parameters, row[6], row[7]
     pace = np.abs(state.speed_mps)
     moves, square = pace > 0, pace * pace
-    gear = np.sign(state.speed_mps + TINY * reference_gear)
+    gear = np.sign(state.speed_mps + vehicle.TINY * reference_gear)
     # Errors along and across the path in m (2, A), and their derivatives: speed difference, slope toward the path.
     x, y, yaw, speed, _, curvature, _, _ = row
     cos, sin = cos_sin(yaw)
@@ -100,25 +91,27 @@ def follow_vehicles(
     turn = curvature * along
     across = cos * dy - sin * dx + turn * along / 2
     _, slope = cos_sin(yaw - turn - state.yaw_rad)
-    error, raw_rate = rows(along, across), rows(speed - state.speed_mps, slope)
+    error, raw_rate = vehicle.rows(along, across), vehicle.rows(speed - state.speed_mps, slope)
     rate = memory.rate - math.expm1(-dt_s / gains.derivative_filter_s) * (raw_rate - memory.rate)
     damping = 2 * gains.damping * rate
     damping[1] *= gear  # in reverse, turning to the left leads to the right
 
-    stiffness = rows(1 / gains.along_s, 1 / np.maximum(pace * gains.across_s, gains.across_min_m))
+    stiffness = vehicle.rows(1 / gains.along_s, 1 / np.maximum(pace * gains.across_s, gains.across_min_m))
     pull = error * stiffness**2
     wanted = row[4:6] + pull + damping * stiffness + memory.integral
     # The smallest radius with grip grows with the square of the speed; at standstill only the lock limits.
     grip = np.minimum(gains.max_lateral_accel_mps2 / np.maximum(square, 1.0), p.max_curvature_1pm)
-    asked = rows(wanted[0] * gear, wanted[1])
-    given = np.minimum(np.maximum(asked, rows(-p.max_brake_mps2, -grip)), rows(p.max_throttle_mps2, grip))
+    asked = vehicle.rows(wanted[0] * gear, wanted[1])
+    given = np.minimum(
+        np.maximum(asked, vehicle.rows(-p.max_brake_mps2, -grip)), vehicle.rows(p.max_throttle_mps2, grip)
+    )
 
     # Anti-windup: the integral does not grow while an actuator is at its limit, while a vehicle far behind catches up, or
     # at standstill.
     integrates = (given == asked) | (error * wanted <= 0)
     integrates[0] &= np.abs(error[0]) < gains.max_along_m
     integrates[1] &= moves
-    bound = rows(gains.integral_limit_mps2, gains.integral_share * grip)
+    bound = vehicle.rows(gains.integral_limit_mps2, gains.integral_share * grip)
     integral = memory.integral + (dt_s / gains.integral_s) * pull * integrates
     integral = np.minimum(np.maximum(integral, -bound), bound)
 
@@ -126,21 +119,21 @@ def follow_vehicles(
     np.copyto(given[0], -gains.hold_brake_mps2, where=held)
     np.copyto(integral[0], 0.0, where=held)
     steer = np.arctan(p.wheelbase_m * given[1] * (1 + p.understeer_s2pm2 * square))
-    controls = VehicleControls(given[0], steer, reference_gear < 0)
+    controls = vehicle.VehicleControls(given[0], steer, reference_gear < 0)
     return controls, ControllerMemory(integral, rate)
 
 
-def follow_points(row: Array, state: PointState, gains: ControllerGains = GAINS) -> PointControls:
+def follow_points(row: Array, state: vehicle.PointState, gains: ControllerGains = GAINS) -> vehicle.PointControls:
     """Compute the controls of points that follow their references `row` (C, A), as `POINT_COLUMNS`, in any direction."""
     x, y, _, vx, vy, ax, ay, _ = row
     p, d = 1 / gains.point_s**2, 2 * gains.damping / gains.point_s
-    return PointControls(
+    return vehicle.PointControls(
         ax + p * (x - state.x_m) + d * (vx - state.velocity_x_mps),
         ay + p * (y - state.y_m) + d * (vy - state.velocity_y_mps),
     )
 
 
-def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
+def start_vehicles(row: Array, parameters: vehicle.VehicleParameters) -> vehicle.VehicleState:
     """Return states of vehicles on their references `row` (C, A)."""
     x, y, yaw, speed, accel, curvature, gear, stands = row
     angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
@@ -148,9 +141,9 @@ def start_vehicles(row: Array, parameters: VehicleParameters) -> VehicleState:
     pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
     speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
     still = np.zeros(len(x))
-    return VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, still, still)
+    return vehicle.VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, still, still)
 
 
-def start_points(row: Array) -> PointState:
+def start_points(row: Array) -> vehicle.PointState:
     """Return states of points on their references `row` (C, A)."""
-    return PointState(row[0].copy(), row[1].copy(), row[3].copy(), row[4].copy())
+    return vehicle.PointState(row[0].copy(), row[1].copy(), row[3].copy(), row[4].copy())

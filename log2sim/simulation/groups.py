@@ -17,38 +17,12 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array, cos_sin, wrap_angle
+from log2sim.simulation import follower, policy
 from log2sim.simulation.corridors import SPACING_M, PathTable
-from log2sim.simulation.follower import (
-    ControllerMemory,
-    control_step,
-    follow_points,
-    follow_vehicles,
-    start_points,
-    start_vehicles,
-)
-from log2sim.simulation.policy import (
-    PATH_AHEAD_M,
-    ROUTE_AHEAD_S,
-    ROUTE_STEP_S,
-    Controls,
-    EgoState,
-    Observation,
-    Others,
-    PathAhead,
-    Route,
-)
 from log2sim.simulation.reference import GRID_S, Reference
 from log2sim.simulation.simulators import VehicleStep
+from log2sim.simulation.vehicles import vehicle
 from log2sim.simulation.vehicles.model_choice import set_slip_states
-from log2sim.simulation.vehicles.vehicle import (
-    Columns,
-    PointControls,
-    PointState,
-    VehicleControls,
-    VehicleParameters,
-    VehicleState,
-    step_point,
-)
 
 STORE_S = 0.05  # spacing of stored states, about 20 Hz
 MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10 ms
@@ -86,7 +60,7 @@ class StepClock:
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot(Columns):
+class Snapshot(vehicle.Columns):
     """Box centers and actuators of agents (A,), map frame.
 
     Commands are those held over the last step; NaN for agents without.
@@ -121,9 +95,9 @@ class AgentGroup(ABC):
         self.live = np.zeros(0, dtype=np.intp)
         self.row = np.zeros((0, 0))
         self.now_s = 0.0
-        self.kept: dict[str, Columns] = {}
+        self.kept: dict[str, vehicle.Columns] = {}
 
-    def keep(self, **columns: Columns) -> None:
+    def keep(self, **columns: vehicle.Columns) -> None:
         """Keep columns of all agents, of which those of the living ones are the attributes of these names."""
         self.kept = columns
         self._take()
@@ -143,7 +117,13 @@ class AgentGroup(ABC):
         if len(self.live):
             self._table = np.empty((rows, self.references[0].columns.shape[1], len(self.live)))
             for slot, i in enumerate(self.live):
-                _copy_rows(self._table[:, :, slot], self.references[i], self._row0)
+                # The first and the last row of a table fill what lies before and after.
+                columns, begin_row = self.references[i].columns, self.references[i].first_row - self._row0
+                low = min(max(begin_row, 0), rows)
+                high = min(max(begin_row + len(columns), low), rows)
+                self._table[:low, :, slot] = columns[0]
+                self._table[low:high, :, slot] = columns[low - begin_row : high - begin_row]
+                self._table[high:, :, slot] = columns[-1]
         self._take()
 
     def log_times(self, t_s: float) -> Array:
@@ -170,7 +150,7 @@ class AgentGroup(ABC):
 
     def advance(self, dt_s: float) -> None:
         """Move the living agents by one step; within a long step controls are renewed."""
-        held_s = control_step(dt_s)
+        held_s = follower.control_step(dt_s)
         for part in range(round(dt_s / held_s)):
             if part:
                 self.look_up(self.now_s + held_s)
@@ -209,10 +189,10 @@ class VehicleGroup(AgentGroup):
     """Vehicles that follow their trajectories through a vehicle model."""
 
     driver = "pid"
-    state: VehicleState
-    memory: ControllerMemory
-    commands: VehicleControls
-    living: VehicleParameters
+    state: vehicle.VehicleState
+    memory: follower.ControllerMemory
+    commands: vehicle.VehicleControls
+    living: vehicle.VehicleParameters
 
     def __init__(
         self,
@@ -220,26 +200,25 @@ class VehicleGroup(AgentGroup):
         references: Sequence[Reference],
         first: NDArray[np.intp],
         last: NDArray[np.intp],
-        parameters: VehicleParameters,
+        parameters: vehicle.VehicleParameters,
         move: VehicleStep,
     ) -> None:
         super().__init__(agents, references, first, last)
         self.parameters, self.move, count = parameters, move, len(agents)
-        commands = VehicleControls(np.zeros(count), np.zeros(count), np.zeros(count, bool))
-        self.keep(
-            state=VehicleState.zeros(count), memory=ControllerMemory.fresh(count), commands=commands, living=parameters
-        )
+        state, memory = vehicle.VehicleState.zeros(count), follower.ControllerMemory.fresh(count)
+        commands = vehicle.VehicleControls(np.zeros(count), np.zeros(count), np.zeros(count, bool))
+        self.keep(state=state, memory=memory, commands=commands, living=parameters)
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
         slots = self._slots(index)
-        state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
+        state = follower.start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
             state = set_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
         self.state.put(slots, state)
-        self.memory.put(slots, ControllerMemory.fresh(len(slots)))
+        self.memory.put(slots, follower.ControllerMemory.fresh(len(slots)))
         placed = self.state.take(slots)
-        self.commands.put(slots, VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
+        self.commands.put(slots, vehicle.VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
 
     def snapshot(self) -> Snapshot:
         """Return the present states of the living vehicles."""
@@ -247,15 +226,13 @@ class VehicleGroup(AgentGroup):
         cos, sin = cos_sin(s.yaw_rad)
         x = s.x_m + o * cos + self.origin_x_m[self.live]
         y = s.y_m + o * sin + self.origin_y_m[self.live]
-        accel = np.where(
-            (s.speed_mps == 0) & (s.pedal_mps2 < 0), 0.0, s.pedal_mps2 * np.where(s.speed_mps < 0, -1.0, 1.0)
-        )
-        c = self.commands
+        held, forward = (s.speed_mps == 0) & (s.pedal_mps2 < 0), np.where(s.speed_mps < 0, -1.0, 1.0)
+        accel, c = np.where(held, 0.0, s.pedal_mps2 * forward), self.commands
         gear = np.where(c.reverse, -1.0, 1.0)
         return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel, c.pedal_mps2, c.steer_rad, gear)
 
     def _step(self, dt_s: float) -> None:
-        self.commands, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
+        self.commands, self.memory = follower.follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
         self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
@@ -264,13 +241,12 @@ class PolicyVehicle(VehicleGroup):
 
     driver = "policy"
     follows_scenario_time = False
-    controls = Controls(0.0, 0.0)
+    controls = policy.Controls(0.0, 0.0)
 
     def _step(self, dt_s: float) -> None:
         c = self.controls
-        self.commands = VehicleControls(
-            np.array([c.accel_mps2], float), np.array([c.steer_rad], float), np.array([c.reverse], bool)
-        )
+        pedal, steer = np.array([[c.accel_mps2], [c.steer_rad]], float)
+        self.commands = vehicle.VehicleControls(pedal, steer, np.array([c.reverse], bool))
         self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
@@ -278,20 +254,20 @@ class PedestrianGroup(AgentGroup):
     """Pedestrians, and all else without wheels, as point masses that follow their trajectories."""
 
     driver = "pid"
-    state: PointState
-    commands: PointControls
-    move = staticmethod(step_point)
+    state: vehicle.PointState
+    commands: vehicle.PointControls
+    move = staticmethod(vehicle.step_point)
 
     def __init__(
         self, agents: Sequence[Agent], references: Sequence[Reference], first: NDArray[np.intp], last: NDArray[np.intp]
     ) -> None:
         super().__init__(agents, references, first, last)
-        self.keep(state=PointState.zeros(len(agents)), commands=PointControls.zeros(len(agents)))
+        self.keep(state=vehicle.PointState.zeros(len(agents)), commands=vehicle.PointControls.zeros(len(agents)))
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put points on their references."""
         slots = self._slots(index)
-        self.state.put(slots, start_points(self._exact(index, t_s)))
+        self.state.put(slots, follower.start_points(self._exact(index, t_s)))
 
     def snapshot(self) -> Snapshot:
         """Return the present states of the living points."""
@@ -302,18 +278,8 @@ class PedestrianGroup(AgentGroup):
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), unknown, unknown, unknown, unknown)
 
     def _step(self, dt_s: float) -> None:
-        self.commands = follow_points(self.row, self.state)
+        self.commands = follower.follow_points(self.row, self.state)
         self.state = self.move(self.state, self.commands, dt_s)
-
-
-def _copy_rows(window: Array, reference: Reference, row0: int) -> None:
-    """Copy the rows from `row0` on of a table to a window (W, C); its first and last row fill what lies before and after."""
-    columns, begin = reference.columns, reference.first_row - row0
-    low = min(max(begin, 0), len(window))
-    high = min(max(begin + len(columns), low), len(window))
-    window[:low] = columns[0]
-    window[low:high] = columns[low - begin : high - begin]
-    window[high:] = columns[-1]
 
 
 # By agent id: the stored steps (S,) and the columns (C, S) of `Snapshot` at these steps.
@@ -383,47 +349,40 @@ class PolicyObserver:
         """Start again at the beginning of the path."""
         self.progress_m = 0.0
 
-    def __call__(self, step: int, t_s: float, dt_s: float) -> Observation:
+    def __call__(self, step: int, t_s: float, dt_s: float) -> policy.Observation:
         """Build the observation at a step; steps must be in order."""
         ahead = self._ahead()
         ego = self._state()
-        return Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
+        return policy.Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
 
-    def _state(self) -> EgoState:
+    def _state(self) -> policy.EgoState:
         """Build the ego's state, at the height of its path in the scenario at `progress_m`."""
-        agent, s, p = self.ego.agents[0], self.ego.snapshot(), self.ego.living
+        (length, width, height), s, p = self.ego.agents[0].size_m, self.ego.snapshot(), self.ego.living
         log_t_s = self._path_table.times(ONE, np.array([self.progress_m]))
-        return EgoState(
-            x_m=float(s.x_m[0]),
-            y_m=float(s.y_m[0]),
-            z_m=float(self._trajectory.heights(log_t_s)[0]),
-            yaw_rad=float(s.yaw_rad[0]),
-            speed_mps=float(s.speed_mps[0]),
-            accel_mps2=float(s.accel_mps2[0]),
-            steer_rad=float(s.steer_rad[0]),
-            length_m=agent.size_m[0],
-            width_m=agent.size_m[1],
-            height_m=agent.size_m[2],
-            wheelbase_m=float(p.wheelbase_m[0]),
-            rear_axle_offset_m=float(p.rear_axle_offset_m[0]),
-            understeer_s2pm2=float(p.understeer_s2pm2[0]),
+        moves = {k: float(getattr(s, k)[0]) for k in ("x_m", "y_m", "yaw_rad", "speed_mps", "accel_mps2", "steer_rad")}
+        built = {k: float(getattr(p, k)[0]) for k in ("wheelbase_m", "rear_axle_offset_m", "understeer_s2pm2")}
+        z_m = float(self._trajectory.heights(log_t_s)[0])
+        return policy.EgoState(z_m=z_m, length_m=length, width_m=width, height_m=height, **moves, **built)
+
+    def _route(self, t_s: float) -> policy.Route:
+        ahead = np.arange(
+            t_s,
+            min(t_s + policy.ROUTE_AHEAD_S, self._trajectory.t_s[-1]) + policy.ROUTE_STEP_S / 2,
+            policy.ROUTE_STEP_S,
         )
-
-    def _route(self, t_s: float) -> Route:
-        ahead = np.arange(t_s, min(t_s + ROUTE_AHEAD_S, self._trajectory.t_s[-1]) + ROUTE_STEP_S / 2, ROUTE_STEP_S)
         x, y, _, yaw, speed = self._trajectory.at(ahead)
-        return Route(*(_read_only(c) for c in (ahead, x, y, yaw, speed)))
+        return policy.Route(*(_read_only(c) for c in (ahead, x, y, yaw, speed)))
 
-    def _ahead(self) -> PathAhead:
+    def _ahead(self) -> policy.PathAhead:
         table, now = self._path_table, self.ego.snapshot()
         self.progress_m = table.progress_near(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
-        ahead = np.arange(0.0, PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
+        ahead = np.arange(0.0, policy.PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
         x, y, cos, sin, at_s = table.along(ONE, self.progress_m + ahead)
         pace = np.abs(table.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)
         columns = (ahead, x + table.origin_m[0], y + table.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
-        return PathAhead(self.progress_m, *(_read_only(c) for c in columns))
+        return policy.PathAhead(self.progress_m, *(_read_only(c) for c in columns))
 
-    def _others(self, ego: EgoState, step: int, t_s: float) -> Others:
+    def _others(self, ego: policy.EgoState, step: int, t_s: float) -> policy.Others:
         begin_s, end_s = self._static_lives_s.T
         here = (begin_s <= t_s) & (t_s <= end_s)
         poses, who, log_s = [self._statics[:, here]], [self._static_agents[here]], [np.full(here.sum(), t_s)]
@@ -439,13 +398,11 @@ class PolicyObserver:
         near = np.argsort(distance, kind="stable")
         near = near[distance[near] <= self.sight_m]
         x, y, yaw, speed, seen = x[near], y[near], yaw[near], speed[near], np.concatenate(who)[near]
-        z = np.array(
-            [trajectory.heights(t) for trajectory, t in zip(seen["trajectory"], np.concatenate(log_s)[near])],
-            dtype=np.float64,
-        )
+        times = zip(seen["trajectory"], np.concatenate(log_s)[near])
+        z = np.array([trajectory.heights(t) for trajectory, t in times], dtype=np.float64)
         size = (seen[k] for k in ("length_m", "width_m", "height_m"))
         columns = (x, y, z, yaw, speed, speed * np.cos(yaw), speed * np.sin(yaw), *size)
-        return Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))
+        return policy.Others(_read_only(seen["id"]), _read_only(seen["category"]), *(_read_only(c) for c in columns))
 
 
 def _identities(agents: Sequence[Agent], trajectories: Sequence[Trajectory]) -> NDArray[Any]:

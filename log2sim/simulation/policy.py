@@ -208,7 +208,9 @@ def load_policy(name: str) -> Policy:
             f"policy '{name}': expected module:attribute or file.py:attribute, such as my_driver:brake_late, or the name of a plug-in"
         )
     try:
-        target: Any = _import_file(Path(source)) if source.endswith(".py") else _import_module(source)
+        folder = Path(source).resolve().parent if source.endswith(".py") else Path.cwd()
+        with _first_on_path(folder):
+            target: Any = _import_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
     except Exception as error:  # a user's module may raise anything while it is imported
         raise ConfigError(f"policy '{name}': '{source}' cannot be imported: {type(error).__name__}: {error}") from error
     for part in attribute.split("."):
@@ -271,19 +273,13 @@ def _made(target: Any, source: str, error_type: type[ConfigError]) -> Policy:
     return result
 
 
-def _import_module(name: str) -> ModuleType:
-    with _first_on_path(Path.cwd()):
-        return importlib.import_module(name)
-
-
 def _import_file(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"log2sim_policy_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} is no Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses of the file look their module up there
-    with _first_on_path(path.resolve().parent):
-        spec.loader.exec_module(module)
+    spec.loader.exec_module(module)
     return module
 
 

@@ -16,20 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import STANDSTILL_MPS, Agent, Trajectory
 from log2sim.geometry import Array, wrap_angle
 from log2sim.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
-from log2sim.simulation.corridors import (
-    EXTENSION_M,
-    HORIZON_S,
-    TIME_STEP_S,
-    PathTable,
-    Pose,
-    Prediction,
-    SafetyMargins,
-    SweptCorridor,
-    leaders,
-    predict_along_path,
-    predict_by_log,
-    predict_policy_vehicle,
-)
+from log2sim.simulation import corridors
 from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, Snapshot, StepClock, VehicleGroup
 from log2sim.simulation.metrics.collisions import BoxTracks, contacts
 from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
@@ -109,28 +96,28 @@ Index = NDArray[np.intp]
 class PathForesight:
     """Others go where the scenario has them go."""
 
-    def __init__(self, paths: PathTable) -> None:
+    def __init__(self, paths: corridors.PathTable) -> None:
         self._paths = paths
 
-    def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
+    def expect(self, agent: Index, t_s: Array, rate: Array) -> corridors.Prediction:
         """Predict agents (P,) that pass their trajectories at rates (P,), from where these are at times (P,)."""
-        return predict_by_log(self._paths, agent, t_s, rate)
+        return corridors.predict_by_log(self._paths, agent, t_s, rate)
 
-    def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
+    def expect_driven(self, agent: int, t_s: float, pose: corridors.Pose) -> corridors.Prediction:
         """Predict an agent that a policy drives, from where it is among all poses; (1, H)."""
         x, y, yaw, speed = (float(c[agent]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
-        return predict_policy_vehicle(self._paths, agent, x, y, yaw, speed)
+        return corridors.predict_policy_vehicle(self._paths, agent, x, y, yaw, speed)
 
-    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
+    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> corridors.Prediction:
         """Predict that agent by the same rules from where the scenario has it at times (P,)."""
         pose = self._paths.at(np.full(len(t_s), agent), t_s)
-        return predict_along_path(self._paths, agent, pose.distance_m, np.abs(pose.speed_mps))
+        return corridors.predict_along_path(self._paths, agent, pose.distance_m, np.abs(pose.speed_mps))
 
 
 class MotionForesight(PathForesight):
     """Others go on at the speed and turn rate that they had so far, smoothed as `log2sim.prediction` does."""
 
-    def __init__(self, paths: PathTable, agents: Sequence[Agent]) -> None:
+    def __init__(self, paths: corridors.PathTable, agents: Sequence[Agent]) -> None:
         super().__init__(paths)
         begin_s, end_s = float(paths.begin_s.min()), float(paths.end_s.max())
         self._begin_s = begin_s
@@ -142,7 +129,7 @@ class MotionForesight(PathForesight):
         self._seen: tuple[float, float] | None = None
         self._driven_radps = 0.0
 
-    def expect(self, agent: Index, t_s: Array, rate: Array) -> Prediction:
+    def expect(self, agent: Index, t_s: Array, rate: Array) -> corridors.Prediction:
         """Predict as `PathForesight` does."""
         pose = self._paths.at(agent, t_s)
         since = (t_s - self._begin_s) / TICK_S + 1e-6
@@ -151,9 +138,9 @@ class MotionForesight(PathForesight):
         turned = np.exp(1j * turn * np.clip(since - tick, 0.0, 1.0) * TICK_S)
         return _go_on(pose, np.asarray(self._velocity[agent, tick] * turned * rate), turn * rate)
 
-    def expect_driven(self, agent: int, t_s: float, pose: Pose) -> Prediction:
+    def expect_driven(self, agent: int, t_s: float, pose: corridors.Pose) -> corridors.Prediction:
         """Predict as `PathForesight` does."""
-        one = Pose(*(np.asarray(c)[agent : agent + 1] for c in pose))
+        one = corridors.Pose(*(np.asarray(c)[agent : agent + 1] for c in pose))
         yaw = float(one.yaw_rad[0])
         if self._seen is None or not t_s > self._seen[0]:  # it begins, or begins again
             self._driven_radps = 0.0
@@ -164,24 +151,24 @@ class MotionForesight(PathForesight):
         self._seen = t_s, yaw
         return _go_on(one, one.speed_mps * np.exp(1j * one.yaw_rad), np.array([self._driven_radps]))
 
-    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> Prediction:
+    def expect_driven_in_scenario(self, agent: int, t_s: Array) -> corridors.Prediction:
         """Predict as `PathForesight` does."""
         return self.expect(np.full(len(t_s), agent), t_s, np.ones(len(t_s)))
 
 
-def _go_on(pose: Pose, velocity: NDArray[np.complex128], turn_radps: Array) -> Prediction:
+def _go_on(pose: corridors.Pose, velocity: NDArray[np.complex128], turn_radps: Array) -> corridors.Prediction:
     """Go on from poses (P,) with velocities (P,) that turn at rates (P,)."""
-    way = displacement(velocity[:, None], turn_radps[:, None], HORIZON_S)
-    yaw = pose.yaw_rad[:, None] + turn_radps[:, None] * HORIZON_S
+    way = displacement(velocity[:, None], turn_radps[:, None], corridors.HORIZON_S)
+    yaw = pose.yaw_rad[:, None] + turn_radps[:, None] * corridors.HORIZON_S
     speed = np.copysign(np.abs(velocity), pose.speed_mps)[:, None]
     x, y = pose.x_m[:, None] + way.real, pose.y_m[:, None] + way.imag
-    return Prediction(x, y, yaw, np.broadcast_to(speed, yaw.shape))
+    return corridors.Prediction(x, y, yaw, np.broadcast_to(speed, yaw.shape))
 
 
 MIN_LOOKAHEAD_M = 10.0  # also at standstill
 
-MARGINS_NOW = SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
-MARGINS_IN_SCENARIO = SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
+MARGINS_NOW = corridors.SafetyMargins(side_m=0.2, crossing_m=1.0, crossing_s=0.5, behind_m=0.0)
+MARGINS_IN_SCENARIO = corridors.SafetyMargins(side_m=0.5, crossing_m=2.5, crossing_s=0.8, behind_m=1.0)
 # Tolerances, besides the difference of the margins, within which an interaction counts as that of the scenario.
 GAP_M, SPEED_MPS = 0.5, 0.5
 
@@ -193,28 +180,28 @@ PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their p
 class TrafficState:
     """All agents (A,) at one time."""
 
-    paths: PathTable
+    paths: corridors.PathTable
     idm: IdmParameters
     size_m: Array  # (A, 3)
     reacts: NDArray[np.bool_]  # (A,) whether an agent is reactive
     driven: int  # the agent that a policy drives, -1 without
     t_s: Array  # (A,) time on the scenario of each agent
     rate: Array  # (A,) rate at which each agent passes its trajectory
-    pose: Pose  # where the agents are, (A,)
-    prediction: Prediction  # where they are expected to go, (A, H)
+    pose: corridors.Pose  # where the agents are, (A,)
+    prediction: corridors.Prediction  # where they are expected to go, (A, H)
     foresight: PathForesight  # what expects it
 
     def reach_m(self, i: Index) -> Array:
         """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
         pace, d = np.abs(self.pose.speed_mps[i]), self.idm.take(i)
-        stop_m = pace * (d.time_gap_s + HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
-        result: Array = np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], EXTENSION_M)
+        stop_m = pace * (d.time_gap_s + corridors.HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
+        result: Array = np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], corridors.EXTENSION_M)
         return result
 
     def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
         """Select those of the pairs (P,), (P,) that may come near each other within the horizon."""
         p, radius = self.pose, np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
-        reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * HORIZON_S[-1] + radius[i] + radius[j]
+        reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * corridors.HORIZON_S[-1] + radius[i] + radius[j]
         near = (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
         i, j = i[near], j[near]
         level = self._level(i, j)
@@ -260,11 +247,11 @@ def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_
     """
     driver, logged_pace = m.idm.take(i), np.abs(m.pose.speed_mps[i])
     pace = m.rate[i] * logged_pace
-    logged = m.paths.at(i[:, None], m.t_s[i][:, None] + HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
-    starting = pace[:, None] * HORIZON_S + driver.accel_mps2[:, None] * HORIZON_S**2 / 2
+    logged = m.paths.at(i[:, None], m.t_s[i][:, None] + corridors.HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
+    starting = pace[:, None] * corridors.HORIZON_S + driver.accel_mps2[:, None] * corridors.HORIZON_S**2 / 2
     means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
-    there = Prediction(*(c[j] for c in m.prediction))
-    found = leaders(m.paths, _corridor(m, i, pace, means), there, m.size_m[j], MARGINS_NOW)
+    there = corridors.Prediction(*(c[j] for c in m.prediction))
+    found = corridors.leaders(m.paths, _corridor(m, i, pace, means), there, m.size_m[j], MARGINS_NOW)
     # Where two reactive agents meet, the one that was first in the scenario goes first; an obstacle already in the path is
     # waited for.
     first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
@@ -278,13 +265,13 @@ def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_
     return np.maximum(taken, 0.0)
 
 
-def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: SweptCorridor) -> Array:
+def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: corridors.SweptCorridor) -> Array:
     """Return the demand of agents j (P,) in the scenario when agents i (P,) were here, as far as it applies now.
 
     The nearer the other agent is than it was in the scenario, the less of the scenario's demand counts; at half the gap
     none.
     """
-    found = leaders(m.paths, corridor, _predict_in_scenario(m, j, m.t_s[i]), m.size_m[j], MARGINS_IN_SCENARIO)
+    found = corridors.leaders(m.paths, corridor, _predict_in_scenario(m, j, m.t_s[i]), m.size_m[j], MARGINS_IN_SCENARIO)
     gap = found.gap_m - GAP_M
     taken = leader_demand(m.idm.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
     known = np.isfinite(gap)
@@ -294,12 +281,12 @@ def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corri
     return result
 
 
-def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> SweptCorridor:
+def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> corridors.SweptCorridor:
     reach = float(m.reach_m(i).max())
-    return SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
+    return corridors.SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
 
 
-def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
+def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> corridors.Prediction:
     """Predict agents (P,) from the scenario at times (P,), by the same rules."""
     prediction = m.foresight.expect(j, t_s, np.ones(len(j)))
     if not np.any(j == m.driven):
@@ -307,15 +294,15 @@ def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> Prediction:
     return _select(j == m.driven, m.foresight.expect_driven_in_scenario(m.driven, t_s), prediction)
 
 
-def _select(mask: NDArray[np.bool_], one: Prediction, other: Prediction) -> Prediction:
-    return Prediction(*(np.where(mask[:, None], a, b) for a, b in zip(one, other)))
+def _select(mask: NDArray[np.bool_], one: corridors.Prediction, other: corridors.Prediction) -> corridors.Prediction:
+    return corridors.Prediction(*(np.where(mask[:, None], a, b) for a, b in zip(one, other)))
 
 
 DEEP_OVERLAP_M = 0.5  # larger than the errors of boxes
 OVERLAP_CHUNK = 200
 
 
-def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def deep_overlaps(paths: corridors.PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the pairs (A, A) whose boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
 
     Pairs that overlap from the start are one object detected twice, or a load and its carrier: no reason to brake.
@@ -328,7 +315,9 @@ def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) ->
         return deep
     begin_s = np.where(stays, -np.inf, paths.begin_s)
     end_s = np.where(stays, np.inf, paths.end_s)
-    t_s = np.arange(paths.begin_s[moving].min(), paths.end_s[moving].max() + TIME_STEP_S, TIME_STEP_S)
+    t_s = np.arange(
+        paths.begin_s[moving].min(), paths.end_s[moving].max() + corridors.TIME_STEP_S, corridors.TIME_STEP_S
+    )
     size = np.maximum(size_m - [DEEP_OVERLAP_M, DEEP_OVERLAP_M, 0.0], 0.1)
     everybody = np.arange(count)
     for part in np.split(t_s, range(OVERLAP_CHUNK, len(t_s), OVERLAP_CHUNK)):
@@ -338,7 +327,7 @@ def deep_overlaps(paths: PathTable, size_m: Array, static: NDArray[np.bool_]) ->
         found = contacts(BoxTracks(x, y, z, yaw, speed, size), moving)
         a, b = found.a, found.b
         deep[a, b] = True
-        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + TIME_STEP_S
+        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + corridors.TIME_STEP_S
         together[a[at_once], b[at_once]] = True
     into = deep & ~together
     return into | into.T
@@ -375,7 +364,7 @@ class Traffic:
         foresight: str = "path",
     ) -> None:
         self.index = {a.id: k for k, a in enumerate(agents)}
-        self.paths = PathTable(trajectories)
+        self.paths = corridors.PathTable(trajectories)
         self._foresight = MotionForesight(self.paths, agents) if foresight == "motion" else PathForesight(self.paths)
         self.reacts = np.array([a.id in reactive for a in agents], dtype=bool)
         self.idm = idm_parameters(agents)
@@ -442,7 +431,7 @@ class Traffic:
         stands = pace < STANDSTILL_MPS  # the scenario's time goes on: waiting then counts as the scenario's own stop
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
-    def _replace_driven_pose(self, pose: Pose, ego: Snapshot | None) -> Pose:
+    def _replace_driven_pose(self, pose: corridors.Pose, ego: Snapshot | None) -> corridors.Pose:
         """Replace the pose of the driven agent by the one to which the policy has driven it."""
         k = self._driven
         if ego is None or k < 0 or not len(ego.x_m):

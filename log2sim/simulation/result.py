@@ -202,18 +202,10 @@ class Replay:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/replay-1.json`."""
-        document = {
-            "replay_version": VERSION,
-            "scenario": self.scenario,
-            "scenario_digest": self.scenario_digest,
-            "mode": self.mode,
-            "model": self.model,
-            "dt_s": self.dt_s,
-            "store_dt_s": self.store_dt_s,
-            "agents": [_agent_to_dict(a) for a in self.agents],
-            "metrics": dict(self.metrics),
-            "left_out": dict(self.left_out),
-        }
+        plain = {k: getattr(self, k) for k in ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s")}
+        agents = [_agent_to_dict(a) for a in self.agents]
+        metrics = {"metrics": dict(self.metrics), "left_out": dict(self.left_out)}
+        document = {"replay_version": VERSION, **plain, "agents": agents, **metrics}
         return document if self.warnings is None else {**document, "warnings": self.warnings.to_dict()}
 
     @classmethod
@@ -237,11 +229,11 @@ def _add_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
         return [{"belongs_to": "scenario" if e["in_log"] else "replay", **e} for e in events]
 
     by_agent = {k: {**m, "collisions": owned(m["collisions"])} for k, m in metrics["by_agent"].items()}
-    conflicts = [
-        {**c, "contact": "scenario" if c["contact"] == "log" else c["contact"]} for c in metrics.get("conflicts", ())
-    ]
-    found = {"conflicts": conflicts} if "conflicts" in metrics else {}
-    return {**metrics, **found, "collisions": owned(metrics["collisions"]), "by_agent": by_agent}
+    found = {**metrics, "collisions": owned(metrics["collisions"]), "by_agent": by_agent}
+    if "conflicts" in metrics:
+        renamed = {"log": "scenario"}
+        found["conflicts"] = [{**c, "contact": renamed.get(c["contact"], c["contact"])} for c in metrics["conflicts"]]
+    return found
 
 
 def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
@@ -267,17 +259,12 @@ def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
     length, width, height = (float(v) for v in agent.size_m)
     commands, known = agent.commands, agent.cross_track_m is not None
     return {
-        "id": agent.id,
-        "category": agent.category,
-        "size_m": {"length": length, "width": width, "height": height},
-        "driver": agent.driver,
-        "model": agent.model,
-        "model_reason": agent.model_reason,
-        "flags": list(agent.flags),
+        "id": agent.id, "category": agent.category, "size_m": {"length": length, "width": width, "height": height},
+        "driver": agent.driver, "model": agent.model, "model_reason": agent.model_reason, "flags": list(agent.flags),
         "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
         "commands": {k: getattr(commands, k).tolist() for k in Commands.COLUMNS} if commands is not None else None,
         "errors": {k: getattr(agent, k).tolist() for k in AgentReplay.ERRORS} if known else None,
-    }
+    }  # fmt: skip
 
 
 def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
@@ -286,19 +273,12 @@ def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
     commands = _columns(entry, "commands", Commands.COLUMNS)
     if commands:
         commands["gear"] = commands["gear"].astype(np.int8)
-    size = entry["size_m"]
+    length, width, height = (float(entry["size_m"][key]) for key in ("length", "width", "height"))
     return AgentReplay(
-        id=entry["id"],
-        category=entry["category"],
-        size_m=(float(size["length"]), float(size["width"]), float(size["height"])),
-        driver=entry["driver"],
-        model=entry["model"],
-        flags=tuple(entry["flags"]),
-        model_reason=entry.get("model_reason", ""),
-        commands=Commands(**commands) if commands else None,
-        **states,
-        **_columns(entry, "errors", AgentReplay.ERRORS),
-    )
+        **{key: entry[key] for key in ("id", "category", "driver", "model")}, size_m=(length, width, height),
+        flags=tuple(entry["flags"]), model_reason=entry.get("model_reason", ""),
+        commands=Commands(**commands) if commands else None, **states, **_columns(entry, "errors", AgentReplay.ERRORS),
+    )  # fmt: skip
 
 
 def _columns(entry: Mapping[str, Any], group: str, keys: Sequence[str]) -> dict[str, Any]:

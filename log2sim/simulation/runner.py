@@ -208,23 +208,10 @@ def replay_result(
         agents.append(replayed)
         stored.append(steps)
     trajectories = {k: trajectory for k, (_, trajectory, _) in source.items() if k in tracks}
-    return Replay(
-        scenario=scenario.name,
-        scenario_digest=scenario.digest,
-        mode=mode,
-        model=model,
-        dt_s=clock.dt_s,
-        store_dt_s=round(clock.dt_s * clock.store_every, 9),
-        agents=tuple(agents),
-        metrics=replay_metrics(
-            agents,
-            stored,
-            trajectories,
-            errors,
-            clock,
-            source_kind=RECONSTRUCTION if scenario.is_reconstruction else SCENARIO,
-        ),
-    )
+    kind, store_dt_s = RECONSTRUCTION if scenario.is_reconstruction else SCENARIO, clock.dt_s * clock.store_every
+    metrics = replay_metrics(agents, stored, trajectories, errors, clock, source_kind=kind)
+    name, digest = scenario.name, scenario.digest
+    return Replay(name, digest, mode, model, clock.dt_s, round(store_dt_s, 9), tuple(agents), metrics)
 
 
 def _moving_agent(

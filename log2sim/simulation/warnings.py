@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from copy import copy
 from dataclasses import fields, replace
 from itertools import permutations
@@ -65,50 +65,34 @@ def count_warnings(warnings: Warnings) -> str:
 
 def describe_warning(warning: CollisionWarning, warnings: Warnings) -> str:
     """Describe a warning: when, how soon and how far off the collision is, whether braking suffices, and since when it is known."""
-    parts = [describe_briefly(warning) + ".", _braking(warning, warnings), _known(warning)]
-    if warning.warned is not None and warning.collision_s is not None:
+    parts, at = [describe_briefly(warning) + "."], warning.warned
+    if at is not None and warning.way_m is not None:
+        verdict = "braking suffices" if warning.braking_suffices else "braking comes too late"
+        needed = "" if warning.needed_mps2 is None else f", {warning.needed_mps2:.1f} m/s2 would be needed"
+        parts.append(
+            f"{'The ego' if warning.driver == EGO else warning.driver} drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the "
+            f"collision, and stands after {at.stopping_m:.1f} m ({warnings.reaction_s:g} s to react, then {warnings.brake_mps2:g} m/s2): {verdict}{needed}."
+        )
+    # Since when the agent is known, and to which end alone.
+    in_order = sorted(warning.known_by.items(), key=lambda e: e[1])
+    ends = "; ".join(f"to the {end} alone from {t_s:.2f} s" for end, t_s in in_order)
+    known = warning.known
+    since = "Never known" if known is None else f"Known since {known.t_s:.2f} s, {known.distance_m:.1f} m away"
+    parts.append(f"{since} ({ends})." if ends else f"{since}.")
+    if at is not None and warning.collision_s is not None:
         parts.append(f"They collide at {warning.collision_s:.2f} s.")
-    return " ".join(part for part in parts if part)
+    return " ".join(parts)
 
 
 def describe_briefly(warning: CollisionWarning) -> str:
     """Say who is warned of, when, and how soon and how far off the collision is."""
-    at = warning.warned
+    at, pair = warning.warned, warning.agent if warning.driver == EGO else f"{warning.driver} and {warning.agent}"
     if at is None or warning.ttc_s is None:
-        return f"{_pair(warning)}: no warning before the collision at {warning.begin_s:.2f} s"
+        return f"{pair}: no warning before the collision at {warning.begin_s:.2f} s"
     return (
-        f"{_pair(warning)}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
+        f"{pair}: warning at {at.t_s:.2f} s, collision in {warning.ttc_s:.2f} s with probability "
         f"{warning.probability:.2f}, {at.distance_m:.1f} m apart"
     )
-
-
-def _pair(warning: CollisionWarning) -> str:
-    return warning.agent if warning.driver == EGO else f"{warning.driver} and {warning.agent}"
-
-
-def _braking(warning: CollisionWarning, warnings: Warnings) -> str:
-    at = warning.warned
-    if at is None or warning.way_m is None:
-        return ""
-    verdict = "braking suffices" if warning.braking_suffices else "braking comes too late"
-    needed = "" if warning.needed_mps2 is None else f", {warning.needed_mps2:.1f} m/s2 would be needed"
-    driver = "The ego" if warning.driver == EGO else warning.driver
-    return (
-        f"{driver} drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the collision, and stands after "
-        f"{at.stopping_m:.1f} m ({warnings.reaction_s:g} s to react, then {warnings.brake_mps2:g} m/s2): {verdict}{needed}."
-    )
-
-
-def _known(warning: CollisionWarning) -> str:
-    """Say since when the agent is known, and to which end alone."""
-    in_order = sorted(warning.known_by.items(), key=lambda e: e[1])
-    ends = "; ".join(f"to the {end} alone from {t_s:.2f} s" for end, t_s in in_order)
-    since = (
-        "Never known"
-        if warning.known is None
-        else f"Known since {warning.known.t_s:.2f} s, {warning.known.distance_m:.1f} m away"
-    )
-    return f"{since} ({ends})." if ends else f"{since}."
 
 
 MAX_SLOPE = 0.06  # of a road beyond the heights of the ego's path: more is rare outside of mountains
@@ -180,13 +164,11 @@ class Watch:
             others = replace(others, position_m=self._moved(others.position_m, agent, tick, seen))
         lead_s = self._expected.lead_s
         own = self.ego_path.at(ego.take(row), lead_s)
-        found = expected_contacts(own, others, lead_s)
-        gone = np.concatenate(
-            [np.zeros((len(row), 1)), np.cumsum(np.abs(np.diff(own.position_m, axis=1)), axis=1)], axis=1
-        )
-        way = np.array([np.interp(t, lead_s, w) if np.isfinite(t) else np.inf for t, w in zip(found.time_s, gone)])
-        due = self.settings.is_due(found.probability, way, ego.speed_mps[row])
-        return Courses(agent, row, found.probability, found.time_s, way, due)
+        probability, time_s = expected_contacts(own, others, lead_s)
+        gone = np.cumsum(np.abs(np.diff(own.position_m, axis=1, prepend=own.position_m[:, :1])), axis=1)
+        way = np.array([np.interp(t, lead_s, w) if np.isfinite(t) else np.inf for t, w in zip(time_s, gone)])
+        due = self.settings.is_due(probability, way, ego.speed_mps[row])
+        return Courses(agent, row, probability, time_s, way, due)
 
     def _may_meet(self, ego: EgoStates, agent: Index, tick: Index) -> NDArray[np.bool_]:
         """Whether agents (C,) are within reach of the ego, and at a height of its path."""
@@ -256,14 +238,22 @@ def warn(
     drivers = warnable(replace(scenario, agents=tuple(a for a in scenario.agents if a.id in now)))
     table = table_of(moved)
     everybody = Watch(scenario, moved.others, settings, table.t_s)
-    collisions = _collisions(replay, {driver.id for driver in drivers})
-    sources = {a.id: a for a in scenario.agents}
+    # When drivers first touch others in the replay; boxes that overlap from the start have not collided.
+    touched: dict[str, dict[str, float]] = {driver.id: {} for driver in drivers}
+    for event in () if replay is None else replay.metrics.get("collisions", ()):
+        for one, two in permutations(event["agents"], 2) if not event.get("from_start", False) else ():
+            if one in touched:
+                touched[one][two] = min(touched[one].get(two, np.inf), round(float(event["t_s"]), _DIGITS))
+    sources, row = {a.id: a for a in scenario.agents}, {a.id: k for k, a in enumerate(moved.others)}
     events, driven_s = [], 0.0
     for driver in drivers:
-        watch = everybody.for_driver(driver)
+        watch, hit = everybody.for_driver(driver), touched[driver.id]
         ticks = np.flatnonzero(table.present[list(now).index(driver.id)])
         drive = _Drive(watch, ego_states(now[driver.id], watch, table.t_s[ticks]), table.t_s[ticks], driver.id)
-        own = _add_collisions(_events(drive, watch.courses(drive.ego, ticks)), collisions.get(driver.id, {}), drive)
+        own = [replace(e, collision_s=hit.get(e.agent)) for e in _events(drive, watch.courses(drive.ego, ticks))]
+        for agent in hit.keys() - {e.agent for e in own}:  # collisions that nothing was predicted of
+            k, kind = row[agent], now[agent].category
+            own.append(CollisionWarning(agent, kind, drive.known(k), driver=drive.driver, collision_s=hit[agent]))
         if len(ends_of(scenario)) > 1:
             own = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in own]
         events += own
@@ -362,31 +352,6 @@ def _spans(t_s: Array) -> tuple[tuple[float, float], ...]:
     edges = np.flatnonzero(np.diff(t_s) > SAME_WARNING_S)
     first, last = np.concatenate([[0], edges + 1]), np.concatenate([edges, [len(t_s) - 1]])
     return tuple((round(float(t_s[a]), _DIGITS), round(float(t_s[b]), _DIGITS)) for a, b in zip(first, last))
-
-
-def _collisions(replay: Replay | None, drivers: Set[str]) -> dict[str, dict[str, float]]:
-    """Return when drivers first touch others in a replay, by both ids; boxes that overlap from the start have not collided."""
-    touched: dict[str, dict[str, float]] = {}
-    for event in () if replay is None else replay.metrics.get("collisions", ()):
-        if not event.get("from_start", False):
-            for driver, other in permutations(event["agents"], 2):
-                if driver in drivers:
-                    own = touched.setdefault(driver, {})
-                    own[other] = min(own.get(other, np.inf), round(float(event["t_s"]), _DIGITS))
-    return touched
-
-
-def _add_collisions(
-    events: Iterable[CollisionWarning], hit: Mapping[str, float], drive: _Drive
-) -> list[CollisionWarning]:
-    """Find which agents the ego touches, and add those that nothing was predicted of."""
-    out = [replace(e, collision_s=hit.get(e.agent)) for e in events]
-    row = {a.id: k for k, a in enumerate(drive.watch.table.agents)}
-    for agent in hit.keys() - {e.agent for e in out}:
-        k = row[agent]
-        category = drive.watch.table.agents[k].category
-        out.append(CollisionWarning(agent, category, drive.known(k), driver=drive.driver, collision_s=hit[agent]))
-    return out
 
 
 def _once(events: Iterable[CollisionWarning]) -> list[CollisionWarning]:
@@ -507,9 +472,8 @@ class BrakeWhenWarned:
         ego, t_s = seen.ego, seen.t_s
         speed, accel = ego.speed_mps, math.copysign(ego.accel_mps2, ego.accel_mps2 * ego.speed_mps)
         if self.braking(t_s):
-            forward = math.cos(
-                float(seen.path.yaw_rad[0]) - ego.yaw_rad
-            )  # negative where the path is driven in reverse
+            # Negative where the path is driven in reverse.
+            forward = math.cos(float(seen.path.yaw_rad[0]) - ego.yaw_rad)
             speed = math.copysign(max(abs(speed), float(seen.path.speed_mps[0]), MIN_EGO_MPS), forward)
             accel = 0.0
         one = [np.array([v]) for v in (ego.x_m, ego.y_m, ego.yaw_rad, speed, accel, seen.path.progress_m)]

@@ -89,6 +89,11 @@ def box(low: Sequence[float], high: Sequence[float], material: Material) -> Poly
     return _made(_FACES, np.array([*high, -low[0], -low[1], -low[2]]), low, high, material)
 
 
+def block(x: float, y: float, along: float, across: float, z: tuple[float, float], material: Material) -> Polytope:
+    """Make a box about x, y that reaches as far along x and y to both sides, between two heights, m."""
+    return box((x - along, y - across, z[0]), (x + along, y + across, z[1]), material)
+
+
 def column(
     radius: float, z: tuple[float, float], material: Material, *, at: tuple[float, float] = (0.0, 0.0)
 ) -> Polytope:

@@ -22,22 +22,11 @@ from log2sim.errors import ConfigError
 from log2sim.files.documents import check_folder, refuse_folder
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
+from log2sim.synth import traffic
 from log2sim.synth.light import light_of, weather_of
 from log2sim.synth.polytope_caster import SensorState
 from log2sim.synth.render import Visibility, render, segment
 from log2sim.synth.scene import Environment
-from log2sim.synth.traffic import (
-    FORWARD_R_CAM,
-    Mount,
-    Rig,
-    TrafficObject,
-    TrafficScene,
-    draw_environment,
-    draw_scene,
-    mount_T_cam_of,
-    rig_of,
-    sensor_named,
-)
 from log2sim.synth.traffic_picture import TrafficPainter
 from log2sim.synth.truth import MIN_LABEL_PX, MIN_UNOCCLUDED
 
@@ -55,7 +44,7 @@ PNG_COMPRESSION = 1
 LIDAR_FROM_IMU_M, IMU_HEIGHT_M = (0.81, -0.32), 0.93
 
 
-def calibration_text(rig: Rig) -> str:
+def calibration_text(rig: traffic.Rig) -> str:
     """Write a calibration file: P0 to P3, R0_rect, Tr_velo_to_cam, Tr_imu_to_velo."""
     cam_R_level = (inverse(rig.map_T_cam)[:3, :3] @ rig.map_T_level[:3, :3]).round(12) + 0.0
     P = np.column_stack([rig.camera.K @ cam_R_level, np.zeros(3)])
@@ -65,14 +54,14 @@ def calibration_text(rig: Rig) -> str:
     return "".join(f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(values))}\n" for name, values in rows.items())
 
 
-def _lidar_T_imu(rig: Rig) -> Array:
+def _lidar_T_imu(rig: traffic.Rig) -> Array:
     """Place KITTI's IMU, by which readers know how high the LiDAR is above the ground."""
-    level = rig.map_T_level[:3, :3] @ FORWARD_R_CAM.T
+    level = rig.map_T_level[:3, :3] @ traffic.FORWARD_R_CAM.T
     away = np.append(LIDAR_FROM_IMU_M, rig.lidar_height_m - IMU_HEIGHT_M)
     return np.asarray(inverse(transform(level.T @ rig.map_T_lidar[:3, :3], away)))
 
 
-def label_text(objects: Sequence[TrafficObject], seen: Sequence[Visibility | None], rig: Rig) -> str:
+def label_text(objects: Sequence[traffic.TrafficObject], seen: Sequence[Visibility | None], rig: traffic.Rig) -> str:
     """Write a label file: road users, and as regions to be ignored those that are too small or hidden.
 
     Truncation is the share of the box outside the picture. Occlusion is 0 where 80 % or more of the silhouette are visible,
@@ -92,14 +81,14 @@ def label_text(objects: Sequence[TrafficObject], seen: Sequence[Visibility | Non
     return "".join(labels + regions)
 
 
-def kitti_type(item: TrafficObject) -> str:
+def kitti_type(item: traffic.TrafficObject) -> str:
     """KITTI's name of a road user's kind."""
     if item.category == "car" and item.size_m[2] >= MIN_VAN_HEIGHT_M:
         return VAN
     return TYPES.get(item.category, OTHER)
 
 
-def _label(item: TrafficObject, share: float, box_2d: str, rig: Rig) -> str:
+def _label(item: traffic.TrafficObject, share: float, box_2d: str, rig: traffic.Rig) -> str:
     level_T_map = inverse(rig.map_T_level)
     x, y, z = apply(level_T_map, item.position_m[None])[0]
     heading = level_T_map[:3, :3] @ np.array([np.cos(item.yaw_rad), np.sin(item.yaw_rad), 0.0])
@@ -114,7 +103,7 @@ def _label(item: TrafficObject, share: float, box_2d: str, rig: Rig) -> str:
     )
 
 
-def truncation(item: TrafficObject, rig: Rig) -> float:
+def truncation(item: traffic.TrafficObject, rig: traffic.Rig) -> float:
     """Share of an object's box that lies outside the picture."""
     steps = np.linspace(-0.5, 0.5, BOX_GRID)
     grid = np.stack(np.meshgrid(steps, steps, steps + 0.5, indexing="ij"), -1).reshape(-1, 3) * item.size_m
@@ -141,12 +130,12 @@ CAR_AHEAD_M = 0.3  # of the car's middle before its LiDAR
 class TrafficRun:
     """A random scene over time."""
 
-    scene: TrafficScene  # at time 0
-    ego: TrafficObject | None  # the sensor's car; None at the roadside
+    scene: traffic.TrafficScene  # at time 0
+    ego: traffic.TrafficObject | None  # the sensor's car; None at the roadside
     # (S, M) float64, m: way that each object, and as the last the sensor's car, has gone after each `STEP_S`
     distance_m: Array
 
-    def at(self, t_s: float) -> TrafficScene:
+    def at(self, t_s: float) -> traffic.TrafficScene:
         """Return the scene at a time since its begin."""
         position = min(max(t_s / STEP_S, 0.0), len(self.distance_m) - 1.000001)
         k = int(position)
@@ -169,7 +158,7 @@ class TrafficRun:
         return replace(self.scene, objects=tuple(kept), sensor=sensor)
 
 
-def run_of(scene: TrafficScene, duration_s: float) -> TrafficRun:
+def run_of(scene: traffic.TrafficScene, duration_s: float) -> TrafficRun:
     """Let a scene run: arcs as at time 0, speeds by the intelligent driver model."""
     ego = None if scene.mount == "roadside" else _own_car(scene)
     movers = [*scene.objects, *([] if ego is None else [ego])]
@@ -186,7 +175,7 @@ def run_of(scene: TrafficScene, duration_s: float) -> TrafficRun:
     return TrafficRun(scene, ego, distance)
 
 
-def _own_car(scene: TrafficScene) -> TrafficObject:
+def _own_car(scene: traffic.TrafficScene) -> traffic.TrafficObject:
     R, position = scene.sensor.rotation, scene.sensor.position_m
     yaw = float(np.arctan2(R[1, 0], R[0, 0]))
     speed = float(np.hypot(*scene.sensor.velocity_mps))
@@ -194,10 +183,12 @@ def _own_car(scene: TrafficScene) -> TrafficObject:
     along = np.cos(yaw - scene.roads[0].yaw_rad)
     follows = abs(along) > np.cos(MAX_ROAD_ANGLE_RAD)
     turn = speed * scene.roads[0].curvature_per_m * float(np.sign(along)) if follows else 0.0
-    return TrafficObject("car", middle, yaw, CAR_SIZE_M, (), speed, turn)
+    return traffic.TrafficObject("car", middle, yaw, CAR_SIZE_M, (), speed, turn)
 
 
-def _moved(item: TrafficObject, distance_m: float, speed_mps: float, scene: TrafficScene | None) -> TrafficObject:
+def _moved(
+    item: traffic.TrafficObject, distance_m: float, speed_mps: float, scene: traffic.TrafficScene | None
+) -> traffic.TrafficObject:
     """Move an object along its arc; with a scene also up and down with the ground."""
     if item.speed_mps == 0 or item.kind == "own car":
         return item
@@ -208,7 +199,7 @@ def _moved(item: TrafficObject, distance_m: float, speed_mps: float, scene: Traf
     return replace(item, position_m=position, yaw_rad=yaw, speed_mps=speed_mps, turn_radps=turn)
 
 
-def _acceleration(places: list[TrafficObject], speed: Array, wish: Array) -> Array:
+def _acceleration(places: list[traffic.TrafficObject], speed: Array, wish: Array) -> Array:
     """Accelerations (M,) of road users that keep their distance to what is in their way."""
     xy = np.array([o.position_m[:2] for o in places]).reshape(-1, 2)
     yaw = np.array([o.yaw_rad for o in places])
@@ -239,7 +230,7 @@ MAX_CACHED = 4
 
 
 def log_of(
-    scene: TrafficScene,
+    scene: traffic.TrafficScene,
     environment: Environment,
     name: str,
     duration_s: float,
@@ -254,13 +245,13 @@ def log_of(
     Labels are given at the camera's stamps, for all road users around; those in images take most of the time.
     """
     run = run_of(scene, duration_s)
-    rig = rig_of(scene)
+    rig = traffic.rig_of(scene)
     mount = "map" if scene.mount == "roadside" else "ego"
     mount_T_lidar = rig.map_T_lidar
     if mount == "ego":
         place = np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])])
         mount_T_lidar = transform(np.eye(3), place)
-    lidar_T_cam = mount_T_cam_of(scene.mount, rig)
+    lidar_T_cam = traffic.mount_T_cam_of(scene.mount, rig)
     camera = replace(rig.camera, name=CAMERA, mount=mount, mount_T_cam=mount_T_lidar @ lidar_T_cam)  # type: ignore[arg-type]
     film = _Film(run, environment, camera, lidar_T_cam, seed)
     # A sweep's middle lies within the log, and so do its first and last point.
@@ -292,7 +283,7 @@ def stamps_of(t_s: Array) -> NDArray[np.int64]:
     return stamps
 
 
-def map_T_lidar_of(scene: TrafficScene) -> Array:
+def map_T_lidar_of(scene: traffic.TrafficScene) -> Array:
     """Return the pose of the LiDAR that records a scene."""
     return transform(scene.sensor.rotation, scene.sensor.position_m)
 
@@ -381,7 +372,7 @@ Progress = Callable[[int, int], None]
 class TrafficSettings:
     """What to write."""
 
-    mount: Mount  # "vehicle" or "roadside"
+    mount: traffic.Mount  # "vehicle" or "roadside"
     scenes: int = 10
     seed: int = 0
     sensor: str | None = None  # name or TOML file of a LiDAR, "random", or None for the usual one of the mount
@@ -402,7 +393,7 @@ def write_traffic(
     """
     if settings.layout == "kitti" and not settings.pictures:
         raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")
-    sensor_named(settings.sensor, settings.mount)
+    traffic.sensor_named(settings.sensor, settings.mount)
     refuse_folder(out, overwrite=overwrite, holding=MANIFEST, kind="data of random traffic")
     check_folder(out, overwrite=overwrite)
     with replaced_folder(out, overwrite=overwrite) as folder:
@@ -433,17 +424,19 @@ def write_traffic(
         (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
-def draw_traffic(settings: TrafficSettings, index: int) -> tuple[TrafficScene, Environment]:
+def draw_traffic(settings: TrafficSettings, index: int) -> tuple[traffic.TrafficScene, Environment]:
     """Draw scene `index`; it depends on the seed and the index, not on how many there are."""
-    environment = draw_environment(np.random.default_rng([settings.seed, index, 1]), settings.light, settings.weather)
-    lidar = sensor_named(settings.sensor, settings.mount)
+    environment = traffic.draw_environment(
+        np.random.default_rng([settings.seed, index, 1]), settings.light, settings.weather
+    )
+    lidar = traffic.sensor_named(settings.sensor, settings.mount)
     rng = np.random.default_rng([settings.seed, index, 0])
-    return draw_scene(settings.mount, rng, lidar=lidar, weather=weather_of(environment)), environment
+    return traffic.draw_scene(settings.mount, rng, lidar=lidar, weather=weather_of(environment)), environment
 
 
-def write_frame(folder: Path, index: int, scene: TrafficScene, environment: Environment, seed: int) -> None:
+def write_frame(folder: Path, index: int, scene: traffic.TrafficScene, environment: Environment, seed: int) -> None:
     """Write picture, cloud, calibration and labels of a scene at time 0 below a folder such as `training`."""
-    rig = rig_of(scene)
+    rig = traffic.rig_of(scene)
     painter = TrafficPainter(scene, seed)
     instant, seen = painter.instant(scene, light_of(environment), rig.camera, rig.map_T_cam)
     image = render(rig.camera, rig.map_T_cam, instant, np.random.default_rng([seed, 2]))
@@ -461,7 +454,7 @@ def write_frame(folder: Path, index: int, scene: TrafficScene, environment: Envi
 
 
 def _write_log(
-    settings: TrafficSettings, scene: TrafficScene, environment: Environment, folder: Path, seed: int
+    settings: TrafficSettings, scene: traffic.TrafficScene, environment: Environment, folder: Path, seed: int
 ) -> None:
     from log2sim.logs.native.writer import write_log
 

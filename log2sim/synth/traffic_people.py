@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from log2sim.synth.polytopes import Material, Polytope, Shape, box, column, ellipsoid, prism, wheel
+from log2sim.synth.polytopes import Material, Polytope, Shape, block, box, column, ellipsoid, prism, wheel
 
 Rng = np.random.Generator
 Kinds = dict[str, tuple[float, Callable[[Rng], Shape]]]
@@ -117,18 +117,10 @@ def bent(rng: Rng) -> Shape:
 def seated(rng: Rng) -> Shape:
     """Draw somebody who sits: on a chair, a bench, a wall or the ground."""
     height = _height(rng)
-    seat = float(
-        rng.choice([rng.uniform(0.02, 0.1), rng.uniform(0.38, 0.5), rng.uniform(0.5, 0.75)], p=[0.1, 0.75, 0.15])
-    )
-    knee = rng.uniform(0.4, 0.52)
-    parts = _torso(
-        rng,
-        height,
-        base=seat,
-        lean=rng.uniform(-0.08, 0.25),
-        x=-0.15,
-        reach=rng.uniform(0.15, 0.4) if rng.random() < 0.5 else None,
-    )
+    seats = [rng.uniform(0.02, 0.1), rng.uniform(0.38, 0.5), rng.uniform(0.5, 0.75)]
+    seat, knee = float(rng.choice(seats, p=[0.1, 0.75, 0.15])), rng.uniform(0.4, 0.52)
+    lean = rng.uniform(-0.08, 0.25)
+    parts = _torso(rng, height, base=seat, lean=lean, x=-0.15, reach=_perhaps(rng, 0.15, 0.4))
     parts += [
         box((-0.2, -0.19, seat), (knee - 0.1, 0.19, seat + 0.16), CLOTH),
         box((knee - 0.22, -0.17, 0.0), (knee - 0.06, 0.17, seat + 0.14), CLOTH),
@@ -156,9 +148,8 @@ def laden(rng: Rng) -> Shape:
         sides = ((-0.33,), (0.33,), (-0.33, 0.33))[rng.integers(3)]
         parts += [box((-0.17, y - 0.08, 0.15), (0.17, y + 0.08, 0.6), CLOTH) for y in sides]
     else:
-        parts.append(
-            box((0.12, -0.25, hips + 0.05), (rng.uniform(0.4, 0.6), 0.25, hips + rng.uniform(0.25, 0.5)), WOOD)
-        )
+        front, top = rng.uniform(0.4, 0.6), hips + rng.uniform(0.25, 0.5)
+        parts.append(box((0.12, -0.25, hips + 0.05), (front, 0.25, top), WOOD))
     return _person(parts)
 
 
@@ -170,10 +161,6 @@ def suitcase(rng: Rng) -> Shape:
     return _person(_upright(rng, height), case)
 
 
-def _wheels(at: list[tuple[float, float]], radius: float) -> list[Polytope]:
-    return [wheel(radius, 0.05, x, y) for x, y in at]
-
-
 def cart(rng: Rng) -> Shape:
     """Draw somebody who pushes a shopping cart, a hand cart with goods or a wheelbarrow."""
     height, start = _height(rng), rng.uniform(0.4, 0.6)
@@ -181,46 +168,32 @@ def cart(rng: Rng) -> Shape:
     top = low + rng.uniform(0.3, 1.0)
     mesh = MESH if rng.random() < 0.4 else WOOD
     things = [box((start, -w, low), (end, w, top), mesh), box((start - 0.1, -w, 0.9), (start, w, 0.96), METAL)]
-    things += _wheels([(x, y) for x in (start + 0.15, end - 0.15) for y in (-w, w)], rng.uniform(0.07, low * 0.8))
+    radius = rng.uniform(0.07, low * 0.8)
+    things += [wheel(radius, 0.05, x, y) for x in (start + 0.15, end - 0.15) for y in (-w, w)]
     return _person(_upright(rng, height, reach=start, lean=rng.uniform(0.05, 0.3)), things)
 
 
 def pram(rng: Rng) -> Shape:
     """Draw somebody who pushes a pram."""
     height, start = _height(rng), rng.uniform(0.45, 0.6)
-    hood, bar = rng.uniform(0.9, 1.1), box((start - 0.1, -0.25, 0.95), (start, 0.25, 1.0), METAL)
+    hood, radius = rng.uniform(0.9, 1.1), rng.uniform(0.1, 0.2)
     things = [
         box((start, -0.24, 0.45), (start + 0.75, 0.24, 0.7), CLOTH),
         box((start + 0.4, -0.24, 0.65), (start + 0.75, 0.24, hood), CLOTH),
-    ]
-    things += [
-        bar,
-        *_wheels([(x, y) for x in (start + 0.1, start + 0.65) for y in (-0.26, 0.26)], rng.uniform(0.1, 0.2)),
+        box((start - 0.1, -0.25, 0.95), (start, 0.25, 1.0), METAL),
+        *(wheel(radius, 0.05, x, y) for x in (start + 0.1, start + 0.65) for y in (-0.26, 0.26)),
     ]
     return _person(_upright(rng, height, reach=start), things)
 
 
 def dog(rng: Rng) -> Shape:
     """Draw somebody with a dog on a leash."""
-    height, x, y, tall = (
-        _height(rng),
-        rng.uniform(-0.6, 1.2),
-        rng.choice([-1, 1]) * rng.uniform(0.4, 0.9),
-        rng.uniform(0.25, 0.7),
-    )
-    length = tall * rng.uniform(0.6, 0.8)
-    things = [box((x - length, y - tall * 0.18, tall * 0.5), (x + length, y + tall * 0.18, tall), CLOTH)]
-    things += [
-        box(
-            (x + s * length * 0.85 - 0.04, y - tall * 0.15, 0.0),
-            (x + s * length * 0.85 + 0.04, y + tall * 0.15, tall * 0.6),
-            CLOTH,
-        )
-        for s in (1, -1)
-    ]
-    things.append(
-        box((x + length, y - tall * 0.12, tall * 0.8), (x + length + tall * 0.35, y + tall * 0.12, tall * 1.15), CLOTH)
-    )
+    height, x, y = _height(rng), rng.uniform(-0.6, 1.2), rng.choice([-1, 1]) * rng.uniform(0.4, 0.9)
+    tall = rng.uniform(0.25, 0.7)
+    length, wide, front = tall * rng.uniform(0.6, 0.8), tall * 0.12, tall * 0.35
+    things = [block(x, y, length, tall * 0.18, (tall * 0.5, tall), CLOTH)]
+    things += [block(x + s * length * 0.85, y, 0.04, tall * 0.15, (0.0, tall * 0.6), CLOTH) for s in (1, -1)]
+    things.append(box((x + length, y - wide, tall * 0.8), (x + length + front, y + wide, tall * 1.15), CLOTH))
     return _person(_upright(rng, height), things)
 
 
@@ -251,9 +224,7 @@ def _bicycle(rng: Rng, length: float, radius: float) -> list[Polytope]:
         box((reach * 0.62, -0.28, bar), (reach * 0.74, 0.28, bar + 0.07), METAL),
     ]
     if rng.random() < 0.3:
-        parts.append(
-            box((-reach - 0.2, -0.17, radius * 2), (-reach + 0.2, 0.17, radius * 2 + rng.uniform(0.05, 0.35)), CLOTH)
-        )
+        parts.append(block(-reach, 0.0, 0.2, 0.17, (radius * 2, radius * 2 + rng.uniform(0.05, 0.35)), CLOTH))
     if rng.random() < 0.25:
         parts.append(box((reach * 0.75, -0.2, seat - 0.1), (reach * 0.75 + 0.3, 0.2, seat + 0.15), MESH))
     return parts
@@ -262,33 +233,28 @@ def _bicycle(rng: Rng, length: float, radius: float) -> list[Polytope]:
 def pushed_bicycle(rng: Rng) -> Shape:
     """Draw somebody who walks beside a bicycle."""
     height, y = _height(rng), rng.choice([-1, 1]) * rng.uniform(0.35, 0.5)
-    things = [
-        shifted(p, rng.uniform(0.0, 0.3), y) for p in _bicycle(rng, rng.uniform(1.6, 1.85), rng.uniform(0.31, 0.36))
-    ]
+    parts = _bicycle(rng, rng.uniform(1.6, 1.85), rng.uniform(0.31, 0.36))
+    things = [shifted(p, rng.uniform(0.0, 0.3), y) for p in parts]
     return _person(_upright(rng, height, reach=rng.uniform(0.2, 0.4)), things)
 
 
 def _rider(rng: Rng, height: float, seat: float, lean: float, foot: float) -> list[Polytope]:
     """Make a rider with two legs down to `foot`, or one silhouette of both."""
-    parts = _torso(
-        rng, height, base=seat, lean=lean, x=-0.2, reach=rng.uniform(0.25, 0.5) if rng.random() < 0.5 else None
-    )
+    parts = _torso(rng, height, base=seat, lean=lean, x=-0.2, reach=_perhaps(rng, 0.25, 0.5))
     if rng.random() < 0.4:
         wide = rng.uniform(0.3, 0.5)
         return [*parts, prism([(-0.15, foot), (0.2, foot), (0.2, seat), (-0.3, seat + 0.05)], wide, CLOTH)]
     for side, kick in ((1, rng.uniform(-0.1, 0.15)), (-1, rng.uniform(-0.1, 0.15))):
-        knee = prism(
-            [(-0.28, seat - 0.05), (0.15 + kick, seat - 0.2), (0.2 + kick, seat - 0.05), (-0.1, seat + 0.1)],
-            0.15,
-            CLOTH,
-        )
-        shin = prism(
-            [(kick / 2, foot), (0.15 + kick / 2, foot), (0.22 + kick, seat - 0.08), (0.08 + kick, seat - 0.08)],
-            0.12,
-            CLOTH,
-        )
-        parts += [shifted(knee, 0.0, side * 0.11), shifted(shin, 0.0, side * 0.12)]
+        knee = [(-0.28, seat - 0.05), (0.15 + kick, seat - 0.2), (0.2 + kick, seat - 0.05), (-0.1, seat + 0.1)]
+        shin = [(kick / 2, foot), (0.15 + kick / 2, foot), (0.22 + kick, seat - 0.08), (0.08 + kick, seat - 0.08)]
+        parts.append(shifted(prism(knee, 0.15, CLOTH), 0.0, side * 0.11))
+        parts.append(shifted(prism(shin, 0.12, CLOTH), 0.0, side * 0.12))
     return parts
+
+
+def _perhaps(rng: Rng, low: float, high: float) -> float | None:
+    """Draw how far arms reach; None half of the time."""
+    return rng.uniform(low, high) if rng.random() < 0.5 else None
 
 
 def _ridden(length: float, width: float, parts: list[Polytope]) -> Shape:
@@ -297,15 +263,10 @@ def _ridden(length: float, width: float, parts: list[Polytope]) -> Shape:
 
 def city_cyclist(rng: Rng, *, scale: float = 1.0, lean: tuple[float, float] = (0.0, 0.25)) -> Shape:
     """Draw a bicycle with its rider."""
-    length, radius, height = (
-        rng.uniform(1.6, 1.9) * scale,
-        rng.uniform(0.31, 0.36) * scale,
-        rng.normal(1.72, 0.1) * scale,
-    )
-    seat = rng.uniform(0.85, 1.0) * scale
-    parts = _bicycle(rng, length, radius) + _rider(
-        rng, height, seat, rng.uniform(*lean) * scale, rng.uniform(0.1, 0.35) * scale
-    )
+    length, radius = rng.uniform(1.6, 1.9) * scale, rng.uniform(0.31, 0.36) * scale
+    height, seat = rng.normal(1.72, 0.1) * scale, rng.uniform(0.85, 1.0) * scale
+    parts = _bicycle(rng, length, radius)
+    parts += _rider(rng, height, seat, rng.uniform(*lean) * scale, rng.uniform(0.1, 0.35) * scale)
     if rng.random() < 0.25:
         parts.append(box((-0.5, -0.18, seat + 0.1), (-0.25, 0.18, seat + 0.5), CLOTH))
     return _ridden(length, 0.65, parts)
@@ -316,10 +277,8 @@ def cargo_cyclist(rng: Rng) -> Shape:
     length, radius = rng.uniform(2.2, 2.7), 0.3
     reach, w = length / 2 - radius, rng.uniform(0.25, 0.42)
     parts = [shifted(p, -length / 2 + 0.7, 0.0) for p in _rider(rng, rng.normal(1.72, 0.1), 0.9, 0.05, 0.2)]
-    parts += [
-        wheel(radius, 0.05, -reach, 0.0),
-        *(wheel(0.25, 0.05, reach, y) for y in ((-w, w) if rng.random() < 0.5 else (0.0,))),
-    ]
+    parts.append(wheel(radius, 0.05, -reach, 0.0))
+    parts += [wheel(0.25, 0.05, reach, y) for y in ((-w, w) if rng.random() < 0.5 else (0.0,))]
     parts.append(box((0.0, -w, 0.25), (reach, w, rng.uniform(0.7, 1.1)), WOOD))
     parts.append(box((-reach, -0.03, 0.35), (0.0, 0.03, 0.5), METAL))
     return _ridden(length, 2 * w, parts)
@@ -335,11 +294,8 @@ def child_trailer(rng: Rng) -> Shape:
 
 def _motorcycle(rng: Rng, *, scooter: bool) -> tuple[float, float, list[Polytope]]:
     """Make length, height of the seat and parts of a motorcycle or scooter without a rider."""
-    length, radius = (
-        (rng.uniform(1.7, 1.95), rng.uniform(0.2, 0.27))
-        if scooter
-        else (rng.uniform(1.9, 2.3), rng.uniform(0.27, 0.33))
-    )
+    lengths, radii = ((1.7, 1.95), (0.2, 0.27)) if scooter else ((1.9, 2.3), (0.27, 0.33))
+    length, radius = rng.uniform(*lengths), rng.uniform(*radii)
     reach, seat = length / 2 - radius, rng.uniform(0.7, 0.85)
     parts = [wheel(radius, 0.14, s * reach, 0.0) for s in (1, -1)]
     parts += [
@@ -347,14 +303,11 @@ def _motorcycle(rng: Rng, *, scooter: bool) -> tuple[float, float, list[Polytope
         box((reach * 0.55, -0.35, seat + 0.2), (reach * 0.7, 0.35, seat + 0.3), METAL),
     ]
     if scooter:
+        apron = [(reach * 0.55, 0.2), (reach * 0.85, 0.35), (reach * 0.7, seat + 0.2), (reach * 0.55, seat + 0.2)]
         parts += [
             box((-reach, -0.18, 0.25), (-0.05, 0.18, seat - 0.05), PAINT),
             box((-0.1, -0.16, 0.18), (reach * 0.6, 0.16, 0.26), DARK),
-            prism(
-                [(reach * 0.55, 0.2), (reach * 0.85, 0.35), (reach * 0.7, seat + 0.2), (reach * 0.55, seat + 0.2)],
-                0.4,
-                PAINT,
-            ),
+            prism(apron, 0.4, PAINT),
         ]
     else:
         parts += [
@@ -362,18 +315,13 @@ def _motorcycle(rng: Rng, *, scooter: bool) -> tuple[float, float, list[Polytope
             box((0.1, -0.16, seat - 0.15), (reach * 0.6, 0.16, seat + 0.15), PAINT),
         ]
     if rng.random() < 0.4:
-        parts.append(
-            prism(
-                [
-                    (reach * 0.5, seat),
-                    (reach * 0.9, seat - 0.1),
-                    (reach * 0.65, seat + 0.5),
-                    (reach * 0.55, seat + 0.5),
-                ],
-                0.35,
-                GLASS,
-            )
-        )
+        screen = [
+            (reach * 0.5, seat),
+            (reach * 0.9, seat - 0.1),
+            (reach * 0.65, seat + 0.5),
+            (reach * 0.55, seat + 0.5),
+        ]
+        parts.append(prism(screen, 0.35, GLASS))
     return length, seat, parts
 
 
@@ -392,14 +340,8 @@ def parked_motorcycle(rng: Rng) -> Shape:
     """Draw a motorcycle or scooter without a rider, some under a cover."""
     length, seat, parts = _motorcycle(rng, scooter=bool(rng.random() < 0.5))
     if rng.random() < 0.1:
-        parts = [
-            prism(
-                [(-length / 2, 0.1), (length / 2, 0.1), (length * 0.3, seat + 0.3), (-length * 0.4, seat)],
-                0.6,
-                CLOTH,
-                taper=0.15,
-            )
-        ]
+        cover = [(-length / 2, 0.1), (length / 2, 0.1), (length * 0.3, seat + 0.3), (-length * 0.4, seat)]
+        parts = [prism(cover, 0.6, CLOTH, taper=0.15)]
     return _ridden(length, 0.75, parts)
 
 
@@ -411,36 +353,25 @@ def bicycle(rng: Rng) -> Shape:
 
 def kick_scooter(rng: Rng) -> Shape:
     """Draw a kick scooter without a rider."""
-    post = box((0.4, -0.02, 0.1), (0.46, 0.02, 1.1), METAL)
-    return (1.1, 0.45, 1.15), (
-        box((-0.5, -0.08, 0.08), (0.45, 0.08, 0.14), DARK),
-        post,
-        box((0.38, -0.22, 1.05), (0.46, 0.22, 1.12), METAL),
-        wheel(0.1, 0.05, 0.45, 0.0),
-    )
+    board = box((-0.5, -0.08, 0.08), (0.45, 0.08, 0.14), DARK)
+    post, bar = box((0.4, -0.02, 0.1), (0.46, 0.02, 1.1), METAL), box((0.38, -0.22, 1.05), (0.46, 0.22, 1.12), METAL)
+    return (1.1, 0.45, 1.15), (board, post, bar, wheel(0.1, 0.05, 0.45, 0.0))
 
 
 def stroller(rng: Rng) -> Shape:
     """Draw a stroller or a shopping cart that nobody holds."""
     height = rng.uniform(0.95, 1.1)
     parts = (box((-0.35, -0.25, 0.45), (0.35, 0.25, 0.75), CLOTH), box((-0.35, -0.25, 0.7), (0.0, 0.25, height), CLOTH))
-    return (0.9, 0.55, height), parts + tuple(
-        wheel(0.12, 0.05, sx * 0.32, sy * 0.24) for sx in (1, -1) for sy in (1, -1)
-    )
+    wheels = (wheel(0.12, 0.05, sx * 0.32, sy * 0.24) for sx in (1, -1) for sy in (1, -1))
+    return (0.9, 0.55, height), (*parts, *wheels)
 
 
 def animal(rng: Rng) -> Shape:
     """Draw a dog without its owner."""
     tall = rng.uniform(0.3, 0.75)
     length = tall * rng.uniform(0.6, 0.8)
-    legs = (
-        box((s * length * 0.85 - 0.04, -tall * 0.15, 0.0), (s * length * 0.85 + 0.04, tall * 0.15, tall * 0.6), CLOTH)
-        for s in (1, -1)
-    )
-    return (2 * length, tall * 0.4, tall), (
-        box((-length, -tall * 0.18, tall * 0.5), (length, tall * 0.18, tall), CLOTH),
-        *legs,
-    )
+    legs = (block(s * length * 0.85, 0.0, 0.04, tall * 0.15, (0.0, tall * 0.6), CLOTH) for s in (1, -1))
+    return (2 * length, tall * 0.4, tall), (block(0.0, 0.0, length, tall * 0.18, (tall * 0.5, tall), CLOTH), *legs)
 
 
 PEOPLE: Kinds = {

@@ -11,29 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from log2sim.synth.polytopes import Polytope, Shape, box, column, ellipsoid, prism, tube, wheel
-from log2sim.synth.traffic_people import (
-    CLOTH,
-    CYCLISTS,
-    DARK,
-    GLASS,
-    GROUND,
-    LEAVES,
-    MESH,
-    METAL,
-    MOTORCYCLES,
-    OTHERS,
-    PAINT,
-    PEOPLE,
-    WALL,
-    WOOD,
-    Kinds,
-    Rng,
-    bicycle,
-    parked_motorcycle,
-    seated,
-    shifted,
-)
+from log2sim.synth import traffic_people as people
+from log2sim.synth.polytopes import Material, Polytope, Shape, block, box, column, ellipsoid, prism, tube, wheel
+from log2sim.synth.traffic_people import Kinds, Rng, shifted
+
+GROUND, PAINT, GLASS, DARK, CLOTH, WALL, LEAVES, METAL, MESH, WOOD = Material
 
 
 @dataclass(frozen=True)
@@ -143,15 +125,10 @@ def _delivery_van(rng: Rng) -> Shape:
         [(-half, 0.35), (half - 0.1, 0.3), (half, 0.5), (half, hood - 0.2), (foot, hood), (-half, hood)],
         width, PAINT,
     )  # fmt: skip
-    upper = prism(
-        [(-half, hood), (foot - 0.9, hood), (top - 0.5, height), (-half + 0.05, height)],
-        width * 0.99,
-        PAINT,
-        taper=0.04,
-    )
-    screen = prism(
-        [(foot - 1.0, hood), (foot, hood), (top, height), (top - 0.6, height)], width * 0.97, GLASS, taper=0.06
-    )
+    side = [(-half, hood), (foot - 0.9, hood), (top - 0.5, height), (-half + 0.05, height)]
+    upper = prism(side, width * 0.99, PAINT, taper=0.04)
+    front = [(foot - 1.0, hood), (foot, hood), (top, height), (top - 0.6, height)]
+    screen = prism(front, width * 0.97, GLASS, taper=0.06)
     seats = box((foot - 1.2, -width * 0.4, hood - 0.1), (foot - 0.7, width * 0.4, hood + 0.45), CLOTH)
     return (length, width, height), (body, upper, screen, seats, *_wheels(half * 0.6, width, 0.34))
 
@@ -165,13 +142,8 @@ def truck(rng: Rng) -> Shape:
     parts += [box((-length * 0.48, -width * 0.25, 0.45), (length * 0.45, width * 0.25, floor + 0.02), DARK)]
     if rng.random() < 0.3:
         # A tail lift, a hopper or a ladder at the back.
-        parts.append(
-            box(
-                (-length / 2 - 0.05, -width * 0.45, rng.uniform(0.3, 0.8)),
-                (-length / 2 + 0.3, width * 0.45, floor + rng.uniform(0.2, 1.4)),
-                METAL,
-            )
-        )
+        back, w, low, high = -length / 2, width * 0.45, rng.uniform(0.3, 0.8), floor + rng.uniform(0.2, 1.4)
+        parts.append(box((back - 0.05, -w, low), (back + 0.3, w, high), METAL))
     axles = (length * 0.36, -length * 0.28, *((-length * 0.4,) if length > 8 else ()))
     parts += [wheel(0.48, 0.3, x, s * (width / 2 - 0.2)) for x in axles for s in (1, -1)]
     return (length, width, float(max(p.high[2] for p in parts))), tuple(parts)
@@ -179,13 +151,8 @@ def truck(rng: Rng) -> Shape:
 
 def tractor(rng: Rng) -> Shape:
     """Draw a tractor or a wheel loader: large wheels, a hood, a cab of glass."""
-    length, width, height, rear = (
-        rng.uniform(3.6, 5.5),
-        rng.uniform(1.8, 2.5),
-        rng.uniform(2.4, 3.2),
-        rng.uniform(0.65, 0.9),
-    )
-    half, w = length / 2, width / 2
+    length, width, height = rng.uniform(3.6, 5.5), rng.uniform(1.8, 2.5), rng.uniform(2.4, 3.2)
+    half, w, rear = length / 2, width / 2, rng.uniform(0.65, 0.9)
     parts = [
         box((0.0, -0.4, 0.6), (half - 0.2, 0.4, 1.5), PAINT),
         box((-half + 0.3, -0.7, 0.9), (0.2, 0.7, 1.5), PAINT),
@@ -301,11 +268,8 @@ def _load(back: float, front: float, width: float, floor: float, height: float, 
     if kind < 0.87:
         return [*bed, tube(min(w, (height - floor) / 2), (back, front), floor + min(w, (height - floor) / 2), METAL)]
     load = rng.uniform(0.5, 1.0)
-    cargo = box(
-        (back + 0.3, -w * 0.9, floor + 0.2),
-        (back + (front - back) * load, w * 0.9, floor + rng.uniform(0.6, 1.8)),
-        WOOD,
-    )
+    end, top = back + (front - back) * load, floor + rng.uniform(0.6, 1.8)
+    cargo = box((back + 0.3, -w * 0.9, floor + 0.2), (end, w * 0.9, top), WOOD)
     return [*bed, cargo, box((front - 0.08, -w, floor), (front, w, floor + 1.2), METAL)]
 
 
@@ -323,11 +287,8 @@ def semitrailer(rng: Rng) -> Shape:
 
 def bus(rng: Rng) -> Shape:
     """Draw a bus or coach."""
-    length, width, height = (
-        rng.choice([rng.uniform(6.5, 9), rng.uniform(10.5, 13), 18.0], p=[0.2, 0.65, 0.15]),
-        rng.uniform(2.3, 2.6),
-        rng.uniform(2.8, 3.5),
-    )
+    length = rng.choice([rng.uniform(6.5, 9), rng.uniform(10.5, 13), 18.0], p=[0.2, 0.65, 0.15])
+    width, height = rng.uniform(2.3, 2.6), rng.uniform(2.8, 3.5)
     half, w, belt = length / 2, width / 2, rng.uniform(1.0, 1.4)
     parts = [
         box((-half, -w, 0.3), (half, w, belt), PAINT),
@@ -336,10 +297,8 @@ def bus(rng: Rng) -> Shape:
         box((-half + 0.05, -w * 0.97, belt), (-half + 0.4, w * 0.97, height - 0.3), PAINT),
         box((-half + 0.6, -w * 0.8, belt - 0.2), (half - 1.5, w * 0.8, belt + 0.35), CLOTH),
     ]  # fmt: skip
-    parts += [
-        box((x - 0.08, -w * 0.99, belt), (x + 0.08, w * 0.99, height - 0.3), PAINT)
-        for x in np.arange(-half + 1.8, half - 1, 3.0)
-    ]
+    posts = np.arange(-half + 1.8, half - 1, 3.0)
+    parts += [block(x, 0.0, 0.08, w * 0.99, (belt, height - 0.3), PAINT) for x in posts]
     parts += [wheel(0.48, 0.3, x, s * (w - 0.18)) for x in (half * 0.6, -half * 0.55) for s in (1, -1)]
     return (length, width, height), tuple(parts)
 
@@ -354,21 +313,19 @@ def tree(rng: Rng) -> Parts:
     parts = [column(radius, (0.0, low + crown), WOOD)]
     for _ in range(rng.integers(1, 4)):
         r = crown * rng.uniform(0.6, 1.0)
-        parts.append(
-            ellipsoid((r, r, r * rng.uniform(0.7, 1.3)), (*rng.normal(0, 0.3 * crown, 2), low + crown), LEAVES)
-        )
+        radii = r, r, r * rng.uniform(0.7, 1.3)
+        parts.append(ellipsoid(radii, (*rng.normal(0, 0.3 * crown, 2), low + crown), LEAVES))
     return tuple(parts)
 
 
 def bush(rng: Rng) -> Parts:
     """Draw a bush of one to three volumes of leaves."""
     r, h = rng.uniform(0.25, 1.6), rng.uniform(0.4, 2.2)
-    return tuple(
-        ellipsoid(
-            (r * rng.uniform(0.6, 1), r * rng.uniform(0.6, 1), h / 2), (*rng.normal(0, 0.4 * r, 2), h * 0.4), LEAVES
-        )
-        for _ in range(rng.integers(1, 4))
-    )
+    parts = []
+    for _ in range(rng.integers(1, 4)):
+        radii = r * rng.uniform(0.6, 1), r * rng.uniform(0.6, 1), h / 2
+        parts.append(ellipsoid(radii, (*rng.normal(0, 0.4 * r, 2), h * 0.4), LEAVES))
+    return tuple(parts)
 
 
 def grass(rng: Rng) -> Parts:
@@ -449,11 +406,8 @@ def fence(length: float, rng: Rng) -> Parts:
     kind, half = rng.random(), length / 2
     height = rng.uniform(0.7, 2.2)
     if kind < 0.3:
-        t = rng.uniform(0.3, 0.8)
-        return (
-            box((-half, -t, 0.05), (half, t, height), LEAVES),
-            box((-half, -t * 0.4, 0.2), (half, t * 0.4, height * 0.8), LEAVES),
-        )
+        t, core = rng.uniform(0.3, 0.8), (0.2, height * 0.8)
+        return block(0.0, 0.0, half, t, (0.05, height), LEAVES), block(0.0, 0.0, half, t * 0.4, core, LEAVES)
     if kind < 0.5:
         return (box((-half, -rng.uniform(0.08, 0.25), 0), (half, 0.1, height * 0.8), WALL),)
     if kind < 0.65:
@@ -519,14 +473,9 @@ def planter(rng: Rng) -> Parts:
 def railing(rng: Rng) -> Parts:
     """Draw a railing or crowd barrier: bars between posts, or hoops to lean bicycles on."""
     length, height = rng.uniform(1.0, 5.0), rng.uniform(0.8, 1.2)
-    posts = [
-        box((x - 0.03, -0.03, 0), (x + 0.03, 0.03, height), METAL)
-        for x in np.arange(-length / 2, length / 2 + 0.1, rng.uniform(0.7, 1.5))
-    ]
-    bars = [
-        box((-length / 2, -0.02, z - 0.03), (length / 2, 0.02, z + 0.03), METAL)
-        for z in np.linspace(height, 0.3, rng.integers(1, 4))
-    ]
+    places, heights = np.arange(-length / 2, length / 2 + 0.1, rng.uniform(0.7, 1.5)), rng.integers(1, 4)
+    posts = (block(x, 0.0, 0.03, 0.03, (0, height), METAL) for x in places)
+    bars = (block(0.0, 0.0, length / 2, 0.02, (z - 0.03, z + 0.03), METAL) for z in np.linspace(height, 0.3, heights))
     return (*posts, *bars)
 
 
@@ -553,9 +502,7 @@ def crates(rng: Rng) -> Parts:
     parts: list[Polytope] = []
     for _ in range(rng.integers(1, 5)):
         x, y, w, z = *rng.normal(0, 0.4, 2), rng.uniform(0.15, 0.4), rng.uniform(0.0, 0.6)
-        parts.append(
-            box((x - w, y - w * 0.8, z if parts else 0.0), (x + w, y + w * 0.8, z + rng.uniform(0.2, 0.8)), WOOD)
-        )
+        parts.append(block(x, y, w, w * 0.8, (z if parts else 0.0, z + rng.uniform(0.2, 0.8)), WOOD))
     return tuple(parts)
 
 
@@ -566,25 +513,15 @@ def stall(rng: Rng) -> Parts:
     if rng.random() < 0.6:
         parts.append(box((-half, -d, 0.0), (half, -d + 0.03, h), CLOTH))
     else:
-        parts += [
-            box((x - 0.03, y - 0.03, 0.0), (x + 0.03, y + 0.03, h), METAL)
-            for x in (-half * 0.9, half * 0.9)
-            for y in (-d, d)
-        ]
+        parts += [block(x, y, 0.03, 0.03, (0.0, h), METAL) for x in (-half * 0.9, half * 0.9) for y in (-d, d)]
     for _ in range(rng.integers(1, 6)):
         x, y, w = rng.uniform(-half, half), rng.uniform(-d, d) * 0.6, rng.uniform(0.1, 0.4)
-        parts.append(box((x - w, y - 0.2, h), (x + w, y + 0.2, h + rng.uniform(0.05, 0.6)), WOOD))
+        parts.append(block(x, y, w, 0.2, (h, h + rng.uniform(0.05, 0.6)), WOOD))
     if rng.random() < 0.8:
         top, over = rng.uniform(1.9, 2.5), d + rng.uniform(0.1, 0.9)
         parts += [column(0.025, (0.0, top), METAL, at=(x, y)) for x in (-half, half) for y in (-over, over)]
-        parts.append(
-            prism(
-                [(-half - 0.2, top), (half + 0.2, top), (half, top + 0.4), (-half, top + 0.4)],
-                2 * over,
-                CLOTH,
-                taper=rng.uniform(0.0, 1.5),
-            )
-        )
+        canopy = [(-half - 0.2, top), (half + 0.2, top), (half, top + 0.4), (-half, top + 0.4)]
+        parts.append(prism(canopy, 2 * over, CLOTH, taper=rng.uniform(0.0, 1.5)))
         if rng.random() < 0.3:
             parts.append(box((-half, over - 0.03, 0.0), (half, over, top), CLOTH))
     return tuple(parts)
@@ -593,13 +530,10 @@ def stall(rng: Rng) -> Parts:
 def clothes_rail(rng: Rng) -> Parts:
     """Draw a rail on which clothes hang."""
     half, top = rng.uniform(0.5, 1.0), rng.uniform(1.3, 1.8)
-    feet = tuple(box((x - 0.02, -0.25, 0.0), (x + 0.02, 0.25, 0.05), METAL) for x in (-half, half))
-    posts = tuple(column(0.02, (0.0, top), METAL, at=(x, 0.0)) for x in (-half, half))
-    return (
-        *feet,
-        *posts,
-        box((-half * 0.95, -0.22, rng.uniform(0.4, 0.8)), (half * rng.uniform(0.3, 0.95), 0.22, top - 0.05), CLOTH),
-    )
+    feet = (block(x, 0.0, 0.02, 0.25, (0.0, 0.05), METAL) for x in (-half, half))
+    posts = (column(0.02, (0.0, top), METAL, at=(x, 0.0)) for x in (-half, half))
+    hem, end = rng.uniform(0.4, 0.8), half * rng.uniform(0.3, 0.95)
+    return (*feet, *posts, box((-half * 0.95, -0.22, hem), (end, 0.22, top - 0.05), CLOTH))
 
 
 def parasol(rng: Rng) -> Parts:
@@ -608,11 +542,8 @@ def parasol(rng: Rng) -> Parts:
     if rng.random() < 0.3:
         return (column(0.12, (0.9, top), CLOTH), column(0.025, (0.0, top), METAL))
     r = rng.uniform(0.9, 1.8)
-    return (
-        ellipsoid((r, r, 0.25), (0, 0, top), CLOTH),
-        column(0.025, (0.0, top), METAL),
-        column(0.25, (0.0, 0.12), WALL),
-    )
+    shade, foot = ellipsoid((r, r, 0.25), (0, 0, top), CLOTH), column(0.25, (0.0, 0.12), WALL)
+    return shade, column(0.025, (0.0, top), METAL), foot
 
 
 def table(rng: Rng) -> Parts:
@@ -621,10 +552,8 @@ def table(rng: Rng) -> Parts:
     parts = [box((-r, -r, h - 0.05), (r, r, h), WOOD), column(0.06, (0.0, h), METAL)]
     for k in range(rng.integers(0, 4)):
         x, y = np.array([np.cos(k * np.pi / 2), np.sin(k * np.pi / 2)]) * (r + 0.3)
-        parts += [
-            box((x - 0.2, y - 0.2, 0.4), (x + 0.2, y + 0.2, 0.45), WOOD),
-            box((x * 1.25 - 0.15, y * 1.25 - 0.15, 0.0), (x * 1.25 + 0.15, y * 1.25 + 0.15, 0.9), MESH),
-        ]
+        parts.append(block(x, y, 0.2, 0.2, (0.4, 0.45), WOOD))
+        parts.append(block(x * 1.25, y * 1.25, 0.15, 0.15, (0.0, 0.9), MESH))
     return tuple(parts)
 
 
@@ -642,9 +571,9 @@ SMALL: dict[str, tuple[float, float, Callable[[Rng], Parts]]] = {
 KINDS: dict[str, Kinds] = {
     "car": {"car": (1.0, car)},
     "truck": {"truck": (0.58, truck), "semitrailer": (0.32, semitrailer), "tractor": (0.05, tractor), "forklift": (0.02, forklift), "excavator": (0.03, excavator)},
-    "bus": {"bus": (1.0, bus)}, "motorcycle": MOTORCYCLES, "cyclist": CYCLISTS, "bicycle": {"bicycle": (1.0, bicycle)},
-    "pedestrian": PEOPLE, "other": OTHERS, "seated": {"seated": (1.0, seated)},
-    "parked motorcycle": {"parked": (1.0, parked_motorcycle)},
+    "bus": {"bus": (1.0, bus)}, "motorcycle": people.MOTORCYCLES, "cyclist": people.CYCLISTS,
+    "bicycle": {"bicycle": (1.0, people.bicycle)}, "pedestrian": people.PEOPLE, "other": people.OTHERS,
+    "seated": {"seated": (1.0, people.seated)}, "parked motorcycle": {"parked": (1.0, people.parked_motorcycle)},
     "trailer": {"small trailer": (0.6, small_trailer), "caravan": (0.4, caravan)},
 }  # fmt: skip
 """Kinds of each category of road users, and of people at tables and of what cars pull."""

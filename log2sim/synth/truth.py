@@ -14,19 +14,9 @@ from shapely.geometry.base import BaseGeometry
 
 from log2sim.datatypes import ImageLabels, Labels, MapFeatures, MapLane, Marking, RoadBorder
 from log2sim.geometry import NS_PER_S, Array, Camera, apply, box_corners, inverse, project, rotation_from_rpy, transform
-from log2sim.synth import raycast
+from log2sim.synth import ground, raycast
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.backdrop import Backdrop
-from log2sim.synth.ground import (
-    GroundPlan,
-    RoadLine,
-    Stroke,
-    arrow_outline,
-    crosswalk_stripes,
-    parallel,
-    road_lines,
-    stretch,
-)
 from log2sim.synth.render import Body, SceneInstant, frame_stamps, segment
 from log2sim.synth.scene import Road, Scene, Zebra
 
@@ -131,15 +121,15 @@ def map_features_of(scene: Scene) -> MapFeatures:
     paint begins to where it ends. Worn lines are whole, removed ones are left out. A lane lies between the lines that are
     painted, else between the ends of its road; it is cut where another road crosses it.
     """
-    plan = GroundPlan.of(scene)
+    plan = ground.GroundPlan.of(scene)
     markings: list[Marking] = []
     borders: list[RoadBorder] = []
     lanes: list[MapLane] = []
     for k, road in enumerate(plan.roads):
-        lines = road_lines(road, keeps_right=plan.keeps_right)
+        lines = ground.road_lines(road, keeps_right=plan.keeps_right)
         own = [_pieces_of(line, area_of(plan.interruptions(k)), f"line_{k}_{n}") for n, line in enumerate(lines)]
         markings += [piece for pieces in own for piece in pieces]
-        crossed = area_of([Stroke(np.array(r.line), r.width_m) for n, r in enumerate(plan.roads) if n != k])
+        crossed = area_of([ground.Stroke(np.array(r.line), r.width_m) for n, r in enumerate(plan.roads) if n != k])
         sides = _borders(road, crossed, k)
         borders += [piece for pieces in sides for piece in pieces]
         lanes += _lanes(road, k, plan.keeps_right, tuple(zip(lines, own)), sides, crossed)
@@ -148,14 +138,14 @@ def map_features_of(scene: Scene) -> MapFeatures:
         line = _on_ground(np.array(stop.line))
         markings.append(Marking(f"stop_line_{k}", "stop_line", line, stop.width_m, stop.color))
     for k, arrow in enumerate(plan.arrows):
-        outline = arrow_outline(arrow)
+        outline = ground.arrow_outline(arrow)
         turn = np.deg2rad(arrow.yaw_deg)
         across = outline @ np.array([-np.sin(turn), np.cos(turn)])
         markings.append(Marking(f"arrow_{k}", "other", _on_ground(outline), float(np.ptp(across)), "white"))
     return MapFeatures(tuple(markings), tuple(borders), tuple(lanes), (TURNS,) if len(plan.roads) > 1 else ())
 
 
-def area_of(strokes: Sequence[Stroke]) -> BaseGeometry:
+def area_of(strokes: Sequence[ground.Stroke]) -> BaseGeometry:
     """Area of strokes as they are painted: square ends, round joints."""
     parts = []
     for stroke in strokes:
@@ -185,7 +175,7 @@ def _along(whole: LineString, part: BaseGeometry) -> list[Interval]:
     return out
 
 
-def _pieces_of(line: RoadLine, gaps: BaseGeometry, name: str) -> list[Marking]:
+def _pieces_of(line: ground.RoadLine, gaps: BaseGeometry, name: str) -> list[Marking]:
     """Cut a line where it is interrupted."""
     whole = LineString(line.line)
     painted = [_along(whole, LineString(dash).difference(gaps)) for dash in line.dashes if len(dash) > 1]
@@ -194,7 +184,7 @@ def _pieces_of(line: RoadLine, gaps: BaseGeometry, name: str) -> list[Marking]:
     for begin, end in _left_over(line.line, gaps):
         inside = [(a, b) for a, b in dashes if a >= begin - MIN_PIECE_M and b <= end + MIN_PIECE_M]
         if inside:
-            points = stretch(line.line, min(a for a, _ in inside), max(b for _, b in inside))
+            points = ground.stretch(line.line, min(a for a, _ in inside), max(b for _, b in inside))
             out.append(Marking(f"{name}_{len(out)}", line.kind, _on_ground(points), line.width_m, line.color))
     return out
 
@@ -204,19 +194,21 @@ def _borders(road: Road, crossed: BaseGeometry, k: int) -> tuple[list[RoadBorder
     kind = "curb" if road.sidewalk_m > 0 else "edge"
     sides = []
     for name, side in (("right", -1), ("left", 1)):
-        line = parallel(np.array(road.line), side * road.width_m / 2)
-        pieces = [stretch(line, *interval) for interval in _left_over(line, crossed)]
+        line = ground.parallel(np.array(road.line), side * road.width_m / 2)
+        pieces = [ground.stretch(line, *interval) for interval in _left_over(line, crossed)]
         sides.append([RoadBorder(f"border_{k}_{name}_{n}", kind, _on_ground(p)) for n, p in enumerate(pieces)])
     return sides[0], sides[1]
 
 
 def _crosswalk(zebra: Zebra, k: int) -> Marking:
-    stripes = crosswalk_stripes(zebra)
+    stripes = ground.crosswalk_stripes(zebra)
     whole = LineString(np.array(zebra.line))
     begin = whole.project(Point(stripes[0].line[0]))
     end = whole.project(Point(stripes[-1].line[-1]))
-    middle = stretch(np.array(zebra.line), begin, end)
-    outline = np.concatenate([parallel(middle, -zebra.width_m / 2), parallel(middle, zebra.width_m / 2)[::-1]])
+    middle = ground.stretch(np.array(zebra.line), begin, end)
+    outline = np.concatenate(
+        [ground.parallel(middle, -zebra.width_m / 2), ground.parallel(middle, zebra.width_m / 2)[::-1]]
+    )
     return Marking(f"crosswalk_{k}", "crosswalk", _on_ground(outline), zebra.width_m, "white")
 
 
@@ -224,7 +216,7 @@ def _lanes(
     road: Road,
     number: int,
     keeps_right: bool,
-    lines: Sequence[tuple[RoadLine, list[Marking]]],
+    lines: Sequence[tuple[ground.RoadLine, list[Marking]]],
     borders: tuple[list[RoadBorder], list[RoadBorder]],
     crossed: BaseGeometry,
 ) -> list[MapLane]:
@@ -249,14 +241,14 @@ def _lanes(
     forward = [first <= lane < first + road.lanes - road.backward_lanes for lane in range(road.lanes)]
     parts: list[list[MapLane]] = []
     for lane in range(road.lanes):
-        middle = parallel(np.array(road.line), float(at[lane : lane + 2].mean()))
+        middle = ground.parallel(np.array(road.line), float(at[lane : lane + 2].mean()))
         whole = LineString(middle)
         free = [(interval, False) for interval in _along(whole, whole.difference(crossed))]
         pieces = sorted([*free, *((interval, True) for interval in _along(whole, whole.intersection(crossed)))])
         names = [f"lane_{number}_{lane}_{n}" for n in range(len(pieces))]
         parts.append([])
         for n, ((begin, end), inside) in enumerate(pieces):
-            points = stretch(middle, begin, end)
+            points = ground.stretch(middle, begin, end)
             ends = names[max(n - 1, 0) : n], names[n + 1 : n + 2]
             right, left = (None, None) if inside else [_beside(points, s) for s in (sides[lane][1], sides[lane + 1][0])]
             if not forward[lane]:
@@ -281,7 +273,7 @@ def _lanes(
     return out
 
 
-def _offset(road: Road, line: RoadLine) -> float:
+def _offset(road: Road, line: ground.RoadLine) -> float:
     """How far a line lies to the left of its road's line, m."""
     a, b = np.array(road.line[:2])
     ahead = (b - a) / np.linalg.norm(b - a)

@@ -21,7 +21,7 @@ from log2sim.files.documents import refuse_existing, replaced
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.records import RecordSource
 from log2sim.simulation.metrics.collisions import REPLAY
-from log2sim.simulation.result import AgentReplay, Replay
+from log2sim.simulation.result import Replay
 from log2sim.visualization.overlay import draw_moment, read_moment
 from log2sim.visualization.plot.drawing import draw_collisions
 from log2sim.visualization.plot.layers import new_collisions
@@ -34,13 +34,7 @@ FRAME_WIDTH_PX, JPEG_QUALITY = 236, 80
 ABOVE_PX, ABOVE_REACH_M = 236, 40.0
 
 
-@dataclass(frozen=True, eq=False)
-class Thumbnail:
-    """A small picture."""
-
-    media_type: str  # "image/png" or "image/jpeg"
-    data: bytes
-    caption: str = ""
+Thumbnail = tuple[str, bytes, str]  # a small picture: "image/png" or "image/jpeg", the bytes, and a caption
 
 
 def thumbnails_of_log(log: Log) -> list[Thumbnail]:
@@ -72,22 +66,18 @@ def thumbnail_of_scenario(scenario: Scenario, collisions_m: Array | None = None)
         draw_collisions(ax, collisions_m)
     ax.set(xlabel="", ylabel="")
     ax.tick_params(length=0, labelbottom=False, labelleft=False)
-    return [Thumbnail("image/png", png_bytes(figure, DPI))]
+    return [("image/png", png_bytes(figure, DPI), "")]
 
 
 def thumbnail_of_replay(replay: Replay) -> list[Thumbnail]:
     """Draw the paths that were driven from above, with the collisions of the replay."""
-    agents = tuple(_as_agent(a) for a in replay.agents if len(a))
+    agents = []
+    for a in (a for a in replay.agents if len(a)):
+        observed, sigma = np.ones(len(a), dtype=bool), np.zeros(len(a))
+        waypoints = Waypoints(a.t_s, a.x_m, a.y_m, a.z_m, a.yaw_rad, a.speed_mps, observed, sigma)
+        agents.append(Agent(a.id, a.category, a.size_m, waypoints, static=a.driver == "static"))
     end_s = max((float(a.waypoints.t_s[-1]) for a in agents), default=0.0)
-    return thumbnail_of_scenario(Scenario(replay.scenario, 0, end_s, agents), new_collisions(replay)[1])
-
-
-def _as_agent(driven: AgentReplay) -> Agent:
-    waypoints = Waypoints(
-        driven.t_s, driven.x_m, driven.y_m, driven.z_m, driven.yaw_rad, driven.speed_mps,
-        observed=np.ones(len(driven), dtype=bool), sigma_xy_m=np.zeros(len(driven)),
-    )  # fmt: skip
-    return Agent(driven.id, driven.category, driven.size_m, waypoints, static=driven.driver == "static")
+    return thumbnail_of_scenario(Scenario(replay.scenario, 0, end_s, tuple(agents)), new_collisions(replay)[1])
 
 
 def _middle_record(log: Log, name: str) -> Any:
@@ -97,7 +87,7 @@ def _middle_record(log: Log, name: str) -> Any:
 
 def _jpeg(image: NDArray[np.uint8], caption: str) -> Thumbnail:
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return Thumbnail("image/jpeg", data.tobytes(), caption)
+    return "image/jpeg", data.tobytes(), caption
 
 
 MAX_TEXT = 200  # letters of a name or a note that are shown
@@ -169,20 +159,17 @@ def _page(title: str, rows: Iterable[Row], pictures: Iterable[Thumbnail]) -> str
     table = "".join(
         f'<tr><td {cell};opacity:0.65">{_text(name)}</td><td {cell}">{_text(value)}</td></tr>' for name, value in rows
     )
-    shown = "".join(_figure(picture) for picture in pictures)
+    shown = ""
+    for media_type, data, caption in pictures:
+        label, source = escape(caption or "picture", quote=True), base64.b64encode(data).decode("ascii")
+        below = f'<figcaption style="font-size:85%;opacity:0.65">{_text(caption)}</figcaption>' * bool(caption)
+        image = f'<img alt="{label}" src="data:{media_type};base64,{source}" style="max-width:100%;height:auto">'
+        shown += f'<figure style="margin:0">{image}{below}</figure>'
     return (
         f'<div style="max-width:760px"><div><code>{_text(title)}</code></div>'
         f'<table style="border-collapse:collapse;margin:4px 0">{table}</table>'
         f'<div style="display:flex;flex-wrap:wrap;gap:8px">{shown}</div></div>'
     )
-
-
-def _figure(picture: Thumbnail) -> str:
-    data = base64.b64encode(picture.data).decode("ascii")
-    caption = f'<figcaption style="font-size:85%;opacity:0.65">{_text(picture.caption)}</figcaption>'
-    name = escape(picture.caption or "picture", quote=True)
-    image = f'<img alt="{name}" src="data:{picture.media_type};base64,{data}" style="max-width:100%;height:auto">'
-    return f'<figure style="margin:0">{image}{caption * bool(picture.caption)}</figure>'
 
 
 def _text(text: str) -> str:
@@ -250,11 +237,8 @@ def notebook_labels(scenario: Scenario, log: Log, t_ns: int) -> Labels:
     stamps = t_ns + np.round(AROUND_S * NS_PER_S).astype(np.int64)
     table = AgentTable.of(scenario.others, t_s, permanent=True)
     k, i = np.nonzero(table.present)
+    ids = np.array([agent.id for agent in scenario.others], dtype=np.str_)
     return Labels(
-        t_ns=stamps[i],
-        track_id=np.array([agent.id for agent in scenario.others], dtype=np.str_)[k],
-        category=table.category[k],
-        center_m=table.center_m[k, i] + shift,
-        size_m=table.size_m[k],
-        yaw_rad=table.yaw_rad[k, i],
-    )
+        t_ns=stamps[i], track_id=ids[k], category=table.category[k], center_m=table.center_m[k, i] + shift,
+        size_m=table.size_m[k], yaw_rad=table.yaw_rad[k, i],
+    )  # fmt: skip

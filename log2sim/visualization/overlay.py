@@ -15,18 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from log2sim import geometry
 from log2sim.datatypes import CATEGORIES, CATEGORY, Boxes3D, Labels, Log, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.files.documents import refuse_existing
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    PoseTrack,
-    box_corners_bev,
-    box_lines,
-    project_moving,
-)
 from log2sim.perception.detect.detectors import MAX_AGE_S, boxes_of_labels, interpolate_pairs, window_ns
 from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_to_map
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
@@ -45,7 +37,7 @@ class SweepInMap:
     """One sweep in the map frame."""
 
     name: str  # of the LiDAR
-    xyz: Array  # (N, 3), m, map frame
+    xyz: geometry.Array  # (N, 3), m, map frame
     middle_ns: int  # middle of its point times; its stamp where it has none
     motion: str  # how the motion of the sensor during the sweep was compensated
 
@@ -54,14 +46,14 @@ class SweepInMap:
 class Shot:
     """The image of one camera with what was projected into it."""
 
-    camera: Camera
+    camera: geometry.Camera
     t_ns: int  # stamp of the image
     image: NDArray[np.uint8] | None  # (H, W, 3) uint8 BGR none where it cannot be read
     # uv_px, depth_m: (N, 2), (N,) liDAR points in the image.
-    uv_px: Array
-    depth_m: Array
-    boxes: tuple[tuple[Array, str], ...]  # str), edges of each 3D box in px, and its category
-    image_boxes_px: Array  # (M, 4) labeled 2D boxes
+    uv_px: geometry.Array
+    depth_m: geometry.Array
+    boxes: tuple[tuple[geometry.Array, str], ...]  # edges of each 3D box in px, and its category
+    image_boxes_px: geometry.Array  # (M, 4) labeled 2D boxes
     residuals_s: dict[str, float]  # middle of the sweep less the stamp of the image
     problem: str = ""  # why a part is missing; empty where nothing is
 
@@ -101,7 +93,7 @@ def read_moment(
         notes.append("the log has no poses: drawn as if the ego stood still")
         ends = [int(t) for stream in log.streams.values() for t in (stream.t_ns[0], stream.t_ns[-1])]
         stamps = np.array([min(ends), max(ends) + 1], dtype=np.int64)
-        log = log.changed(ego=PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
+        log = log.changed(ego=geometry.PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
     schedule = synchronize(log, tuple(cameras) or tuple(log.cameras))
     tick = _find_tick(schedule, at_s) if t_ns is None else int(np.argmin(np.abs(schedule.t_ns - t_ns)))
     t_ns = int(schedule.t_ns[tick])
@@ -111,7 +103,7 @@ def read_moment(
     shots = tuple(_shot(log, schedule, reader, row, tick) for row in range(len(schedule.frames)))
     sweeps = reader.at(schedule, schedule.reference_row, tick)
     boxes = labels_at(log.labels, t_ns)
-    at = float(t_ns - schedule.t_ns[0]) / NS_PER_S
+    at = float(t_ns - schedule.t_ns[0]) / geometry.NS_PER_S
     return OverlayMoment(log, t_ns, at, shots, sweeps, boxes, (*notes, *reader.problems))
 
 
@@ -127,7 +119,7 @@ def labels_at(labels: Labels | None, t_ns: int) -> Boxes3D:
         rows = near[labels.track_id[near] == track]
         earlier, later = rows[labels.t_ns[rows] <= t_ns], rows[labels.t_ns[rows] > t_ns]
         ends = [*earlier[-1:], *later[:1]]
-        if len(ends) == 2 or abs(int(labels.t_ns[ends[0]]) - t_ns) <= MAX_AGE_S * NS_PER_S:
+        if len(ends) == 2 or abs(int(labels.t_ns[ends[0]]) - t_ns) <= MAX_AGE_S * geometry.NS_PER_S:
             before.append(ends[0])
             after.append(ends[-1])
     first, second = np.array(before, dtype=np.intp), np.array(after, dtype=np.intp)
@@ -143,7 +135,7 @@ def _find_tick(schedule: Schedule, at_s: float | None) -> int:
         records = np.sum([index >= 0 for index in rows], axis=0)
         fullest = np.flatnonzero(records == records.max())
         return int(fullest[len(fullest) // 2])
-    seconds = (schedule.t_ns - schedule.t_ns[0]) / NS_PER_S
+    seconds = (schedule.t_ns - schedule.t_ns[0]) / geometry.NS_PER_S
     slack = 0.5 * float(np.diff(seconds).max(initial=0.0)) + 1e-9
     if not -slack <= at_s <= seconds[-1] + slack:
         raise ConfigError(f"--at {at_s:g}: the log has ticks from 0 to {seconds[-1]:.3f} s; choose a time between them")
@@ -160,13 +152,11 @@ class _SweepReader:
 
     def at(self, schedule: Schedule, row: int, tick: int) -> tuple[SweepInMap, ...]:
         """Return the sweeps of a row of the schedule at a tick."""
-        found = [self._read(name, int(index[row, tick])) for name, index in schedule.sweeps.items()]
-        return tuple(sweep for sweep in found if sweep is not None)
-
-    def _read(self, name: str, index: int) -> SweepInMap | None:
-        if index >= 0 and (name, index) not in self._known:
-            self._known[name, index] = self._load(name, index)
-        return self._known.get((name, index))
+        wanted = [(name, int(index[row, tick])) for name, index in schedule.sweeps.items()]
+        for key in wanted:
+            if key[1] >= 0 and key not in self._known:
+                self._known[key] = self._load(*key)
+        return tuple(sweep for key in wanted if (sweep := self._known.get(key)) is not None)
 
     def _load(self, name: str, index: int) -> SweepInMap | None:
         try:
@@ -191,7 +181,10 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
     if index < 0:
         return replace(empty, problem="no image near this tick")
     t_ns = int(log.streams[name].t_ns[index])
-    shot = replace(empty, t_ns=t_ns, image_boxes_px=_image_boxes(log, name, t_ns))
+    shot = replace(empty, t_ns=t_ns)
+    if (labels := log.image_labels.get(name)) is not None:
+        near = np.abs(labels.t_ns - t_ns) <= STAMP_TOLERANCE_NS
+        shot = replace(shot, image_boxes_px=np.asarray(labels.box_px[near], dtype=np.float64))
     try:
         shot = replace(shot, image=RecordSource(log).require(name, index))
     except RecordError as error:
@@ -200,17 +193,13 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
         return replace(shot, problem="no ego pose at the stamp of the image")
     sweeps = reader.at(schedule, row, tick)
     points = np.concatenate([s.xyz for s in sweeps]) if sweeps else np.zeros((0, 3))
-    uv, depth, valid = project_moving(camera, points, poses_around(log, name, t_ns))
-    return replace(
-        shot,
-        uv_px=uv[valid],
-        depth_m=depth[valid],
-        boxes=_wireframes(log, camera, t_ns),
-        residuals_s={s.name: (s.middle_ns - t_ns) / NS_PER_S for s in sweeps},
-    )
+    uv, depth, valid = geometry.project_moving(camera, points, poses_around(log, name, t_ns))
+    residuals_s = {s.name: (s.middle_ns - t_ns) / geometry.NS_PER_S for s in sweeps}
+    boxes = _wireframes(log, camera, t_ns)
+    return replace(shot, uv_px=uv[valid], depth_m=depth[valid], boxes=boxes, residuals_s=residuals_s)
 
 
-def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str], ...]:
+def _wireframes(log: Log, camera: geometry.Camera, t_ns: int) -> tuple[tuple[geometry.Array, str], ...]:
     """Project the edges of the labels at a stamp; each box takes the pose of the line that shows its center."""
     boxes = labels_at(log.labels, t_ns)
     view = view_of(log, camera.name, t_ns)
@@ -220,15 +209,8 @@ def _wireframes(log: Log, camera: Camera, t_ns: int) -> tuple[tuple[Array, str],
     out = []
     for i in np.flatnonzero(shown.valid):
         corners = corners_in_view(view, shown.box_px[i], boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])
-        out.append((box_lines(camera, corners), str(boxes.category[i])))
+        out.append((geometry.box_lines(camera, corners), str(boxes.category[i])))
     return tuple(out)
-
-
-def _image_boxes(log: Log, name: str, t_ns: int) -> Array:
-    labels = log.image_labels.get(name)
-    if labels is None:
-        return np.zeros((0, 4))
-    return np.asarray(labels.box_px[np.abs(labels.t_ns - t_ns) <= STAMP_TOLERANCE_NS], dtype=np.float64)
 
 
 # Colors of boxes by group, none of which the colors of depths have.
@@ -341,20 +323,19 @@ def _draw_above(ax: Axes, moment: OverlayMoment, aspect: float) -> tuple[str, st
             vmin=-MAX_HEIGHT_M, vmax=MAX_HEIGHT_M,
         )  # fmt: skip
     boxes = moment.boxes
-    corners = box_corners_bev(boxes.center_m[:, :2] - origin[:2], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad)
+    corners = geometry.box_corners_bev(
+        boxes.center_m[:, :2] - origin[:2], boxes.size_m[:, 0], boxes.size_m[:, 1], boxes.yaw_rad
+    )
     colors = [COLORS[CATEGORY[str(c)].group] for c in boxes.category]
-    add_lines(ax, [_outline(c) for c in corners], colors=colors, linewidths=0.9, zorder=3)
+    # Around a box, and across its front to the center.
+    fronts = [(c[0] + c[3]) / 2 for c in corners]
+    lines = [np.array([front, *c, c[0], front, c.mean(axis=0)]) for c, front in zip(corners, fronts)]
+    add_lines(ax, lines, colors=colors, linewidths=0.9, zorder=3)
     for name in (*moment.log.lidars, *moment.log.cameras):
         at = moment.log.map_T_sensor(name, moment.t_ns)[0][0, :2, 3] - origin[:2]
         ax.plot(*at, "+", color="#FF5050", ms=5, mew=0.8, zorder=4)
     motion = [f"{s.name} {(s.middle_ns - moment.t_ns) / 1e6:+.1f} ms, {MOTION[s.motion]}" for s in moment.sweeps]
     return f"from above, in m from the ego or the sensors (+), {len(boxes.t_ns)} boxes", " · ".join(motion)
-
-
-def _outline(corners: Array) -> Array:
-    """Line (7, 2) around a box with corners (4, 2), and across its front to the center."""
-    front = (corners[0] + corners[3]) / 2
-    return np.array([front, *corners, corners[0], front, corners.mean(axis=0)])
 
 
 def _draw_frame(figure: Figure, moment: OverlayMoment, box_name: str) -> None:

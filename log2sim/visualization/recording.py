@@ -12,22 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim import geometry
 from log2sim.datatypes import AgentTable, Log, Scenario
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    Camera,
-    apply,
-    box_corners,
-    box_lines,
-    fold_radius,
-    inverse,
-    line_time_s,
-    nearest_index,
-    period_of,
-    project,
-)
 from log2sim.geometry.boxes import EDGES, NEAR_M
 from log2sim.perception.frames import give_pictures
 from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
@@ -54,16 +41,13 @@ def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) ->
     """
     require_cameras(log, asked)
     used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
-    return tuple(sorted(asked or used or log.cameras, key=lambda name: _place(log.cameras[name])))
 
+    def place(name: str) -> tuple[int, float]:  # those that look back come after the others, then those at the road
+        x, y = log.cameras[name].mount_T_cam[:2, 2]
+        azimuth = float(np.arctan2(y, x))
+        return (int(abs(azimuth) > BACK_RAD), -azimuth) if log.cameras[name].mount == "ego" else (2, 0.0)
 
-def _place(camera: Camera) -> tuple[int, float]:
-    """Sort cameras of a vehicle from left to right, then those that look back, then those at the road."""
-    x, y = camera.mount_T_cam[:2, 2]
-    azimuth = float(np.arctan2(y, x))
-    if camera.mount != "ego":
-        return 2, 0.0
-    return (1 if abs(azimuth) > BACK_RAD else 0), -azimuth
+    return tuple(sorted(asked or used or log.cameras, key=place))
 
 
 def require_overlap(log: Log, scenario: Scenario) -> None:
@@ -74,7 +58,7 @@ def require_overlap(log: Log, scenario: Scenario) -> None:
     spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
     if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
         first, last = min(span[0] for span in spans), max(span[1] for span in spans)
-        end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        end_ns = scenario.t0_ns + round(scenario.duration_s * geometry.NS_PER_S)
         raise LogError(
             f"{log.name}: its records are from stamp {first} to {last} ns, the scenario '{scenario.name}' from {scenario.t0_ns} "
             f"to {end_ns} ns; choose the log that the scenario was made of"
@@ -83,8 +67,8 @@ def require_overlap(log: Log, scenario: Scenario) -> None:
 
 def records_within(t_ns: NDArray[np.int64], scenario: Scenario) -> NDArray[np.int64]:
     """Return the indices of the records with stamps (F,) during a scenario."""
-    margin_ns = round(MARGIN_S * NS_PER_S)
-    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+    margin_ns = round(MARGIN_S * geometry.NS_PER_S)
+    end_ns = scenario.t0_ns + round(scenario.duration_s * geometry.NS_PER_S)
     return np.flatnonzero((t_ns >= scenario.t0_ns - margin_ns) & (t_ns <= end_ns + margin_ns)).astype(np.int64)
 
 
@@ -93,11 +77,11 @@ def take_at_rate(t_ns: NDArray[np.int64], index: NDArray[np.int64], rate_hz: flo
 
     Beats count from `start_ns`, so that the cameras of a rig show the same moments.
     """
-    if len(index) < 2 or period_of(t_ns[index]) * rate_hz > 0.75:
+    if len(index) < 2 or geometry.period_of(t_ns[index]) * rate_hz > 0.75:
         return index
-    stamps, step_ns = t_ns[index], round(NS_PER_S / rate_hz)
+    stamps, step_ns = t_ns[index], round(geometry.NS_PER_S / rate_hz)
     beats = np.arange(start_ns, stamps[-1] + step_ns // 2, step_ns, dtype=np.int64)
-    return index[np.unique(nearest_index(stamps, beats))]
+    return index[np.unique(geometry.nearest_index(stamps, beats))]
 
 
 def take_evenly(count: int, most: int) -> NDArray[np.int64]:
@@ -134,7 +118,7 @@ class OutlineProjector:
         view = view_of(self._log, camera, t_ns)
         if view is None or not self.agents:
             return []
-        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / NS_PER_S]), permanent=True)
+        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / geometry.NS_PER_S]), permanent=True)
         center, yaw, rows = table.center_m[:, 0], table.yaw_rad[:, 0], np.flatnonzero(table.present[:, 0])
         found = project_boxes_in_view(view, center[rows], table.size_m[rows], yaw[rows])
         height_px = found.box_px[:, 3] - found.box_px[:, 1]
@@ -150,14 +134,14 @@ class OutlineProjector:
         return out
 
 
-def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
+def ground_outline(camera: geometry.Camera, corners_cam: geometry.Array) -> tuple[int, geometry.Array]:
     """Return the kind and the coordinates, px, of the outline of a box with corners (8, 3), m, cam frame.
 
     Corners where straight lines between them are right: all in front of the camera, and the lens bends no edge visibly.
     """
     if (corners_cam[:, 2] > NEAR_M).all():
         ends = corners_cam[np.array(EDGES)]
-        uv = project(camera, np.concatenate([corners_cam, ends.mean(axis=1)]))[0]
+        uv = geometry.project(camera, np.concatenate([corners_cam, ends.mean(axis=1)]))[0]
         straight = uv[np.array(EDGES)].mean(axis=1)
         # Perspective moves the middle of an edge along it; what counts is its distance from the line.
         along = uv[np.array(EDGES)[:, 1]] - uv[np.array(EDGES)[:, 0]]
@@ -166,16 +150,18 @@ def ground_outline(camera: Camera, corners_cam: Array) -> tuple[int, Array]:
         bent = np.abs(along[:, 0] * off[:, 1] - along[:, 1] * off[:, 0]) / length
         if np.isfinite(uv).all() and bent.max() <= STRAIGHT_SHARE * camera.width_px:
             return CORNERS, uv[:8]
-    return SEGMENTS, box_lines(camera, corners_cam)
+    return SEGMENTS, geometry.box_lines(camera, corners_cam)
 
 
-def corners_in_view(view: View, box_px: Array, center_m: Array, size_m: Array, yaw_rad: float) -> Array:
+def corners_in_view(
+    view: View, box_px: geometry.Array, center_m: geometry.Array, size_m: geometry.Array, yaw_rad: float
+) -> geometry.Array:
     """Return the corners (8, 3), m, cam frame, of a box that is shown as `box_px` (4,), when the line of its middle is taken."""
     if view.cam_T_map_at is None:
-        cam_T_map = inverse(view.map_T_cam)
+        cam_T_map = geometry.inverse(view.map_T_cam)
     else:
-        cam_T_map = view.cam_T_map_at(line_time_s(view.camera, box_px.reshape(2, 2).mean(axis=0)[None]))[0]
-    return apply(cam_T_map, box_corners(center_m, size_m, yaw_rad)[0])
+        cam_T_map = view.cam_T_map_at(geometry.line_time_s(view.camera, box_px.reshape(2, 2).mean(axis=0)[None]))[0]
+    return geometry.apply(cam_T_map, geometry.box_corners(center_m, size_m, yaw_rad)[0])
 
 
 QUALITY = 72  # of JPEGs, of 100: at the sizes of a page, blocks are hardly seen
@@ -255,12 +241,19 @@ def picture_document(
     give_pictures(reader, [pictures], progress, least_px=width_px)
     entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
-    _thin_out(entries, budget_bytes)
+    used = [log.cameras[name] for name in entries]
+    forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in used]
+    while (total := sum(map(_bytes_of, entries.values()))) > budget_bytes:  # evenly over the time
+        for entry in entries.values():
+            kept = take_evenly(len(entry["t_s"]), int(0.97 * len(entry["t_s"]) * budget_bytes / total)).tolist()
+            entry |= {key: [entry[key][k] for k in kept] for key in ("t_s", "jpeg", "outlines", "cam_T_map")}
+        if all(len(entry["t_s"]) <= 1 for entry in entries.values()):
+            break
     return {
         "cameras": list(entries.values()),
-        "ahead": _ahead([log.cameras[name] for name in entries]),
+        "ahead": int(np.argmax(forward)) if forward else 0,
         "agents": [agent.id for agent in projector.agents],
-        "width_px": min(width_px, max((log.cameras[name].width_px for name in entries), default=0)),
+        "width_px": min(width_px, max((camera.width_px for camera in used), default=0)),
         "rate_hz": detail.rate_hz,
         "bytes": sum(map(_bytes_of, entries.values())),
     }
@@ -319,7 +312,7 @@ def _entry(
     camera, t_ns = log.cameras[name], log.streams[name].t_ns
     order = sorted(index for index, data in jpeg.items() if data)
     map_T_cam, known = log.map_T_sensor(name, t_ns[order])
-    reach = fold_radius(camera)
+    reach = geometry.fold_radius(camera)
     return {
         "name": name,
         "size_px": [camera.width_px, camera.height_px],
@@ -328,28 +321,13 @@ def _entry(
         "model": camera.distortion_model,
         "distortion": list(map(float, camera.distortion)),
         "reach": reach if np.isfinite(reach) else 1e6,
-        "cam_T_map": [np.round(inverse(m)[:3].ravel(), 7).tolist() if k else None for m, k in zip(map_T_cam, known)],
-        "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / NS_PER_S, 4) for i in order],
+        "cam_T_map": [
+            np.round(geometry.inverse(m)[:3].ravel(), 7).tolist() if k else None for m, k in zip(map_T_cam, known)
+        ],
+        "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / geometry.NS_PER_S, 4) for i in order],
         "jpeg": [base64.b64encode(jpeg[i]).decode() for i in order],
         "outlines": [projector.outlines(name, int(t_ns[i])) for i in order],
     }
-
-
-def _ahead(cameras: Sequence[Camera]) -> int:
-    """Return the place of the camera that looks straight ahead most; 0 where none is on the vehicle."""
-    forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in cameras]
-    return int(np.argmax(forward)) if forward else 0
-
-
-def _thin_out(entries: Mapping[str, dict[str, Any]], budget_bytes: int) -> None:
-    """Leave out pictures, evenly over the time, until all fit."""
-    while (total := sum(map(_bytes_of, entries.values()))) > budget_bytes:
-        for entry in entries.values():
-            kept = take_evenly(len(entry["t_s"]), int(0.97 * len(entry["t_s"]) * budget_bytes / total))
-            for key in ("t_s", "jpeg", "outlines", "cam_T_map"):
-                entry[key] = [entry[key][k] for k in kept.tolist()]
-        if all(len(entry["t_s"]) <= 1 for entry in entries.values()):
-            return
 
 
 def _bytes_of(entry: Mapping[str, Any]) -> int:
@@ -383,9 +361,9 @@ class PointsAbove:
 
     t_ns: int
     origin: tuple[int, int]  # (2,) tuple of, m map position that the points are relative to
-    xy_m: Array  # (N, 2) relative to `origin`
-    height_m: Array  # (N,) above the ground
-    intensity: Array  # (N,) NaN where it is not known
+    xy_m: geometry.Array  # (N, 2) relative to `origin`
+    height_m: geometry.Array  # (N,) above the ground
+    intensity: geometry.Array  # (N,) NaN where it is not known
 
 
 def point_document(
@@ -423,16 +401,11 @@ def point_document(
     while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
         moments = [moments[k] for k in take_evenly(len(moments), int(0.97 * len(moments) * budget_bytes / total))]
     return {
-        "t_s": [round((points.t_ns - scenario.t0_ns) / NS_PER_S, 4) for points, _ in moments],
-        "origin_m": [list(points.origin) for points, _ in moments],
-        "points": [text for _, text in moments],
-        "unit_m": UNIT_M,
-        "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M],
-        "intensity": bright > 0,
-        "cell_m": detail.size,
-        "rate_hz": detail.rate_hz,
-        "bytes": total,
-    }
+        "t_s": [round((points.t_ns - scenario.t0_ns) / geometry.NS_PER_S, 4) for points, _ in moments],
+        "origin_m": [list(points.origin) for points, _ in moments], "points": [text for _, text in moments],
+        "unit_m": UNIT_M, "height_m": [MIN_HEIGHT_M, HEIGHT_UNIT_M], "intensity": bright > 0, "cell_m": detail.size,
+        "rate_hz": detail.rate_hz, "bytes": total,
+    }  # fmt: skip
 
 
 def pack_recording(points: PointsAbove, cell_m: float, bright: float) -> str:
@@ -468,8 +441,8 @@ class _Sweeps:
         xyz, intensity = [], []
         for name, middle_ns in self._middle_ns.items():
             stamps = self._log.streams[name].t_ns + middle_ns
-            near = index if name == main else int(nearest_index(stamps, t_ns)[0])
-            if abs(int(stamps[near]) - t_ns) > MAX_APART_S * NS_PER_S:
+            near = index if name == main else int(geometry.nearest_index(stamps, t_ns)[0])
+            if abs(int(stamps[near]) - t_ns) > MAX_APART_S * geometry.NS_PER_S:
                 continue
             sweep = self._reader.get(name, near)
             mapped = None if sweep is None else sweep_to_map(self._log, name, sweep, compensate=True)
@@ -482,7 +455,7 @@ class _Sweeps:
             intensity.append(none if sweep.intensity is None else np.asarray(sweep.intensity, dtype=np.float64))
         return self._from_above(t_ns, np.concatenate(xyz), np.concatenate(intensity))
 
-    def _from_above(self, t_ns: int, xyz: Array, intensity: Array) -> PointsAbove:
+    def _from_above(self, t_ns: int, xyz: geometry.Array, intensity: geometry.Array) -> PointsAbove:
         """Keep what is near and neither under the ground nor high above it."""
         middle, ground_z = cloud_origin(self._log, t_ns)
         origin = np.rint(middle[:2])
@@ -498,10 +471,6 @@ class _Sweeps:
 POINT_SHARE = 0.3  # of the budget, for points, where there are pictures too; what they leave is for the pictures
 
 
-def _silent(stage: str, done: int, total: int) -> None:
-    """Report nothing."""
-
-
 # Of a page with pictures: mail and chat programs take so much, and a phone still opens it.
 DEFAULT_MAX_BYTES = 40_000_000
 
@@ -514,7 +483,7 @@ class Recorded:
     max_bytes: int = DEFAULT_MAX_BYTES  # of the whole page
     cameras: tuple[str, ...] = ()  # whose pictures to take; those that the scenario was made with where it is empty
     # Called as `progress(stage, done, total)` while records are read.
-    progress: Callable[[str, int, int], None] = _silent
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None
 
 
 def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int) -> dict[str, Any]:
@@ -531,33 +500,28 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     points = point_document(
         log, scenario, int(share * budget_bytes), reader, lambda done, total: report("page: sweeps", done, total)
     )
-    left = budget_bytes - (0 if points is None else points["bytes"])
-    pictures = None
+    left, pictures = budget_bytes - (0 if points is None else points["bytes"]), None
     if cameras:
-
-        def told(done: int, total: int) -> None:
-            report("page: pictures", done, total)
-
-        pictures = picture_document(log, scenario, cameras, budget_bytes=left, reader=reader, progress=told)
+        pictures = picture_document(
+            log, scenario, cameras, budget_bytes=left, reader=reader,
+            progress=lambda done, total: report("page: pictures", done, total),
+        )  # fmt: skip
     reader.require_some()
-    if pictures is not None and not pictures["cameras"]:
+    seen, hit = (
+        "no pictures: the log has none during the scenario",
+        "no LiDAR points: the log has none during the scenario",
+    )
+    if pictures is not None and pictures["cameras"]:
+        count, cameras_shown = sum(len(c["t_s"]) for c in pictures["cameras"]), len(pictures["cameras"])
+        noun = f"{count} picture{'s' * (count != 1)} of {cameras_shown} camera{'s' * (cameras_shown != 1)}"
+        seen = f"{noun}, {pictures['width_px']} px wide, {_rate_and_size(pictures)}"
+    else:
         pictures = None
-    return {"pictures": pictures, "points": points, "notes": [_tell_pictures(pictures), _tell_points(points)]}
+    if points is not None:
+        noun = f"LiDAR points of {len(points['t_s'])} sweep{'s' * (len(points['t_s']) != 1)}"
+        hit = f"{noun}, one in {points['cell_m']:g} m, {_rate_and_size(points)}"
+    return {"pictures": pictures, "points": points, "notes": [seen, hit]}
 
 
-def _tell_pictures(pictures: dict[str, Any] | None) -> str:
-    if pictures is None:
-        return "no pictures: the log has none during the scenario"
-    count, cameras = sum(len(c["t_s"]) for c in pictures["cameras"]), len(pictures["cameras"])
-    noun = f"{count} picture{'s' * (count != 1)} of {cameras} camera{'s' * (cameras != 1)}"
-    rate = f"up to {pictures['rate_hz']:g} a second"
-    return f"{noun}, {pictures['width_px']} px wide, {rate}: {pictures['bytes'] / 1e6:.1f} MB"
-
-
-def _tell_points(points: dict[str, Any] | None) -> str:
-    if points is None:
-        return "no LiDAR points: the log has none during the scenario"
-    count = len(points["t_s"])
-    noun = f"LiDAR points of {count} sweep{'s' * (count != 1)}"
-    rate = f"up to {points['rate_hz']:g} a second"
-    return f"{noun}, one in {points['cell_m']:g} m, {rate}: {points['bytes'] / 1e6:.1f} MB"
+def _rate_and_size(part: dict[str, Any]) -> str:
+    return f"up to {part['rate_hz']:g} a second: {part['bytes'] / 1e6:.1f} MB"

@@ -118,10 +118,11 @@ class Studio:
         shown = {"agents": _agents(result.scenario), "features": feature_columns(result.scenario), "version": version}
         return {**shown, "unmatched": list(result.unmatched)}
 
-    def allows(self, path: str, host: str | None, origin: str | None) -> bool:
-        """Whether a request is for this run, asked of this computer by its own page."""
-        named = path.startswith(f"/{self._token}/") and host == self.origin.removeprefix("http://")
-        return named and origin in (None, self.origin)
+    def allows(self, request: BaseHTTPRequestHandler, end: str) -> bool:
+        """Whether a request is for what ends so of this run, asked of this computer by its own page."""
+        named = request.path.startswith(f"/{self._token}/") and request.path.endswith(end)
+        asked = request.headers["Host"] == self.origin.removeprefix("http://")
+        return named and asked and request.headers["Origin"] in (None, self.origin)
 
 
 def _agents(scenario: Scenario) -> list[dict[str, Any]]:
@@ -143,9 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with the page."""
-        if not self.served.allows(self.path, self.headers["Host"], self.headers["Origin"]) or not self.path.endswith(
-            "/"
-        ):
+        if not self.served.allows(self, "/"):
             return self._answer(404, "text/plain", b"not found")
         try:
             self._answer(200, "text/html; charset=utf-8", self.served.page())
@@ -154,9 +153,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_PUT(self) -> None:
         """Keep corrections."""
-        if not self.served.allows(self.path, self.headers["Host"], self.headers["Origin"]) or not self.path.endswith(
-            "/corrections"
-        ):
+        if not self.served.allows(self, "/corrections"):
             return self._answer(404, "text/plain", b"not found")
         length = self.headers["Content-Length"] or ""
         if not length.isascii() or not length.isdecimal() or int(length[:12]) > MAX_BODY_BYTES:

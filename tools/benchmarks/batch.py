@@ -1,6 +1,6 @@
 """Rate, failures, memory and overhead of `log2sim batch` on many small logs that are written for it.
 
-    python tools/bench.py batch FOLDER [--logs 10000] [--jobs 2] [--damaged 10] [--detector lidar:labels]
+    python tools/bench.py batch FOLDER --logs 10000 --jobs 2
 
 One short drive is synthesized; each log is a copy of it at another time and place, with records that are links to the same files, so that
 10,000 logs take seconds to write. All of them must give the same number of agents, but for those that are damaged on purpose.
@@ -9,15 +9,12 @@ FOLDER/logs is written once; FOLDER/out goes on where an earlier call was stoppe
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-
-from entry import parser_of
 
 from log2sim.batch import plan_batch, run_batch
 from log2sim.batch.folder import Row, sum_up
@@ -51,20 +48,13 @@ STEP_NS, STEP_M = 10**12, 7.0
 SHIFTED = {"t_ns": STEP_NS, "x_m": STEP_M, "y_m": -STEP_M}
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Write the logs, run them and print a table."""
-    parser = parser_of(__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--logs", type=int, default=10_000)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--damaged", type=int, default=10, help="logs whose index is cut off")
-    parser.add_argument("--detector", default="lidar:labels")
-    asked = parser.parse_args(arguments)
-    root = asked.folder / "logs"
+def main(folder: Path, logs: int = 10_000, jobs: int = 2, damaged: int = 10, detector: str = "lidar:labels") -> None:
+    """Write the logs, of which `damaged` have an index that is cut off, run them and print a table."""
+    root = folder / "logs"
     if not root.exists():
-        write_logs(root, asked.logs, asked.damaged)
-    for line in measure(root, asked.folder / "out", asked.jobs, asked.detector):
-        print(line)
+        write_logs(root, logs, damaged)
+    for name, value in measure(root, folder / "out", jobs, detector).items():
+        print(f"{name:32}  {value}")
 
 
 def write_logs(root: Path, count: int, damaged: int) -> None:
@@ -106,45 +96,33 @@ def _moved(name: str, text: str, steps: int) -> str:
     return str(int(text) + steps * STEP_NS) if name == "t_ns" else repr(float(text) + steps * SHIFTED[name])
 
 
-def measure(root: Path, out: Path, jobs: int, detector: str) -> Iterable[str]:
-    """Run the batch and return the lines of a table."""
+def measure(root: Path, out: Path, jobs: int, detector: str) -> dict[str, str]:
+    """Run the batch: what ran, how fast, and what it cost beside the logs themselves."""
     began = time.perf_counter()
     batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": detector}))
     found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
-    wall, own, workers = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
-    with progress(quiet=False) as report_progress:
-        rows = run_batch(
-            batch, lambda: local_workers(jobs), progress=lambda done, total: report_progress("logs", done, total)
-        )
-    wall = time.perf_counter() - wall
-    own, workers = _cpu(resource.RUSAGE_SELF) - own, _cpu(resource.RUSAGE_CHILDREN) - workers
-    ran = [row for row in rows if row.name in missing]
-    return table(ran, {"found": found_s, "wall": wall, "own": own, "workers": workers}, jobs)
-
-
-def table(rows: Sequence[Row], spent: dict[str, float], jobs: int) -> Iterable[str]:
-    """Yield the lines: what ran, how fast, and what it cost beside the logs themselves."""
+    before = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
+    with progress(quiet=False) as report:
+        rows = run_batch(batch, lambda: local_workers(jobs), progress=lambda done, total: report("logs", done, total))
+    after = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
+    wall, own, workers = (b - a for a, b in zip(before, after))
+    rows = [row for row in rows if row.name in missing]
     count, sums = len(rows), sum_up(rows)
-    agents = sorted({row.agents for row in rows if row.agents is not None})
     in_logs = sum(row.cpu_s or 0.0 for row in rows)
     peaks = [row.peak_memory_mib for row in rows if row.peak_memory_mib is not None]
-    tenth = max(len(peaks) // 10, 1)
-    figures = {
+    return {
         "logs run": f"{count}, {sums['done']:.0f} done, {sums['failed']:.0f} failed ({_kinds(rows)})",
         "run twice": str(sum(row.attempts > 1 for row in rows)),
-        "agents a log": ", ".join(map(str, agents)),
-        "finding the logs": f"{spent['found']:.1f} s",
-        "wall time": f"{spent['wall']:.1f} s, {count / spent['wall']:.1f} logs/s with {jobs} workers",
-        "CPU time": f"{spent['own'] + spent['workers']:.1f} s",
+        "agents a log": ", ".join(map(str, sorted({row.agents for row in rows if row.agents is not None}))),
+        "finding the logs": f"{found_s:.1f} s",
+        "wall time": f"{wall:.1f} s, {count / wall:.1f} logs/s with {jobs} workers",
+        "CPU time": f"{own + workers:.1f} s",
         "of a log": f"{1000 * in_logs / count:.1f} ms",
-        "of a worker beside the logs": f"{1000 * (spent['workers'] - in_logs) / count:.1f} ms a log, its start among them",
-        "of client and scheduler": f"{1000 * spent['own'] / count:.2f} ms a log",
+        "of a worker beside the logs": f"{1000 * (workers - in_logs) / count:.1f} ms a log, its start among them",
+        "of client and scheduler": f"{1000 * own / count:.2f} ms a log",
         "memory of client and scheduler": f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB",
-        "memory of a worker": f"{max(peaks[:tenth]):.0f} MiB in the first tenth, {max(peaks):.0f} MiB in all",
+        "memory of a worker": f"{max(peaks[: len(peaks) // 10 or 1]):.0f} MiB in the first tenth, {max(peaks):.0f} MiB in all",
     }
-    width = max(map(len, figures))
-    yield from (f"{name:{width}}  {value}" for name, value in figures.items())
-    yield json.dumps({"rows": count, **{k: round(v, 3) for k, v in spent.items()}, "in_logs": round(in_logs, 3)})
 
 
 def _kinds(rows: Sequence[Row]) -> str:

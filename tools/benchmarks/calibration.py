@@ -1,6 +1,6 @@
 """Print how well time offset and yaw of a LiDAR are found in the sample and its sister scenes, and what is told of sound ones.
 
-    python tools/bench.py calibration [--seeds 30] [--only crossing,yard]
+    python tools/bench.py calibration --seeds 10 --only crossing
 
 Sweeps are cast and compared once for each scene; each seed draws new errors of GNSS and IMU, as large as those of the scene.
 Columns: share of seeds in which an offset, a yaw, anything else is told; RMSE, mean sigma and NEES (1 where sigma is right) of both estimates.
@@ -9,10 +9,9 @@ Columns: share of seeds in which an offset, a yaw, anything else is told; RMSE, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-from entry import parser_of
+from entry import SAMPLES
 
 from log2sim.config import CalibrationConfig
 from log2sim.geometry import NS_PER_S, inverse
@@ -21,7 +20,6 @@ from log2sim.localization.surfaces import SweepPairs, exp_of, pair_sweeps
 from log2sim.synth.scene import Scene, load_scene
 from log2sim.synth.synthesis import synthesize
 
-SAMPLES = Path(__file__).resolve().parents[2] / "samples"
 SCENES = {"crossing": SAMPLES / "crossing.toml"} | {f.stem: f for f in sorted((SAMPLES / "scenes").glob("*.toml"))}
 WITHOUT_ERRORS = {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0}
 
@@ -91,12 +89,9 @@ def line(name: str, figures: np.ndarray) -> str:
     return f"{name:12} {offset:6.2f} {yaw:5.2f} {other:5.2f}   {offset_words}   {yaw_words}"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--only", default="", help="scenes, separated by commas")
-    options = parser.parse_args(arguments)
+def main(seeds: int = 30, only: str = "") -> None:
+    """Print a row for each scene and fault; `only`: a scene."""
     print(f"{'':12} told: offset yaw else   offset RMSE sigma NEES, ms   yaw RMSE sigma NEES, degrees")
-    for name in options.only.split(",") if options.only else SCENES:
-        for row in rows_of(load_scene(SCENES[name]), options.seeds):
+    for name in [only] if only else SCENES:
+        for row in rows_of(load_scene(SCENES[name]), seeds):
             print(f"{name:10} {row}", flush=True)

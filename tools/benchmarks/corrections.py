@@ -1,31 +1,23 @@
 """What corrections by hand are worth: the doubtful and the wrong agents corrected as a person would who sees the truth.
 
-    python tools/bench.py corrections SCENARIO TRUTH [--browser] [--range M] [--out FILE.json]
+    python tools/bench.py corrections SCENARIO TRUTH --range 40
 
 TRUTH is a log with labels, or a scenario. Each agent that the scenario doubts, or that is wrong at more than a fifth of its ticks, gets what a person would
 give it: confirmed, deleted, merged, turned round, of another category or size (to 0.1 m), moved by key poses with errors of 5 cm, one a second.
 Agents that are found at less than a fifth of their ticks are added: by a click, key poses while the truth says that they are seen, and a size.
-Figures are those of `log2sim evaluate` before and after.
-
-With --browser the same is done on the page of the studio in a headless Chromium, by keys and clicks. Seconds an agent are those of the
-keystroke-level model (Card, Moran, Newell, Communications of the ACM 23, 1980: 0.28 s a key, 1.1 s to point, 0.1 s a button) for
-carrying it out, without the looking and thinking, and what the page takes to answer.
+Figures are those of `log2sim evaluate` before and after. Seconds an agent are those of the keystroke-level model (Card, Moran, Newell,
+Communications of the ACM 23, 1980: 0.28 s a key, 1.1 s to point, 0.1 s a button) for carrying it out in the studio, without the looking and thinking.
 """
 
 from __future__ import annotations
 
 import json
-import sys
-import tempfile
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entry import parser_of
 
 from benchmarks.table import markdown
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
@@ -34,7 +26,6 @@ from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE
 from log2sim.evaluation.metrics.evaluator import evaluate, place_truth
 from log2sim.evaluation.metrics.truth import load_truth
 from log2sim.geometry import NS_PER_S, wrap_angle
-from log2sim.visualization.studio import Studio
 
 HAND_M, HAND_RAD = 0.05, 0.02
 MOVED_M = 0.5  # a person moves what is farther off, a quarter of a car's width
@@ -101,15 +92,7 @@ def _of_missed(scenario: Scenario, true: Agent, place: tuple[Any, float], rng: n
     count = 1 if true.static else int(np.ceil(np.ptp(seen_s))) + 1
     t_s = np.linspace(seen_s[0], seen_s[-1], count) if count > 1 else np.full(1, np.median(seen_s))
     at = true.at(t_s + later_s)
-    poses = [
-        {
-            "t_ns": scenario.t0_ns + round(float(t_s[k]) * NS_PER_S),
-            "x_m": float(at.x_m[k] + shift[0] + rng.normal(0, HAND_M)),
-            "y_m": float(at.y_m[k] + shift[1] + rng.normal(0, HAND_M)),
-            "yaw_rad": float(wrap_angle(at.yaw_rad[k] + rng.normal(0, HAND_RAD))),
-        }
-        for k in np.flatnonzero(at.valid)
-    ]
+    poses = _key_poses(scenario, t_s, at, shift, np.flatnonzero(at.valid), rng)
     here = {k: poses[0][k] for k in ("t_ns", "x_m", "y_m")}
     yield "", {"kind": "add", "category": true.category, "poses": [{**here, "yaw_rad": 0.0}]}
     yield "", {"kind": "move", "agent": here, "poses": poses}
@@ -142,16 +125,23 @@ def _of_known(
     off = np.hypot(at.x_m + shift[0] - ours.x_m, at.y_m + shift[1] - ours.y_m)
     there = at.valid & ours.valid
     if there.any() and (off[there].mean() > MOVED_M or row["wrong_speed_ticks"] + row["wrong_motion_ticks"] > much):
-        poses = [
-            {
-                "t_ns": scenario.t0_ns + round(float(t_s[k]) * NS_PER_S),
-                "x_m": float(at.x_m[k] + shift[0] + rng.normal(0, HAND_M)),
-                "y_m": float(at.y_m[k] + shift[1] + rng.normal(0, HAND_M)),
-                "yaw_rad": float(wrap_angle(at.yaw_rad[k] + rng.normal(0, HAND_RAD))),
-            }
-            for k in np.flatnonzero(there)
-        ]
+        poses = _key_poses(scenario, t_s, at, shift, np.flatnonzero(there), rng)
         yield _step(scenario, agent, "move", poses=poses)
+
+
+def _key_poses(
+    scenario: Scenario, t_s: Any, at: Any, shift: Any, rows: Any, rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """Poses of the true states `at` as a hand puts them."""
+    return [
+        {
+            "t_ns": scenario.t0_ns + round(float(t_s[k]) * NS_PER_S),
+            "x_m": float(at.x_m[k] + shift[0] + rng.normal(0, HAND_M)),
+            "y_m": float(at.y_m[k] + shift[1] + rng.normal(0, HAND_M)),
+            "yaw_rad": float(wrap_angle(at.yaw_rad[k] + rng.normal(0, HAND_RAD))),
+        }
+        for k in rows
+    ]
 
 
 def _reference(scenario: Scenario, agent: Agent) -> dict[str, Any]:
@@ -165,105 +155,20 @@ def _step(scenario: Scenario, agent: Agent, kind: str, **more: Any) -> Step:
     return agent.id, {"kind": kind, "agent": _reference(scenario, agent), **more}
 
 
-def on_the_page(scenario: Scenario, steps: list[list[Step]], folder: Path) -> tuple[Scenario, dict[str, float]]:
-    """Carry the steps out on the page of the studio; return what came of it, and actions and seconds an agent."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-    from browser import browsing
+# Keys, clicks and drags in the studio by kind of correction; a key pose is sought, begun, dragged, turned and accepted.
+ACTIONS = {
+    "add": (1, 4, 0), "merge": (1, 1, 0), "size": (9, 4, 0), "category": (1, 1, 0), "confirm": (1, 0, 0), "delete": (1, 0, 0), "flip": (1, 0, 0),
+}  # fmt: skip
+POSE_ACTIONS = (2, 1, 2)
 
-    studio = Studio(scenario, folder / "corrections.json")
-    threading.Thread(target=studio.serve, daemon=True).start()
-    counts: Counter[str] = Counter()
-    with browsing(folder / "profile") as browser:
-        browser.open(studio.address, size=(1280, 800))
 
-        def key(name: str) -> None:
-            browser.press(name)
-            counts["keys"] += len(name)
-
-        def click(name: str) -> None:
-            browser.run("document.getElementById(arguments[0]).click()", f"studio-{name}")
-            counts["clicks"] += 1
-
-        def fill(name: str, value: Any, keys: int) -> None:
-            script = "const e = document.getElementById(arguments[0]); e.value = arguments[1]; e.dispatchEvent(new Event('change'))"
-            browser.run(script, f"studio-{name}", value)
-            counts["clicks"] += 1
-            counts["keys"] += keys
-
-        def seek(t_ns: int) -> None:
-            browser.run("log2sim.time = arguments[0]", (t_ns - scenario.t0_ns) / NS_PER_S)
-            counts["clicks"] += 1
-
-        def window(x_m: float, y_m: float) -> tuple[float, float]:
-            script = "const r = document.getElementById('map').getBoundingClientRect(), p = log2sim.pixelOf(...arguments); return [p[0] + r.left, p[1] + r.top]"
-            x, y = browser.run(script, x_m, y_m)
-            if not (30 < x < 850 and 90 < y < 640):  # the map is moved first
-                browser.run("log2sim.lookAt(...arguments)", x_m, y_m)
-                counts["drags"] += 1
-                x, y = browser.run(script, x_m, y_m)
-            return float(x), float(y)
-
-        begin, made = time.monotonic(), 0
-        for own in steps:
-            for k, (name, entry) in enumerate(own):
-                if entry["kind"] == "add":
-                    seek(entry["poses"][0]["t_ns"])
-                    known = browser.run("return log2sim.agents")
-                    click("add")
-                    fill("category", entry["category"], 1)
-                    browser.mouse(window(entry["poses"][0]["x_m"], entry["poses"][0]["y_m"]))
-                    made += 1
-                    browser.wait(f"log2sim.corrections().length === {made}")
-                    (name,) = set(browser.run("return log2sim.agents")) - set(known)
-                    browser.run("log2sim.choose(arguments[0])", name)
-                    counts["clicks"] += 2
-                    continue
-                if k == 0:
-                    seek(entry["agent"]["t_ns"])
-                    browser.run("log2sim.choose(arguments[0])", name)  # a click in the list, or on it in the map
-                    counts["clicks"] += 1
-                kind = entry["kind"]
-                if kind == "merge":
-                    key("M")
-                    browser.mouse(window(entry["other"]["x_m"], entry["other"]["y_m"]))
-                    counts["clicks"] += 1
-                elif kind == "size":
-                    for side, value in zip(("length", "width", "height"), entry["size_m"]):
-                        fill(side, value, 3)
-                    click("size")
-                elif kind == "category":
-                    fill("category", entry["category"], 1)
-                elif kind == "move":
-                    for pose in entry["poses"]:
-                        seek(pose["t_ns"])
-                        key("E")
-                        x, y, yaw, ahead = browser.run("return log2sim.poseOf()")
-                        browser.mouse(window(x, y), window(pose["x_m"], pose["y_m"]))
-                        counts["drags"] += 1
-                        if abs(wrap_angle(pose["yaw_rad"] - yaw)) > 2 * HAND_RAD:
-                            x, y, yaw, ahead = browser.run("return log2sim.poseOf()")
-                            tips = [
-                                window(x + ahead * np.cos(a), y + ahead * np.sin(a)) for a in (yaw, pose["yaw_rad"])
-                            ]
-                            browser.mouse(*tips)
-                            counts["drags"] += 1
-                        key("\ue007")
-                        made += 1
-                        browser.wait(f"log2sim.corrections().length === {made}")
-                    continue
-                else:
-                    key({"confirm": "K", "delete": "\ue017", "flip": "B"}[kind])
-                made += 1
-                browser.wait(f"log2sim.corrections().length === {made}")
-        took_s = time.monotonic() - begin
-    studio.close()
-    actions = counts["keys"] + counts["clicks"] + counts["drags"]
-    by_hand_s = (
-        KEY_S * counts["keys"] + (POINT_S + BUTTON_S) * counts["clicks"] + 2 * (POINT_S + BUTTON_S) * counts["drags"]
-    )
-    agents = max(len(steps), 1)
-    per = {"actions": actions / agents, "by_hand_s": by_hand_s / agents, "page_s": took_s / agents}
-    return studio.result.scenario, per
+def effort(steps: list[list[Step]]) -> tuple[float, float]:
+    """Actions and seconds an agent."""
+    made = [ACTIONS[entry["kind"]] for own in steps for _, entry in own if entry["kind"] in ACTIONS]
+    made += [POSE_ACTIONS for own in steps for _, entry in own if entry["kind"] == "move" for _ in entry["poses"]]
+    made += [(0, 2, 0) for own in steps if own[0][1]["kind"] != "add"]  # the time, and the agent
+    keys, clicks, drags = np.sum(made, axis=0) / max(len(steps), 1)
+    return keys + clicks + drags, KEY_S * keys + (POINT_S + BUTTON_S) * (clicks + 2 * drags)
 
 
 def figures(scenario: Scenario, truth: Any, max_range_m: float | None) -> dict[str, Any]:
@@ -278,45 +183,21 @@ def figures(scenario: Scenario, truth: Any, max_range_m: float | None) -> dict[s
     }
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("scenario", type=Path)
-    parser.add_argument("truth", type=Path)
-    parser.add_argument("--browser", action="store_true", help="also on the page of the studio")
-    parser.add_argument("--range", type=float, metavar="M", help="agents up to this distance from the ego")
-    parser.add_argument("--out", type=Path, help="JSON file with the figures and the corrections")
-    options = parser.parse_args(arguments)
-    scenario = Scenario.load(options.scenario)
-    truth = load_truth(options.truth, scenario, points=True)
-    steps = steps_of(scenario, truth, options.range, np.random.default_rng(0))
+def main(scenario_path: Path, truth_path: Path, range: float | None = None, out: Path | None = None) -> None:
+    """Print figures before and after, of agents up to `range` m from the ego; `out` gets the corrections."""
+    scenario = Scenario.load(scenario_path)
+    truth = load_truth(truth_path, scenario, points=True)
+    steps = steps_of(scenario, truth, range, np.random.default_rng(0))
     made = [entry for own in steps for _, entry in own]
     document = {"format": "log2sim-corrections", "version": 1, "log": scenario.name, "corrections": made}
     document["map_offset_m"] = list(scenario.map.offset_m)
     after = correct(scenario, document)
-    columns = {
-        "before": figures(scenario, truth, options.range),
-        "corrected": figures(after.scenario, truth, options.range),
-    }
-    per: dict[str, float] = {}
-    if options.browser:
-        with tempfile.TemporaryDirectory() as folder:
-            by_page, per = on_the_page(scenario, steps, Path(folder))
-        columns["on the page"] = figures(by_page, truth, options.range)
-    print(
-        markdown(
-            ["figure", *columns],
-            [[k, *("-" if c[k] is None else f"{c[k]:.3g}" for c in columns.values())] for k in columns["before"]],
-        )
-    )
-    kinds = Counter(entry["kind"] for entry in made)
-    new = sum(own[0][1]["kind"] == "add" for own in steps)
-    print(
-        f"\n{len(steps) - new} of {len(scenario.others)} agents, {new} added, {dict(kinds)}, {len(after.unmatched)} without their agent; an agent: ",
-        end="",
-    )
-    print(", ".join(f"{name} {value:.1f}" for name, value in per.items()) or "not asked for")
-    if options.out is not None:
-        options.out.write_text(
-            json.dumps({**columns, "per_agent": per, "corrections": document}, indent=1) + "\n", encoding="utf-8"
-        )
-    return 0
+    columns = [figures(s, truth, range) for s in (scenario, after.scenario)]
+    rows = [[k, *("-" if c[k] is None else f"{c[k]:.3g}" for c in columns)] for k in columns[0]]
+    print(markdown(["figure", "before", "corrected"], rows))
+    kinds, new = Counter(entry["kind"] for entry in made), sum(own[0][1]["kind"] == "add" for own in steps)
+    actions, seconds = effort(steps)
+    print(f"\n{len(steps) - new} of {len(scenario.others)} agents, {new} added, {dict(kinds)}, {len(after.unmatched)} without their agent; "
+          f"an agent: {actions:.0f} actions, {seconds:.0f} s")  # fmt: skip
+    if out is not None:
+        out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

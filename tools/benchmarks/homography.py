@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -346,5 +347,6 @@ def sections(*, quick: bool) -> tuple[str, str]:
     return "Homography", "\n\n".join(parts)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    print_section("homography", sections, arguments)
+def main(quick: bool = False, write: Path | None = None) -> None:
+    """With fewer repeats, to see that everything runs; `write` puts the tables between their markers in a file."""
+    print_section("homography", sections, quick, write)

@@ -4,7 +4,7 @@ The poses are refined once, with all records, as for a map of the whole log. The
 Patches of the ground that both parts show are registered; what counts is how far they are shifted against each other where a
 LiDAR saw the ground, and by how much the heights differ.
 
-    python tools/bench.py map_repeatability LOG [--sequence NAME] [--cell 0.05]
+    python tools/bench.py map_repeatability LOG [--as-logged]
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from entry import parser_of
 from numpy.typing import NDArray
 
 from log2sim.config import MapConfig
 from log2sim.datatypes import Log, Scenario, Stream
 from log2sim.errors import LogError
+from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.geometry import Array
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
@@ -28,6 +28,7 @@ from log2sim.logs.opening import open_log
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap
 
+CELL_M = 0.05
 PATCH_M, STRIDE_M, SEARCH_M = 3.0, 1.5, 0.5
 # Parts of a patch that must be known in both maps.
 MIN_KNOWN = 0.9
@@ -168,10 +169,7 @@ def parts_of(log: Log) -> Iterator[tuple[str, Log, Log]]:
     yield "odd and even records", *(thinned(log, {n: k[p::2] for n, k in count.items()}) for p in (0, 1))
     yield (
         "first and second half",
-        *(
-            thinned(log, {n: k[: len(k) // 2] if p == 0 else k[len(k) // 2 :] for n, k in count.items()})
-            for p in (0, 1)
-        ),
+        *(thinned(log, {n: np.array_split(k, 2)[p] for n, k in count.items()}) for p in (0, 1)),
     )
     sides = {name: float(camera.mount_T_cam[0, 2]) for name, camera in log.cameras.items() if camera.mount == "ego"}
     ahead = {n: log.cameras[n] for n, x in sides.items() if x > 0.3}
@@ -188,42 +186,33 @@ def quantile_text(values_m: Array) -> str:
     return f"{100 * p50:.1f} cm median, {100 * p95:.1f} cm 95 %, {np.mean(values_m <= 0.05):.3f} within 5 cm, {len(values_m)}"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("log", type=Path)
-    parser.add_argument("--sequence")
-    parser.add_argument("--cell", type=float, default=0.05)
-    parser.add_argument("--as-logged", action="store_true", help="with the poses of the log, not refined ones")
-    options = parser.parse_args(arguments)
-    log = open_log(options.log, sequence=options.sequence)
+def main(path: Path, as_logged: bool = False) -> None:
+    """Print what repeats, with the poses refined by registration or as they were logged."""
+    log = open_log(path)
     scenario = scenario_of(log)
-    if not options.as_logged:
-        refined = refine_poses(log)
-        log = log if refined is None else replace_poses(log, refined)
+    if not as_logged and (refined := refine_poses(log)) is not None:
+        log = replace_poses(log, refined)
     for title, *pair in parts_of(log):
         try:
-            settings = MapConfig(cell_m=options.cell)
-            a, b = (map_ground(part, restricted(scenario, part), settings, refine=False) for part in pair)
+            a, b = (
+                map_ground(part, restricted(scenario, part), MapConfig(cell_m=CELL_M), refine=False) for part in pair
+            )
         except LogError as error:
             print(f"{title}: {error}")
             continue
         print(f"{title}\n  height     {quantile_text(np.abs(height_differences(a, b)))} cells")
         for layer in ("color", "intensity"):
             offsets = measure_offsets(a, b, layer)
-            if offsets is None:
-                print(f"  {layer:10} nothing in common")
-                continue
-            mean = offsets.vector_m.mean(axis=0) if len(offsets.xy) else np.zeros(2)
-            near = quantile_text(offsets.offset_m)
-            print(
-                f"  {layer:10} {near} patches, {offsets.unlike} unlike; mean {100 * mean[0]:.1f} {100 * mean[1]:.1f} cm"
+            words = (
+                "nothing in common"
+                if offsets is None
+                else f"{quantile_text(offsets.offset_m)} patches, {offsets.unlike} unlike"
             )
+            print(f"  {layer:10} {words}")
 
 
 def scenario_of(log: Log) -> Scenario:
     """The labeled agents of a log, or none."""
-    from log2sim.evaluation.metrics.truth import truth_from_log
-
     if log.labels is not None:
         return truth_from_log(log)
     stamps = np.concatenate([stream.t_ns for stream in log.streams.values()])

@@ -1,6 +1,6 @@
 """What each way of measuring is worth: error of place, size and yaw by range, `paper` beside `robust`, on logs with labels.
 
-    python tools/bench.py measure LOG [LOG ...]
+    python tools/bench.py measure LOG ...
 
 Every measurement is compared with the nearest labeled object of its kind within 4 m; yaw counts up to half turns. NEES is
 the squared error over its covariance and dimensions: 1 where the covariance is honest.
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entry import parser_of
 
+from benchmarks.table import markdown
 from log2sim import Config, Scenario, open_log
 from log2sim.datatypes import GROUP_OF, Log, Measurements
 from log2sim.evaluation.metrics.truth import truth_from_log
@@ -31,26 +31,17 @@ RANGES_M = ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0))
 COLUMNS = ("rows", "found", "median m", "RMSE m", "depth m", "size m", "yaw deg", "NEES", "median")
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(logs: list[Path]) -> None:
     """Print one table a log."""
-    parser = parser_of(__doc__)
-    parser.add_argument("logs", nargs="+", metavar="LOG", type=Path, help="folder of a log with labels")
-    for path in parser.parse_args(arguments).logs:
+    for path in logs:
         log = open_log(path)
-        truth = _truth(log, path)
-        print(f"{log.name}: boxes of the log, vehicles")
-        print("| mode | range m | " + " | ".join(COLUMNS) + " |\n|" + "---|" * (len(COLUMNS) + 2))
+        truth = Scenario.load(path / "truth.json") if (path / "truth.json").exists() else truth_from_log(log)
+        rows = []
         for mode in ("paper", "robust"):
             errors = list(_errors(_measured(log, mode), truth))
             for low, high in RANGES_M:
-                rows = [e for e in errors if low <= e["range_m"] < high]
-                print(f"| {mode} | {low:g}-{high:g} | " + " | ".join(_figures(rows)) + " |")
-        print()
-    return 0
-
-
-def _truth(log: Log, path: Path) -> Scenario:
-    return Scenario.load(path / "truth.json") if (path / "truth.json").exists() else truth_from_log(log)
+                rows.append([mode, f"{low:g}-{high:g}", *_figures([e for e in errors if low <= e["range_m"] < high])])
+        print(f"{log.name}: boxes of the log, vehicles\n{markdown(['mode', 'range m', *COLUMNS], rows)}\n")
 
 
 def _measured(log: Log, mode: str) -> Sequence[Measurements]:

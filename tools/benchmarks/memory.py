@@ -1,6 +1,6 @@
 """Peak memory of a reconstruction against the length of its log, which is driven several times in a row.
 
-    python tools/bench.py memory LOG [--times 1 4 16] [--detector NAME]
+    python tools/bench.py memory LOG --times 4 --times 30
 
 Each length runs in a process of its own. The table has the peak by stage and what a tick more adds to it.
 """
@@ -10,13 +10,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entry import parser_of
 from numpy.typing import NDArray
 
 from benchmarks.table import markdown
@@ -25,7 +23,6 @@ from log2sim.geometry import Array, PoseTrack
 
 RUN = """
 import json, sys
-from entry import parser_of
 from log2sim import Config, open_log, reconstruct
 from benchmarks.memory import loop_log
 path, times, settings = json.loads(sys.argv[1])
@@ -46,37 +43,19 @@ def measure(path: str, times: int, settings: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def peak_of(measured: dict[str, Any]) -> float:
-    """Peak of all stages, MiB."""
-    return max(float(stage["peak_memory_mib"]) for stage in measured["stages"])
-
-
-def growth_kib(one: dict[str, Any], other: dict[str, Any]) -> float:
-    """What each tick more of the second run adds to the peak of the first, KiB."""
-    return 1024 * (peak_of(other) - peak_of(one)) / (other["ticks"] - one["ticks"])
-
-
-def rows_of(runs: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """One row a stage and one for what a tick adds, one column a run."""
-    names = list(dict.fromkeys(stage["stage"] for run in runs for stage in run["stages"]))
-    by_name = [{stage["stage"]: stage["peak_memory_mib"] for stage in run["stages"]} for run in runs]
-    rows = [[name, *(f"{peaks[name]:.0f} MiB" if name in peaks else "-" for peaks in by_name)] for name in names]
-    rows.append(["agents", *(str(run["agents"]) for run in runs)])
-    added = ["-", *(f"{growth_kib(runs[0], run):.1f} KiB" for run in runs[1:])]
-    return [*rows, ["each tick more", *added]]
-
-
-def main(arguments: list[str] | None = None) -> int:
+def main(log: Path, times: list[int] = [1, 4, 16], detector: str = "lidar:vehicle") -> None:
     """Print the table."""
-    parser = parser_of(__doc__)
-    parser.add_argument("log")
-    parser.add_argument("--times", type=int, nargs="+", default=[1, 4, 16])
-    parser.add_argument("--detector", default="lidar:vehicle")
-    options = parser.parse_args(arguments)
-    settings = {"detect": {"name": options.detector}}
-    runs = [measure(str(Path(options.log).resolve()), times, settings) for times in options.times]
-    print(markdown(["peak at the end of", *(f"{run['ticks']} ticks" for run in runs)], rows_of(runs)))
-    return 0
+    runs = [measure(str(log.resolve()), count, {"detect": {"name": detector}}) for count in times]
+    peaks = [{stage["stage"]: float(stage["peak_memory_mib"]) for stage in run["stages"]} for run in runs]
+    names = dict.fromkeys(name for of_run in peaks for name in of_run)
+    rows = [[name, *(f"{of_run[name]:.0f} MiB" if name in of_run else "-" for of_run in peaks)] for name in names]
+    rows.append(["agents", *(str(run["agents"]) for run in runs)])
+    more = [
+        (max(p.values()) - max(peaks[0].values())) / (r["ticks"] - runs[0]["ticks"])
+        for r, p in zip(runs[1:], peaks[1:])
+    ]
+    rows.append(["each tick more", "-", *(f"{1024 * mib:.1f} KiB" for mib in more)])
+    print(markdown(["peak at the end of", *(f"{run['ticks']} ticks" for run in runs)], rows))
 
 
 def loop_log(log: Log, times: int) -> Log:

@@ -3,14 +3,15 @@ riders and people who stroll, turn and wait. Seen with noise, its states are smo
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-from entry import parser_of
 from numpy.typing import NDArray
 
+from benchmarks.table import markdown
 from log2sim.agents.smooth import MotionModel, smooth_track
 from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import wrap_angle
@@ -49,11 +50,8 @@ def courses(seed: int) -> list[Course]:
         turned = rng.uniform(0, 2 * np.pi)
         lane = _route(ROUTES[(seed + k) % len(ROUTES)], rng)
         out += _queue(lane @ _rotation(turned).T + rng.normal(0, 60.0, 2), "car", CARS_A_LANE, rng)
-        out += (
-            _queue(_route(ROUTES[(seed + k + 1) % 4], rng) @ _rotation(turned).T, "cyclist", 1, rng)
-            if k < CYCLISTS
-            else []
-        )
+        if k < CYCLISTS:
+            out += _queue(_route(ROUTES[(seed + k + 1) % 4], rng) @ _rotation(turned).T, "cyclist", 1, rng)
     return [*out, *(_stroll(rng) for _ in range(PEDESTRIANS))]
 
 
@@ -107,11 +105,8 @@ def _queue(corners: Array, category: str, count: int, rng: np.random.Generator) 
         ahead_v = np.where(stops & (crossing - 8.0 < ahead), 0.0, ahead_v)
         ahead = np.where(stops, np.minimum(ahead, crossing - 6.0), ahead)
         gap = np.maximum(ahead - at, 0.1)
-        needed = (
-            GAP_M
-            + speed * HEADWAY_S * own
-            + speed * (speed - ahead_v) / (2 * np.sqrt(ACCELERATION_MPS2 * DECELERATION_MPS2))
-        )
+        closing = speed * (speed - ahead_v) / (2 * np.sqrt(ACCELERATION_MPS2 * DECELERATION_MPS2))
+        needed = GAP_M + speed * HEADWAY_S * own + closing
         rate = own * ACCELERATION_MPS2 * (1 - (speed / wanted) ** 4 - (np.maximum(needed, 0.0) / gap) ** 2)
         speed = np.maximum(speed + np.clip(rate, -7.0, 2.5) * TICK_S, 0.0)
         at = at + speed * TICK_S
@@ -120,14 +115,8 @@ def _queue(corners: Array, category: str, count: int, rng: np.random.Generator) 
     for k in range(count):
         xy, heading = path.at(ways[first:, k])
         sway = 0.15 * np.sin(2 * np.pi * ways[first:, k] / 60.0 + rng.uniform(0, 6.3))  # keeping to a lane
-        out.append(
-            Course(
-                category,
-                xy + sway[:, None] * np.column_stack([-np.sin(heading), np.cos(heading)]),
-                speeds[first:, k],
-                heading,
-            )
-        )
+        xy = xy + sway[:, None] * np.column_stack([-np.sin(heading), np.cos(heading)])
+        out.append(Course(category, xy, speeds[first:, k], heading))
     return out
 
 
@@ -215,57 +204,39 @@ MOVING_MPS = 0.15
 BEGIN_S = 3.0
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print the table."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--seeds", type=int, default=4)
-    parser.add_argument("--past", action="store_true", help="also states smoothed over the past only")
-    parser.add_argument("--by-category", action="store_true")
-    asked = parser.parse_args(arguments)
-    sums: dict[tuple[str, str, str, int], list[np.ndarray]] = defaultdict(list)
+def main(seeds: int = 4, past: bool = False) -> None:
+    """Print the table; with `past` also of states smoothed over the past only."""
+    sums: dict[tuple[str, str, int], list[tuple[Array, Array]]] = defaultdict(list)
     spent, count = 0.0, 0
-    for seed in range(asked.seeds):
+    for seed in range(seeds):
         drawn = courses(seed)
         truth = table_of(true_scenario(drawn))
         tables = {"truth": truth, "whole log": table_of(smoothed_scenario(drawn, seed))}
-        if asked.past:
+        if past:
             tables["past only"] = causal_table(truth, drawn, seed)
         tables["differences"] = difference_table(truth, drawn, seed)
         for source, table in tables.items():
             start = time.process_time()
             found = predict_table(table, leads_of(3.0))
             spent, count = spent + time.process_time() - start, count + len(found.row)
-            for method, forecast in found.forecasts.items():
-                collect(sums, (source, method), truth, (found.row, found.tick), forecast)
-    print(
-        f"{'states':12} {'agents':12} {'method':9} "
-        + " ".join(f"{f'FDE {s} s':>8} {'NEES':>5} {'in 95':>5}" for s in LEADS_S)
-    )
-    for source, method, group in dict.fromkeys(key[:3] for key in sums):
-        if group != "all" and not asked.by_category:
-            continue
+            moves = (np.abs(truth.velocity_mps[found.row, found.tick]) > MOVING_MPS) & (
+                truth.t_s[found.tick] >= BEGIN_S
+            )
+            for (method, forecast), lead in itertools.product(found.forecasts.items(), LEADS_S):
+                later, h = truth.later(round(lead / truth.tick_s))[0], 2 * lead - 1
+                error = (forecast.position_m[:, h] - later[found.row, found.tick]) * forecast.course[:, h].conj()
+                squared = (error.real / forecast.sigma_m[:, h, 0]) ** 2 + (error.imag / forecast.sigma_m[:, h, 1]) ** 2
+                chosen = moves & np.isfinite(error)
+                sums[source, method, lead].append((np.abs(error[chosen]), squared[chosen]))
+    rows = []
+    for source, method in dict.fromkeys(key[:2] for key in sums):
         cells = []
         for lead in LEADS_S:
-            distance, squared = (np.concatenate(c) for c in zip(*sums[source, method, group, lead]))
-            cells.append(f"{distance.mean():8.2f} {squared.mean() / 2:5.2f} {(squared < CHI2_95).mean():5.2f}")
-        print(f"{source:12} {group:12} {method:9} " + " ".join(cells))
+            distance, squared = (np.concatenate(c) for c in zip(*sums[source, method, lead]))
+            cells.append(f"{distance.mean():.2f} / {squared.mean() / 2:.2f} / {(squared < CHI2_95).mean():.2f}")
+        rows.append([source, method, *cells])
+    print(markdown(["states", "method", *(f"FDE m / NEES / in 95 %, {s} s" for s in LEADS_S)], rows))
     print(f"{count} agent-ticks, {len(METHODS)} methods: {1e4 * spent / count:.2f} s for 10,000")
-
-
-def collect(sums, key, truth: MotionTable, at, forecast) -> None:
-    """Add the errors of a method to the sums, by category."""
-    row, tick = at
-    category = np.array([a.category for a in truth.agents])[row]
-    moves = (np.abs(truth.velocity_mps[row, tick]) > MOVING_MPS) & (truth.t_s[tick] >= BEGIN_S)
-    for lead in LEADS_S:
-        later, _ = truth.later(round(lead / truth.tick_s))
-        h = 2 * lead - 1
-        error = (forecast.position_m[:, h] - later[row, tick]) * forecast.course[:, h].conj()
-        squared = (error.real / forecast.sigma_m[:, h, 0]) ** 2 + (error.imag / forecast.sigma_m[:, h, 1]) ** 2
-        there = moves & np.isfinite(error)
-        for group in ("all", *dict.fromkeys(category)):
-            chosen = there & ((category == group) | (group == "all"))
-            sums[(*key, str(group), lead)].append((np.abs(error[chosen]), squared[chosen]))
 
 
 def causal_table(truth: MotionTable, courses, seed: int) -> MotionTable:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -181,5 +182,6 @@ def sections(*, quick: bool) -> tuple[str, str]:
     return "Projection and points in boxes", f"{told}\n\n{markdown(head, [[k, *v] for k, v in rows.items()])}"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    print_section("projection", sections, arguments)
+def main(quick: bool = False, write: Path | None = None) -> None:
+    """With fewer repeats, to see that everything runs; `write` puts the tables between their markers in a file."""
+    print_section("projection", sections, quick, write)

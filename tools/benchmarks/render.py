@@ -1,4 +1,4 @@
-"""Pictures a second and core of the renderer: python tools/bench.py render [--pictures N]
+"""Pictures a second and core of the renderer: python tools/bench.py render
 
 Prints CPU time of one thread, for pictures of 960 x 600 px: of the sample scene, of the roadside scene in four kinds of light
 and weather, and of random traffic, each picture of which is a new scene (its ground, shapes and colors made included).
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from entry import parser_of
+from entry import SAMPLES
 
 from log2sim.geometry import Camera
 from log2sim.synth.light import light_of
@@ -23,7 +23,6 @@ from log2sim.synth.traffic import rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
 
-SAMPLES = Path(__file__).resolve().parents[2] / "samples"
 SIZE_PX = (960, 600)
 CONDITIONS = (("noon", "clear"), ("overcast", "rain"), ("night", "clear"), ("dusk", "fog"))
 
@@ -66,22 +65,16 @@ def measured(jobs: Iterator[Callable[[], object]], count: int) -> float:
     return float(np.median(seconds[2:]))
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print the table."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--pictures", type=int, default=20, help="pictures a row")
-    count = parser.parse_args(arguments).pictures
+def main(pictures: int = 20) -> None:
+    """Print the table, of so many pictures a row."""
     cv2.setNumThreads(1)
-    rows = [("samples/crossing.toml, noon", of_scene(SAMPLES / "crossing.toml", Environment()))]
+    rows = {"samples/crossing.toml, noon": of_scene(SAMPLES / "crossing.toml", Environment())}
     for light, weather in CONDITIONS:
         environment = Environment(light=light, weather=weather)
-        rows.append(
-            (
-                f"samples/scenes/roadside.toml, {light}, {weather}",
-                of_scene(SAMPLES / "scenes/roadside.toml", environment),
-            )
+        rows[f"samples/scenes/roadside.toml, {light}, {weather}"] = of_scene(
+            SAMPLES / "scenes/roadside.toml", environment
         )
-    rows.append(("random traffic, a new scene each, noon", of_traffic(Environment())))
-    for name, jobs in rows:
-        seconds = measured(jobs, count)
+    rows["random traffic, a new scene each, noon"] = of_traffic(Environment())
+    for name, jobs in rows.items():
+        seconds = measured(jobs, pictures)
         print(f"{name:52s} {seconds:6.3f} s {1 / seconds:5.1f} pictures a second and core", flush=True)

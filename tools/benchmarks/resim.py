@@ -1,9 +1,9 @@
 """Measure simulated sweeps and pictures against recorded ones that were left out, and from beside the path against true ones.
 
 python tools/bench.py resim samples/crossing out/scenario.json
-python tools/bench.py resim samples/crossing out/scenario.json --figures pictures --camera front --images out/
-python tools/bench.py resim samples/scenes/bare.toml --sideways 0.5 1 2 3 --figures sweeps
-python tools/bench.py resim samples/crossing.toml --figures pictures --sideways 0 -0.5 -1 -2 -3
+python tools/bench.py resim samples/crossing out/scenario.json --figures pictures --camera front
+python tools/bench.py resim samples/scenes/bare.toml --figures sweeps
+python tools/bench.py resim samples/crossing.toml --figures pictures --sideways -1 --sideways -3
 python tools/bench.py resim samples/crossing out/scenario.json --circle out/edited.json
 python tools/bench.py resim samples/crossing out/scenario.json --picture out/sweeps.jpg --without bus-1
 """
@@ -14,10 +14,11 @@ import resource
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
-from entry import parser_of
+import typer
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -45,6 +46,8 @@ from log2sim.visualization.sensor_film import range_image, title_line, window_of
 
 EVERY = 5
 LIMIT_M = 40.0
+FIGURES, SIDEWAYS_M = ("sweeps", "boxes", "pictures"), (0.0, 0.5, 1.0, 2.0, 3.0)
+SWEEP, EVERY_SIDEWAYS = 22, 7  # that is drawn; of a scene so many sweeps are compared
 Figures = dict[str, float]
 
 
@@ -158,7 +161,7 @@ def moved(old: Agent | None, new: Agent) -> bool:
     return not (was.valid & (np.hypot(was.x_m - new.waypoints.x_m, was.y_m - new.waypoints.y_m) < 0.1)).all()
 
 
-def circle(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tuple[str, Figures]]:
+def around(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tuple[str, Figures]]:
     """Reconstruct the recorded sweeps, and what is simulated of a scenario and of an edited one, and compare with what each shows."""
     world, rows = build_world(log, source, [name]), []
     known = {agent.id: agent for agent in source.agents}
@@ -167,6 +170,7 @@ def circle(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tupl
         found = reconstruct(shown, Config(detect="lidar:vehicle")).scenario
         judged = evaluate(found, count_points(now, shown), max_range_m=LIMIT_M)
         figures = {k: float(judged[k]) for k in ("recall", "precision", "position_median_m")}
+        figures["recall where there are points"] = float(judged["coverage"]["hit_recall"])
         changed = [row for row in judged["agents"] if moved(known.get(row["id"]), now[row["id"]])]
         if ticks := sum(r["ticks"] for r in changed):
             figures["recall of changed"] = sum(r["matched"] for r in changed) / ticks
@@ -195,9 +199,7 @@ def compare_pictures(true: Array, other: Array) -> Figures:
     return {"PSNR dB": signal, "SSIM": float(structural_similarity(*gray))}
 
 
-def pictures(
-    log: Log, scenario: Scenario, camera: str, world: World, count: int, folder: Path | None
-) -> list[tuple[str, Figures]]:
+def pictures(log: Log, scenario: Scenario, camera: str, world: World, count: int) -> list[tuple[str, Figures]]:
     """Compare pictures that were left out with simulated ones, and with the nearest recorded ones as they are; and what SSD sees in both."""
     simulation = Simulation(log, world, scenario, 0, Pictures(log, world, scenario, left_out))
     detector, t_ns, read = create_detector("ssd-mobilenet-v2", log), log.streams[camera].t_ns, log.streams[camera].read
@@ -216,16 +218,14 @@ def pictures(
         rows[0].append(compare_pictures(true, image) | found_again(box_iou(own, boxes(i, image)), 0.5) | more)
         before = read(i - 1)
         rows[1].append(compare_pictures(true, before) | found_again(box_iou(own, boxes(i, before)), 0.5))
-        if folder is not None:
-            cv2.imwrite(str(folder / f"{camera}_{i}.png"), np.vstack([true, image]))
     return [(f"pictures of {camera}", shares(rows[0])), ("the one before", shares(rows[1]))]
 
 
-def picture(log: Log, scenario: Scenario, name: str, index: int, without: str, path: Path) -> None:
+def draw_sweep(log: Log, scenario: Scenario, name: str, without: str, path: Path) -> None:
     """Draw ranges of a recorded sweep, of the same simulated, and of the same without an agent."""
-    world = build_world(log, scenario, [name], leave_out=lambda _, i: i == index)
+    world = build_world(log, scenario, [name], leave_out=lambda _, i: i == SWEEP)
     rest = replace(scenario, agents=tuple(a for a in scenario.agents if a.id != without))
-    shots = Simulation(log, world, scenario).shots(name, index)
+    shots = Simulation(log, world, scenario).shots(name, SWEEP)
     window = window_of(shots.direction)
     parts = [title_line("recorded"), range_image(shots.direction, shots.range_m, window)]
     for title, what in (("simulated from the other sweeps", scenario), (f"simulated without {without}", rest)):
@@ -235,7 +235,7 @@ def picture(log: Log, scenario: Scenario, name: str, index: int, without: str, p
     cv2.imwrite(str(path), np.vstack(parts))
 
 
-def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:
+def sweeps_sideways(scene_path: Path, meters: list[float]) -> list[tuple[str, Figures]]:
     """Cast from beside the sensor that recorded, and compare with the true sweep from there."""
     scene = load_scene(scene_path).model_copy(update={"camera": ()})
     log, truth = synthesize(scene, observe=False)
@@ -248,7 +248,7 @@ def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[st
         lidars = (spec.model_copy(update={"position_m": place}), *scene.lidar[1:])
         true_log = synthesize(scene.model_copy(update={"lidar": lidars}), observe=False)[0].changed(ego=log.ego)
         simulation, figures = Simulation(log, world, truth), []
-        for i in range(0, len(log.streams[name].t_ns), every):
+        for i in range(0, len(log.streams[name].t_ns), EVERY_SIDEWAYS):
             shots = all_shots(
                 recorded_shots(true_log, name, true_log.streams[name].read(i)), world.models[name].pattern
             )
@@ -258,7 +258,7 @@ def sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[st
     return out
 
 
-def pictures_sideways(scene_path: Path, meters: list[float], every: int) -> list[tuple[str, Figures]]:
+def pictures_sideways(scene_path: Path, meters: list[float]) -> list[tuple[str, Figures]]:
     """Make pictures from beside the first camera, and compare them, and those that it took, with the true ones from there."""
     scene = load_scene(scene_path)
     scene = scene.model_copy(update={"camera": scene.camera[:1]})
@@ -270,7 +270,7 @@ def pictures_sideways(scene_path: Path, meters: list[float], every: int) -> list
         moved = scene.model_copy(update={"camera": (spec.model_copy(update={"position_m": (x, y + off_m, z)}),)})
         true_log = synthesize(moved, observe=False)[0].changed(ego=log.ego)
         rows: tuple[list[Figures], list[Figures]] = [], []
-        for i in range(0, len(t_ns), every):
+        for i in range(0, len(t_ns), EVERY_SIDEWAYS):
             true = true_log.streams[spec.name].read(i)
             image, unknown = made.make(true_log, truth, world.agents, spec.name, int(t_ns[i]))
             rows[0].append(compare_pictures(true, image) | {"made up": unknown.mean()})
@@ -283,51 +283,35 @@ def mean(figures: list[Figures]) -> Figures:
     return {key: float(np.mean([f[key] for f in figures])) for key in figures[0]}
 
 
-def main(argv: list[str] | None = None) -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("log", type=Path, help="a log, or a scene file for --sideways")
-    parser.add_argument("scenario", type=Path, nargs="?", help="what was reconstructed from it")
-    parser.add_argument("--lidar", help="by default the first of the log")
-    parser.add_argument(
-        "--figures", nargs="+", choices=["sweeps", "boxes", "pictures"], default=["sweeps", "boxes", "pictures"]
-    )
-    parser.add_argument("--camera", help="of pictures; by default the first of the log")
-    parser.add_argument("--count", type=int, default=8, help="of pictures")
-    parser.add_argument("--images", type=Path, help="folder for pictures, recorded above simulated")
-    parser.add_argument("--sideways", type=float, nargs="+", default=[0.0, 0.5, 1.0, 2.0, 3.0], metavar="M")
-    parser.add_argument(
-        "--circle", type=Path, help="an edit of the scenario: both are simulated and reconstructed instead"
-    )
-    parser.add_argument("--picture", type=Path, help="draw a sweep instead")
-    parser.add_argument("--sweep", type=int, default=22, help="of --picture")
-    parser.add_argument("--without", default="", metavar="AGENT", help="agent that --picture leaves out")
-    parser.add_argument("--every", type=int, default=7, help="sweeps of a scene that are compared")
-    given = parser.parse_args(argv)
-    if given.scenario is None:
-        rows = sideways(given.log, given.sideways, given.every) if "sweeps" in given.figures else []
-        if "pictures" in given.figures:
-            rows += pictures_sideways(given.log, given.sideways, given.every)
+def main(
+    path: Path, scenario_path: Annotated[Path | None, typer.Argument(metavar="SCENARIO")] = None, figures: list[str] = list(FIGURES),
+    camera: str = "", count: int = 8, sideways: list[float] = list(SIDEWAYS_M), circle: Path | None = None, picture: Path | None = None,
+    without: str = "",
+) -> None:  # fmt: skip
+    """Measure a log beside what was reconstructed from it, or a scene file from beside its path.
+
+    `figures` of sweeps, boxes and `count` pictures of a camera; `circle` is an edit of the scenario, `picture` a file for a sweep without an agent.
+    """
+    if scenario_path is None:
+        rows = sweeps_sideways(path, sideways) if "sweeps" in figures else []
+        rows += pictures_sideways(path, sideways) if "pictures" in figures else []
     else:
-        scenario = Scenario.load(given.scenario)
-        log = localize_like(open_log(given.log), scenario.provenance)
-        name = given.lidar or next(iter(log.lidars))
-        if given.picture is not None:
-            picture(log, scenario, name, given.sweep, given.without, given.picture)
-            return 0
-        if given.circle is not None:
-            rows = circle(log, scenario, Scenario.load(given.circle), name)
+        scenario = Scenario.load(scenario_path)
+        log = localize_like(open_log(path), scenario.provenance)
+        name = next(iter(log.lidars))
+        if picture is not None:
+            draw_sweep(log, scenario, name, without, picture)
+            return
+        if circle is not None:
+            rows = around(log, scenario, Scenario.load(circle), name)
         else:
             begin, rows = time.process_time(), []
             world = build_world(log, scenario, [name], leave_out=left_out)
             print(f"build s/sweep {(time.process_time() - begin) / len(log.streams[name].t_ns):.3f}")
-            if "sweeps" in given.figures:
-                rows += held_out(log, scenario, name, world)
-            if "boxes" in given.figures:
-                rows += boxes_in_sweeps(log, scenario, name, world)
-            camera = given.camera or next(iter(log.cameras), None)
-            if "pictures" in given.figures and camera is not None:
-                rows += pictures(log, scenario, camera, world, given.count, given.images)
-    for label, figures in rows:
-        print(f"{label:22s}", ", ".join(f"{key} {value:.3f}" for key, value in figures.items()))
+            rows += held_out(log, scenario, name, world) if "sweeps" in figures else []
+            rows += boxes_in_sweeps(log, scenario, name, world) if "boxes" in figures else []
+            if "pictures" in figures and log.cameras:
+                rows += pictures(log, scenario, camera or next(iter(log.cameras)), world, count)
+    for label, found in rows:
+        print(f"{label:22s}", ", ".join(f"{key} {value:.3f}" for key, value in found.items()))
     print(f"at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
-    return 0

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -368,5 +369,6 @@ def by_bound(seeds: int) -> str:
     return f"{text}\n\n{markdown(head, rows)}"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    print_section("smoothing", sections, arguments)
+def main(quick: bool = False, write: Path | None = None) -> None:
+    """With fewer repeats, to see that everything runs; `write` puts the tables between their markers in a file."""
+    print_section("smoothing", sections, quick, write)

@@ -14,15 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from entry import parser_of
-
 PEERS = ("numpy", "scipy", "opencv-contrib-python-headless", "scikit-image", "poselib", "pycolmap", "filterpy", "numba")
-HEAD = """# Benchmarks
-
-log2sim's single estimators beside what a user would otherwise take. Each table comes from one process on one machine, so
-its ratios mean more than its times; times are those of the processor, one thread. `tools/bench.py` writes the parts
-between the markers; what was measured, on which worlds, is told above each table.
-"""
 
 
 def optional(name: str) -> ModuleType | None:
@@ -55,35 +47,23 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def replace_section(path: Path, name: str, text: str) -> None:
-    """Put a section between its markers in a file; at the end where the file has none."""
+    """Put a section between its markers in a file."""
     begin, end = f"<!-- bench {name} -->", f"<!-- end {name} -->"
-    old = path.read_text(encoding="utf-8") if path.exists() else HEAD
-    block = f"{begin}\n{text}\n{end}"
-    if begin in old and end in old:
-        new = old[: old.index(begin)] + block + old[old.index(end) + len(end) :]
-    else:
-        new = f"{old.rstrip()}\n\n{block}\n"
-    path.write_text(new, encoding="utf-8")
+    old = path.read_text(encoding="utf-8")
+    path.write_text(old[: old.index(begin)] + f"{begin}\n{text}\n" + old[old.index(end) :], encoding="utf-8")
 
 
-def print_section(name: str, sections: Callable[..., tuple[str, str]], arguments: list[str] | None) -> None:
-    """Print what `sections(quick=...)` returns, a title and tables, with the versions of what was compared; `--write` puts it into a file."""
-    parser = parser_of(sys.modules[sections.__module__].__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer repeats, to see that everything runs")
-    parser.add_argument(
-        "--write", type=Path, metavar="FILE.md", help="put the tables between their markers in this file"
-    )
-    options = parser.parse_args(arguments)
+def print_section(name: str, sections: Callable[..., tuple[str, str]], quick: bool, write: Path | None) -> None:
+    """Print what `sections(quick=...)` returns, a title and tables, with the versions of what was compared; put it into a file, too."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         print("OPENBLAS_NUM_THREADS is not 1: times will swing", file=sys.stderr)
-    title, body = sections(quick=options.quick)
-    flags = " --quick" if options.quick else ""
-    command = f"OPENBLAS_NUM_THREADS=1 python tools/bench.py {name}{flags} --write BENCHMARKS.md"
+    title, body = sections(quick=quick)
+    command = f"OPENBLAS_NUM_THREADS=1 python tools/bench.py {name}{' --quick' if quick else ''} --write BENCHMARKS.md"
     versions = ", ".join(f"{peer} {_version(peer)}" for peer in PEERS)
     text = f"## {title}\n\n`{command}`\n\n{body}\n\nPython {platform.python_version()}, {versions}."
     print(text)
-    if options.write:
-        replace_section(options.write, name, text)
+    if write:
+        replace_section(write, name, text)
 
 
 def _version(name: str) -> str:

@@ -1,6 +1,6 @@
 """Precision and recall of tags in worlds whose maneuvers are known in closed form.
 
-    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json SCENE.toml]
+    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=SCENE.toml]
 
 `--write` writes the random traffic as scenarios, for `log2sim find` and `vary`. `--pair` compares the tags of what was reconstructed of a
 rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other.
@@ -20,8 +20,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from entry import parser_of
 
+from benchmarks.table import markdown
 from log2sim.datatypes import Agent, AgentTable, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios.tagging import find_tags
@@ -568,44 +568,35 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
     return out
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print a table."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--worlds", type=int, default=48)
-    parser.add_argument("--scripted", type=int, default=12, help="of each scripted scene")
-    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of places, m")
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--write", type=Path, metavar="FOLDER")
-    pair = ("RECONSTRUCTION.json", "SCENE.toml")
-    parser.add_argument("--pair", type=Path, nargs=2, action="append", default=[], metavar=pair)
-    parser.add_argument("--wrong", action="store_true", help="list what was wrong")
-    asked = parser.parse_args(arguments)
-    worlds = [*variants(asked.worlds, asked.noise, asked.first), *scripted(asked.scripted, asked.noise, asked.first)]
-    if asked.write is not None:
-        for k, world in enumerate(worlds):
-            world.scenario.save(asked.write / f"{k:04}" / "scenario.json")
+def main(
+    worlds: int = 48, scripts: int = 12, noise: float = 0.0, first: int = 0, write: Path | None = None,
+    pair: list[str] = [], wrong: bool = False,
+) -> None:  # fmt: skip
+    """Print a table of random worlds and of `scripts` of each scripted scene from a first seed, whose places have noise, m; `wrong` lists what was."""
+    drawn = [*variants(worlds, noise, first), *scripted(scripts, noise, first)]
+    for k, world in enumerate(drawn if write is not None else ()):
+        world.scenario.save(write / f"{k:04}" / "scenario.json")
     sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
-    for made, scene in asked.pair:
+    for made, scene in (map(Path, text.split("=", 1)) for text in pair):
         for tag, lists in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
             sums[tag] = [[*a, *(f"{made.name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
+    rows, lines = [], []
     for tag, (true, invented, missed) in sorted(sums.items()):
         counts = len(true), len(invented), len(missed)
-        print(
-            f"{tag:22} {counts[0]:5} of the truth, {counts[1]} alone, {counts[2]} missed in reconstructions, F1 {f1(*counts):.3f}"
-        )
-        for line in [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed] if asked.wrong else ():
-            print("   ", line)
+        rows.append([f"{tag}, reconstructed", *map(str, counts), *shares(*counts), ""])
+        lines += [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed]
     begin = time.process_time()
-    found = [find_tags(w.scenario) for w in worlds]
+    found = [find_tags(w.scenario) for w in drawn]
     spent = time.process_time() - begin
-    print(
-        f"{'tag':22} {'true':>5} {'invented':>8} {'missed':>6} {'precision':>9} {'recall':>6} {'F1':>6} {'error s':>7}"
-    )
-    for tag, (true, invented, missed, error_s, wrong) in sorted(score(worlds, found).items()):
-        print(
-            f"{tag:22} {true:5} {invented:8} {missed:6} {true / max(true + invented, 1):9.3f} {true / max(true + missed, 1):6.3f} "
-            f"{f1(true, invented, missed):6.3f} {error_s:7.2f}"
-        )
-        for line in wrong if asked.wrong else ():
-            print("   ", line)
-    print(f"{len(worlds)} scenarios in {spent:.1f} s of processor time, {len(worlds) / max(spent, 1e-9):.1f} a second")
+    for tag, (true, invented, missed, error_s, words) in sorted(score(drawn, found).items()):
+        rows.append([tag, str(true), str(invented), str(missed), *shares(true, invented, missed), f"{error_s:.2f}"])
+        lines += words
+    print(markdown(["tag", "true", "invented", "missed", "precision", "recall", "F1", "error s"], rows))
+    print("\n".join(lines) if wrong else "")
+    print(f"{len(drawn)} scenarios in {spent:.1f} s of processor time, {len(drawn) / max(spent, 1e-9):.1f} a second")
+
+
+def shares(true: int, invented: int, missed: int) -> list[str]:
+    """Precision, recall and their harmonic mean."""
+    parts = true / max(true + invented, 1), true / max(true + missed, 1), f1(true, invented, missed)
+    return [f"{part:.3f}" for part in parts]

@@ -1,10 +1,10 @@
 """Names the colors of vehicles in photos that lie in folders named by color, and counts how often the names agree.
 
-    python tools/bench.py vehicle_colors FOLDER [--detector NAME_OR_FILE.onnx]
+    python tools/bench.py vehicle_colors FOLDER
     python tools/bench.py vehicle_colors      # rendered streets with two cars of each color, in all light and weather, boxes known
 
 Labels that are not among the names of `log2sim.datatypes.COLOR_NAMES` are merged with the next one: silver and gray are one,
-pink is red. Without a box the vehicle is taken to fill the photo but for its context. Nothing is learned from the photos.
+pink is red. The vehicle is taken to fill the photo but for its context. Nothing is learned from the photos.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
-from entry import parser_of
+import typer
 from numpy.typing import NDArray
 from skimage.color import deltaE_ciede2000
 
 from benchmarks.table import markdown
-from log2sim.datatypes import COLOR_NAMES, Frame, Log, Scenario
+from log2sim.datatypes import COLOR_NAMES, Log, Scenario
 from log2sim.datatypes.color_names import to_lab
 from log2sim.files.inputs import read_bytes
-from log2sim.geometry import Camera
 from log2sim.road.color_network import CONTEXT, crop, shipped_network
 from log2sim.road.colors import ColorSampler
 from log2sim.synth.scene import scene_from_table
@@ -37,53 +37,37 @@ MERGED = {"silver": "gray", "grey": "gray", "pink": "red", "magenta": "red", "pu
 MAX_BYTES = 20 * 1024**2
 HEADER = ["light and weather", "name right", "mean confidence", "CIEDE2000", "confused"]
 SKIES = (
-    ("noon", "clear"),
-    ("overcast", "clear"),
-    ("dusk", "clear"),
-    ("night", "clear"),
-    ("noon", "rain"),
-    ("overcast", "rain"),
-    ("noon", "fog"),
-)
+    ("noon", "clear"), ("overcast", "clear"), ("dusk", "clear"), ("night", "clear"), ("noon", "rain"), ("overcast", "rain"), ("noon", "fog"),
+)  # fmt: skip
 STREET = {
     "black": ((28, 29, 31), (14, 14, 16)), "white": ((232, 233, 232), (240, 238, 230)), "gray": ((90, 94, 98), (110, 108, 108)),
     "silver": ((180, 183, 186), (165, 168, 170)), "red": ((160, 28, 30), (120, 18, 30)), "blue": ((40, 66, 140), (24, 40, 84)),
     "green": ((30, 90, 50), (70, 120, 70)), "yellow": ((226, 190, 30), (235, 205, 60)), "brown": ((92, 62, 40), (70, 48, 36)),
     "orange": ((225, 105, 25), (215, 120, 40)),
 }  # fmt: skip
-MIN_VEHICLE_SHARE = 0.1  # of the photo; a smaller box is of something in the background
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("folder", type=Path, nargs="?")
-    parser.add_argument("--detector", help="finds the box of the vehicle; without it the photo is the box")
-    options = parser.parse_args(arguments)
-    if options.folder is None:
+def main(folder: Annotated[Path | None, typer.Argument()] = None) -> int:
+    """Print which names are right of photos in a folder, or in rendered streets."""
+    if folder is None:
         print(markdown(HEADER, [street_row(*sky) for sky in SKIES]))
         return 0
-    detector = None
-    if options.detector:
-        from log2sim.perception.detect.detectors import create_detector
-
-        detector = create_detector(options.detector, Log("photos", "photos", {}, {}, {}), min_score=0.3)
     confusion: Counter[tuple[str, str]] = Counter()
     second, begin = 0, time.perf_counter()
-    for label, path in photos(options.folder):
+    for label, path in photos(folder):
         image = cv2.imdecode(np.frombuffer(read_bytes(path, MAX_BYTES), np.uint8), cv2.IMREAD_COLOR)
-        order = ["none", "none"] if image is None else ranked(probabilities(image, box_of(image, detector)))
+        order = ["none", "none"] if image is None else ranked(image)
         confusion[label, order[0]] += 1
         second += label in order[:2]
-    count = sum(confusion.values())
-    if not count:
-        print(f"{options.folder}: no photos in folders named by color", file=sys.stderr)
+    if not (count := confusion.total()):
+        print(f"{folder}: no photos in folders named by color", file=sys.stderr)
         return 1
-    print_table(confusion)
+    names = sorted({name for pair in confusion for name in pair}, key=(*COLOR_NAMES, "none").index)
+    rows = [[label, *(str(confusion[label, n] or ".") for n in names)] for label in names]
+    print(markdown(["label", *(f"as {n}" for n in names)], rows))
     first = sum(n for (label, name), n in confusion.items() if label == name)
-    seconds = time.perf_counter() - begin
-    print(
-        f"{count} photos, top 1 {first / count:.3f}, top 2 {second / count:.3f}, {1000 * seconds / count:.0f} ms each"
-    )
+    ms = 1000 * (time.perf_counter() - begin) / count
+    print(f"{count} photos, top 1 {first / count:.3f}, top 2 {second / count:.3f}, {ms:.0f} ms each")
     return 0
 
 
@@ -133,40 +117,10 @@ def photos(folder: Path) -> Iterator[tuple[str, Path]]:
             yield from ((label, path) for path in sorted(inner.iterdir()) if path.suffix.lower() in SUFFIXES)
 
 
-def probabilities(image: NDArray[np.uint8], box: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return how probable each of `COLOR_NAMES` is for the vehicle in a photo."""
-    if box is None:
-        size = np.array(image.shape[1::-1], float)
-        box = np.concatenate([size * (1 - 1 / CONTEXT) / 2, size * (1 + 1 / CONTEXT) / 2])
-    return shipped_network().probabilities([crop(image, box)])
-
-
-def ranked(probability: NDArray[np.float64]) -> list[str]:
-    """Return the merged names by their probability."""
-    total: Counter[str] = Counter()
-    for name, share in zip(COLOR_NAMES, probability):
+def ranked(image: NDArray[np.uint8]) -> list[str]:
+    """Return the merged names by their probability for the vehicle in a photo."""
+    size, total = np.array(image.shape[1::-1], float), Counter[str]()
+    box = np.concatenate([size * (1 - 1 / CONTEXT) / 2, size * (1 + 1 / CONTEXT) / 2])
+    for name, share in zip(COLOR_NAMES, shipped_network().probabilities([crop(image, box)])):
         total[MERGED.get(name, name)] += float(share)
     return [name for name, _ in total.most_common()]
-
-
-def box_of(image: NDArray[np.uint8], detector: object) -> NDArray[np.float64] | None:
-    """Return the box of the largest vehicle that a detector finds; None without one."""
-    if detector is None:
-        return None
-    height, width = image.shape[:2]
-    camera = Camera("photo", width, height, np.diag([width, width, 1.0]), "map", np.eye(4))
-    found = detector.detect(Frame(camera, 0, lambda: image))
-    vehicle = np.isin(found.category, ("car", "truck", "bus", "motorcycle"))
-    boxes = found.box_px[vehicle]
-    area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
-    if not len(area) or area.max() < MIN_VEHICLE_SHARE * width * height:
-        return None
-    return boxes[int(np.argmax(area))]
-
-
-def print_table(confusion: Counter[tuple[str, str]]) -> None:
-    names = sorted({name for pair in confusion for name in pair}, key=lambda n: (*COLOR_NAMES, "none").index(n))
-    print("label \\ name".ljust(14) + "".join(name.rjust(8) for name in names))
-    for label in names:
-        if any(pair[0] == label for pair in confusion):
-            print(label.ljust(14) + "".join(str(confusion[label, name] or ".").rjust(8) for name in names))

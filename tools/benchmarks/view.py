@@ -1,6 +1,6 @@
 """How smoothly the page of `log2sim view` plays: frames in a headless Chromium, without a graphics processor.
 
-python tools/bench.py view [--agents N ...] [--seconds S] [--play S] [--out FILE.json]
+    python tools/bench.py view --play 6
 
 Agents on rings that change their speed, ten waypoints a second, all in sight with their trails. The page plays in real time;
 told are the time from frame to frame, the time that the page's script takes for one, the page's size and how long it loads.
@@ -8,15 +8,11 @@ told are the time from frame to frame, the time that the page's script takes for
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from entry import parser_of
 
 from benchmarks.table import markdown
 from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Scenario, Waypoints
@@ -26,11 +22,9 @@ from log2sim.visualization.page.writer import write_page
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 from browser import CHROMIUM, DRIVER, Browser, browsing
 
-COUNTS = (50, 200, 500)
-STEP_S = 0.1
+COUNTS, SECONDS, STEP_S = (50, 200, 500), 60.0, 0.1
 CATEGORIES = ("car", "car", "truck", "cyclist", "pedestrian", "bus")
-WINDOW_PX = (1280, 800)
-
+HEAD = ["agents", "page MB", "load ms", "frame median / 95 % / longest ms", "script median / 95 % / longest ms"]
 WATCH = """const [seconds, done] = arguments, stamps = [], costs = [], ask = window.requestAnimationFrame.bind(window);
     window.requestAnimationFrame = (f) => ask((now) => {
         const begin = performance.now();
@@ -42,53 +36,28 @@ WATCH = """const [seconds, done] = arguments, stamps = [], costs = [], ask = win
     setTimeout(() => { log2sim.pause(); done([stamps, costs]); }, seconds * 1000);"""
 
 
-@dataclass(frozen=True)
-class Case:
-    """So many agents, with or without the layers of truth and replay."""
-
-    agents: int
-    layers: bool
-
-    @property
-    def name(self) -> str:
-        return f"{self.agents}{' with truth and replay' if self.layers else ''}"
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Measure, print the table and write the rows."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--agents", nargs="*", type=int, default=COUNTS, help="numbers of agents")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of the scenario")
-    parser.add_argument("--play", type=float, default=10.0, help="seconds that are played")
-    parser.add_argument("--out", type=Path, help="also write the rows here")
-    options = parser.parse_args(arguments)
+def main(play: float = 10.0) -> None:
+    """Measure the page for `play` seconds each and print the table."""
     if CHROMIUM is None or DRIVER is None:
         sys.exit("needs Chromium and its driver (Debian: chromium, chromium-driver)")
-    cases = [Case(n, layers=False) for n in options.agents] + [Case(options.agents[-1], layers=True)]
     with tempfile.TemporaryDirectory() as folder, browsing(Path(folder) / "profile") as browser:
-        rows = [measure(browser, case, Path(folder), options.seconds, options.play) for case in cases]
-    print(table(rows))
-    if options.out:
-        options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    return 0
+        rows = [row(browser, n, Path(folder) / "page.html", play) for n in COUNTS]
+        rows.append(row(browser, COUNTS[-1], Path(folder) / "page.html", play, layers=True))
+    print(markdown(HEAD, rows))
 
 
-def measure(browser: Browser, case: Case, folder: Path, seconds: float, play_s: float) -> dict[str, Any]:
-    """Frames of one page."""
-    scenario, page = rings(case.agents, seconds), folder / "page.html"
-    layers = {"truth": scenario, "replay": replay(scenario, mode="exact", dt_s=0.1)} if case.layers else {}
-    write_page(scenario, page, overwrite=True, **layers)
-    browser.open(page.as_uri(), size=WINDOW_PX)
+def row(browser: Browser, count: int, page: Path, play_s: float, *, layers: bool = False) -> list[str]:
+    """Frames of the page of so many agents, with or without the layers of truth and replay."""
+    scenario = rings(count, SECONDS)
+    more = {"truth": scenario, "replay": replay(scenario, mode="exact", dt_s=0.1)} if layers else {}
+    write_page(scenario, page, overwrite=True, **more)
+    browser.open(page.as_uri(), size=(1280, 800))
     loaded_ms = browser.run("return performance.getEntriesByType('navigation')[0].domComplete")
     stamps, costs = browser.run_async(WATCH, play_s)
-    between = np.diff(stamps)
-    return {
-        "agents": case.name,
-        "page_mb": page.stat().st_size / 1e6,
-        "load_ms": loaded_ms,
-        **{f"frame_{k}_ms": v for k, v in _spread(between).items()},
-        **{f"script_{k}_ms": v for k, v in _spread(np.array(costs)).items()},
-    }
+    spreads = [np.percentile(values, [50, 95, 100]) for values in (np.diff(stamps), costs)]
+    name = f"{count} with truth and replay" if layers else str(count)
+    figures = [" / ".join(f"{v:.1f}" for v in spread) for spread in spreads]
+    return [name, f"{page.stat().st_size / 1e6:.1f}", f"{loaded_ms:.0f}", *figures]
 
 
 def rings(count: int, seconds: float) -> Scenario:
@@ -107,21 +76,3 @@ def rings(count: int, seconds: float) -> Scenario:
         )  # fmt: skip
         agents.append(Agent("ego" if k == 0 else f"{category}-{k}", category, TYPICAL_SIZE_M[category], waypoints))
     return Scenario(name=f"{count} agents", t0_ns=0, duration_s=seconds, agents=tuple(agents))
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Medians and 95 % of frames as Markdown."""
-    head = ["agents", "page MB", "load ms", "frame median / 95 % / longest ms", "script median / 95 % / longest ms"]
-    return markdown(
-        head,
-        [
-            [r["agents"], f"{r['page_mb']:.1f}", f"{r['load_ms']:.0f}", *(
-                " / ".join(f"{r[f'{what}_{k}_ms']:.1f}" for k in ("median", "p95", "longest")) for what in ("frame", "script")
-            )]
-            for r in rows
-        ],
-    )  # fmt: skip
-
-
-def _spread(values: np.ndarray) -> dict[str, float]:
-    return {"median": float(np.median(values)), "p95": float(np.percentile(values, 95)), "longest": float(values.max())}

@@ -151,18 +151,4 @@ def figures(rows: Sequence[Array]) -> dict[str, object]:
         if recall is not None and recall < 0.5:
             break
         reached = float(high)
-    return {
-        "range_m": reached,
-        "recall_30m": float(table[inside, 1].mean()),
-        "variants_30m": float(np.mean([_all_seen(r) for r in rows if _crosses(r)])),
-        "recall_by_distance": by_bin,
-    }
-
-
-def _crosses(rows: Array) -> bool:
-    return bool(((rows[:, 0] >= AROUND_30_M[0]) & (rows[:, 0] < AROUND_30_M[1])).any())
-
-
-def _all_seen(rows: Array) -> bool:
-    inside = (rows[:, 0] >= AROUND_30_M[0]) & (rows[:, 0] < AROUND_30_M[1])
-    return bool(rows[inside, 1].all())
+    return {"range_m": reached, "recall_30m": float(table[inside, 1].mean()), "recall_by_distance": by_bin}

@@ -216,46 +216,37 @@ def found_at(view: SeenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> Sce
     return SceneBoxes.of(boxes[kept], found.category[kept], found.score[kept], range_m=away[kept])
 
 
-def row(view: SeenTraffic, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> dict[str, Any]:
-    """Boxes of each sweep by kind: found ones with their scores, true ones with whether they count and hide from the vehicle."""
-    out: dict[str, Any] = {kind: [] for kind in KINDS}
-    for stamp, of_sweep in zip(t_ns.tolist(), boxes, strict=True):
-        for kind in KINDS:
-            truth, hidden = truth_at(view, stamp, kind)
-            found = found_at(view, stamp, of_sweep, kind)
-            out[kind].append(
-                {
-                    "found": found.box.round(4).tolist(),
-                    "score": found.score.round(4).tolist(),
-                    "truth": truth.box.round(4).tolist(),
-                    "ignored": truth.ignored.tolist(),
-                    "hidden": hidden.tolist(),
-                }
-            )
-    return out
+# By kind: found boxes of a sweep, true ones, and which of these hide from the vehicle.
+BoxesOfSweep = dict[str, tuple[SceneBoxes, SceneBoxes, NDArray[np.bool_]]]
 
 
-def figures(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+def sweeps(view: SeenTraffic, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> list[BoxesOfSweep]:
+    """Boxes of each sweep beside the true ones."""
+    return [
+        {kind: (found_at(view, t, found, kind), *truth_at(view, t, kind)) for kind in KINDS}
+        for t, found in zip(t_ns.tolist(), boxes, strict=True)
+    ]
+
+
+def figures(rows: dict[str, list[BoxesOfSweep]]) -> dict[str, Any]:
     """AP BEV (R40) at the limits of `IOU` by kind and way, and recall at a score of 0.5 of what hides from the vehicle and of what does not."""
     ap: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
     recall: dict[str, dict[str, float]] = {"seen": {}, "hidden": {}}
     for way, of_way in rows.items():
         for kind in KINDS:
             criterion = Criterion("iou_bev", IOU[kind])
-            sweeps = [sweep for of_scene in of_way for sweep in of_scene[kind]]
-            found = SceneBoxes.join([SceneBoxes.of(np.reshape(s["found"], (-1, 7)), score=s["score"]) for s in sweeps])
-            truth = SceneBoxes.join(
-                [SceneBoxes.of(np.reshape(s["truth"], (-1, 7)), ignored=s["ignored"]) for s in sweeps]
-            )
+            found, truth = (SceneBoxes.join([sweep[kind][k] for sweep in of_way]) for k in (0, 1))
             ap[kind][way] = average_precision(found, truth, criterion)
-            if kind == "vehicle":
-                hidden = np.concatenate([np.array(s["hidden"], bool) for s in sweeps])
-                right = match_detections(found.take(found.score >= REPORTED_SCORE), truth, criterion).truth
-                got = np.isin(np.arange(len(truth)), right[right >= 0])
-                for name, of in (("seen", ~hidden), ("hidden", hidden)):
-                    counted = ~truth.ignored & of
-                    recall[name][way] = float(got[counted].mean()) if counted.any() else float("nan")
-                count, share = int((~truth.ignored).sum()), float(hidden[~truth.ignored].mean())
+        found, truth = (SceneBoxes.join([sweep["vehicle"][k] for sweep in of_way]) for k in (0, 1))
+        hidden = np.concatenate([sweep["vehicle"][2] for sweep in of_way])
+        right = match_detections(
+            found.take(found.score >= REPORTED_SCORE), truth, Criterion("iou_bev", IOU["vehicle"])
+        ).truth
+        got = np.isin(np.arange(len(truth)), right[right >= 0])
+        for name, of in (("seen", ~hidden), ("hidden", hidden)):
+            counted = ~truth.ignored & of
+            recall[name][way] = float(got[counted].mean()) if counted.any() else float("nan")
+        count, share = int((~truth.ignored).sum()), float(hidden[~truth.ignored].mean())
     return {"ap": ap, "recall": recall, "vehicles": count, "hidden_from_vehicle": share}
 
 

@@ -49,11 +49,9 @@ def keeps_promise(world: World) -> bool:
 
 
 def _view_angle(world: World, t_s: np.ndarray) -> np.ndarray:
-    moving = world.moving
-    assert moving.ego is not None
-    xy = next(a for a in moving.actors if a.spec.id == world.target).at(t_s).center_m[:, :2]
-    pole = np.array(world.scene.lidar[1].position_m[:2])
-    views = [moving.ego.at(t_s).center_m[:, :2] - xy, pole - xy]
+    ego, xy = world.moving.ego, world.target_actor.at(t_s).center_m[:, :2]
+    assert ego is not None
+    views = [ego.at(t_s).center_m[:, :2] - xy, np.array(world.scene.lidar[1].position_m[:2]) - xy]
     cross = views[0][:, 0] * views[1][:, 1] - views[0][:, 1] * views[1][:, 0]
     return np.abs(np.arctan2(cross, (views[0] * views[1]).sum(1)))
 
@@ -171,7 +169,6 @@ def figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "over_better_end": float(np.nanmean(m[:, 1]) - best_on_average),
             "over_better_by_variant": float(np.nanmean(m[:, 1] - better)),
             "worse_variants": int(np.sum(m[:, 1] < better - WORSE_BY)),
-            "never_found": int(np.isnan(m[:, 1]).sum()),
         }
         for way, m in means.items()
     }

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,66 +78,35 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
     return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
 
 
-class Rows(dict[tuple[Any, ...], Any]):
-    """What was measured, by test, seed, way and settings; with a file of JSON lines also across runs.
-
-    Rows of older code are not told apart, so begin a new file after a change.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        super().__init__()
-        self._path = path
-        if path is not None and path.is_file():
-            self.update((tuple(key), row) for key, row in map(json.loads, path.read_text().splitlines()))
-
-    def __setitem__(self, key: tuple[Any, ...], row: Any) -> None:
-        """Keep a row."""
-        super().__setitem__(key, row)
-        if self._path is not None:
-            with self._path.open("a") as file:
-                file.write(json.dumps([key, row]) + "\n")
-
-
-def registration_row(log: Log, error: RoadError) -> dict[str, Any]:
-    """Errors of the pole's end before and after `log2sim` has prepared a run, and what it says about them."""
+def registration_row(log: Log, error: RoadError) -> tuple[Array, Array, bool]:
+    """Errors of the pole's end (3,) before and after `log2sim` has prepared a run, NaN where it is left out, and whether it says that it is unsure."""
     disturbed = disturb(log, error)
     run = start(disturbed, settings("points", register=True))
-    before, after = _error(log, disturbed), None
-    if ROAD_LIDAR in run.log.lidars:
-        after = _error(log, run.log)
-    return {
-        "before": before,
-        "after": after,
-        "faults": [[fault.kind, fault.treatment] for fault in run.faults if fault.subject == ROAD_LIDAR],
-    }
+    after = _error(log, run.log) if ROAD_LIDAR in run.log.lidars else np.full(3, np.nan)
+    told = any(f.kind in ("unknown_road_pose", "wrong_road_pose") for f in run.faults if f.subject == ROAD_LIDAR)
+    return _error(log, disturbed), after, told
 
 
-def _error(log: Log, other: Log) -> dict[str, float]:
+def _error(log: Log, other: Log) -> Array:
+    """Offset m, turn degrees and delay s, their sizes."""
     true, pose = log.lidars[ROAD_LIDAR].mount_T_lidar, other.lidars[ROAD_LIDAR].mount_T_lidar
     turned = inverse(true)[:3, :3] @ pose[:3, :3]
-    angle = np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))
+    angle = np.rad2deg(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
     late_ns = other.streams[ROAD_LIDAR].t_ns[0] - log.streams[ROAD_LIDAR].t_ns[0]
+    return np.array([np.linalg.norm(pose[:2, 3] - true[:2, 3]), angle, abs(late_ns) / NS_PER_S])
+
+
+def registration_figures(rows: Sequence[tuple[Array, Array, bool]]) -> dict[str, Any]:
+    """Medians and 90th percentiles (2, 3) of the errors, of those that are used, and shares."""
+    before, after, told = map(np.array, zip(*rows))
+    good = (after[:, 0] <= 0.1) & (after[:, 1] <= 0.3)
     return {
-        "offset_m": float(np.linalg.norm(pose[:2, 3] - true[:2, 3])),
-        "turn_deg": float(np.rad2deg(angle)),
-        "delay_s": float(late_ns / NS_PER_S),
+        "before": np.quantile(before, [0.5, 0.9], axis=0),
+        "after": np.nanquantile(after, [0.5, 0.9], axis=0),
+        "within 0.1 m and 0.3 deg": good.mean(),
+        "left out": np.isnan(after[:, 0]).mean(),
+        "silent": (~good & ~told).mean(),
     }
-
-
-def registration_figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Medians and 90th percentiles of the errors, of those that are used."""
-    out: dict[str, Any] = {}
-    for when in ("before", "after"):
-        of = [r[when] for r in rows if r[when] is not None]
-        for name in ("offset_m", "turn_deg", "delay_s"):
-            values = np.abs([e[name] for e in of]) if of else np.array([np.nan])
-            out[f"{name}_{when}"] = {"median": float(np.median(values)), "p90": float(np.quantile(values, 0.9))}
-    good = [r["after"] is not None and r["after"]["offset_m"] <= 0.1 and r["after"]["turn_deg"] <= 0.3 for r in rows]
-    out["within_target"] = float(np.mean(good))
-    out["left_out"] = float(np.mean([r["after"] is None for r in rows]))
-    told = [any(kind in ("unknown_road_pose", "wrong_road_pose") for kind, _ in r["faults"]) for r in rows]
-    out["silent"] = float(np.mean(~np.array(good) & ~np.array(told)))
-    return out
 
 
 NAMES = {
@@ -188,15 +155,9 @@ def ap_table(figures: dict[str, Any]) -> str:
 
 
 def registration_table(figures: dict[str, Any]) -> str:
-    rows = []
-    for when in ("before", "after"):
-        cells = [figures[f"{name}_{when}"] for name in ("offset_m", "turn_deg", "delay_s")]
-        rows.append([when, *(f"{c['median']:.3f} / {c['p90']:.3f}" for c in cells)])
-    table = markdown(["median / 90 %", "position m", "angle deg", "clock s"], rows)
-    return (
-        table + f"\n\nwithin 0.1 m and 0.3 deg: {cell(figures['within_target'])}; left out: {cell(figures['left_out'])}"
-        f"; silent: {cell(figures['silent'])}"
-    )
+    rows = [[when, *(f"{m:.3f} / {p:.3f}" for m, p in figures[when].T)] for when in ("before", "after")]
+    shares = [f"{name}: {value:.2f}" for name, value in figures.items() if name not in ("before", "after")]
+    return markdown(["median / 90 %", "position m", "angle deg", "clock s"], rows) + f"\n\n{'; '.join(shares)}"
 
 
 TABLE: dict[str, Callable[[dict[str, Any]], str]] = {

@@ -7,12 +7,9 @@ with the truth by overlap. The logarithm of the error of each side is regressed 
 
 from __future__ import annotations
 
-import pickle
 import sys
-from pathlib import Path
 
 import numpy as np
-from entry import parser_of
 from lidar_training.clouds import draw_example
 from scipy.optimize import minimize
 
@@ -97,16 +94,9 @@ def collect(scenes: int, seed: int) -> list[Row]:
     return rows
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print the weights, and how well they describe the errors of other scenes."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--scenes", type=int, default=300, help="of each mount")
-    parser.add_argument("--seed", type=int, default=5)
-    parser.add_argument("--out", type=Path, help="pickle of all errors")
-    args = parser.parse_args(arguments)
-    rows = collect(args.scenes, args.seed)
-    if args.out:
-        args.out.write_bytes(pickle.dumps(rows))
+def main(scenes: int = 300, seed: int = 5) -> None:
+    """Print the weights of scenes of each mount, and how well they describe the errors."""
+    rows = collect(scenes, seed)
     for group in GROUPS:
         for kind in ("side", "yaw"):
             mine = [row for row in rows if row[:2] == (group, kind)]

@@ -1,6 +1,6 @@
 """Fit the weights of the evidence by which agents are judged, and those of their systematic errors, on simulated logs.
 
-    python tools/fit.py confidence_logs --logs 60 --seed 2 --out FOLDER
+    python tools/fit.py confidence_logs FOLDER --logs 60 --seed 2
     python tools/fit.py confidence FOLDER ... > log2sim/agents/weights.py
 
 Goes on from the first passes that the former made, judges every candidate as `evaluate` does, also those that are dropped, and
@@ -19,7 +19,6 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from entry import parser_of
 from numpy.typing import NDArray
 
 from fits.confidence_logs import Case
@@ -297,20 +296,14 @@ def module_text(command: str, agents: Sequence[Rated]) -> str:
     return "\n".join(lines).replace("'", '"')
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("folders", type=Path, nargs="+", help="of confidence_logs.py")
-    options = parser.parse_args(arguments)
+def main(folders: list[Path]) -> None:
+    """Print the module that fits the logs of `confidence_logs` in some folders."""
     agents: list[Rated] = []
-    paths = [path for folder in options.folders for path in sorted(folder.glob("*.pkl"))]
+    paths = [path for folder in folders for path in sorted(folder.glob("*.pkl"))]
     for path in paths:
         agents += [agent for case in pickle.loads(path.read_bytes()) for agent in agents_of(case, path.stem)]
         say(f"{path.stem}: {len(agents)} candidates")
     report(agents)
     seeds = ", ".join(sorted({path.stem.split("-")[0] for path in paths}))
-    print(
-        module_text(
-            f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs --logs {len(paths)} --seed {seeds}",
-            agents,
-        )
-    )
+    command = f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs FOLDER --logs {len(paths)} --seed {seeds}"
+    print(module_text(command, agents))

@@ -1,6 +1,6 @@
 """Make the first passes over synthetic logs on which `fit.py confidence` fits: random traffic, sensors, rates and detectors.
 
-    python tools/fit.py confidence_logs --logs 40 --seed 1 --out FOLDER
+    python tools/fit.py confidence_logs FOLDER --logs 40 --seed 1
 
 Each log is random traffic (either side of the road, weather, LiDARs of the market, on a vehicle or at the roadside), with a
 detector in sweeps, a simulated one in images, or both, and a second time without LiDAR. Simulated are the errors that detectors
@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from entry import parser_of
 
 from log2sim.config import Config
 from log2sim.datatypes import (
@@ -346,19 +345,14 @@ def _case(log: Log, scene: TrafficScene, truth: Scenario, detector: str, seed: i
     return Case(f"{log.name} ({kind})", run, observations, truth)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--logs", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0, help="index of the first log")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    for index in range(options.first, options.first + options.logs):
-        path = options.out / f"{options.seed}-{index:03d}.pkl"
+def main(folder: Path, logs: int = 40, first: int = 0, seed: int = 1) -> None:
+    """Make so many logs, from the first index on."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for index in range(first, first + logs):
+        path = folder / f"{seed}-{index:03d}.pkl"
         if path.exists():
             continue
-        cases = cases_of(options.seed, index)
+        cases = cases_of(seed, index)
         part = path.with_suffix(f".{os.getpid()}")
         part.write_bytes(pickle.dumps(cases, protocol=5))
         part.replace(path)

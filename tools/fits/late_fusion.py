@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from entry import parser_of
 from numpy.typing import NDArray
 
 from log2sim.config import Config
@@ -85,17 +84,11 @@ def loss_of(x: Array, right: NDArray[np.bool_], w: Array) -> float:
     return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (x @ w)).sum())
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--images", default="ssd-mobilenet-v2", help="detector in images")
-    parser.add_argument("--sweeps", default="lidar:vehicle", help="detector in sweeps")
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args(arguments)
-    parts = [pairs_of(scene, options.images, options.sweeps, options.seed) for scene in options.scenes]
-    x, right = np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts])
+def main(scenes: list[Path], images: str = "ssd-mobilenet-v2", sweeps: str = "lidar:vehicle", seed: int = 1) -> None:
+    """Print the weights for a detector in images and one in sweeps."""
+    x, right = (np.concatenate(part) for part in zip(*(pairs_of(scene, images, sweeps, seed) for scene in scenes)))
     before, weights = np.array(list(vars(PAIR_WEIGHTS).values())), fit(x, right)
-    print(f"{len(x)} pairs, {int(right.sum())} right; seed {options.seed}")
+    print(f"{len(x)} pairs, {int(right.sum())} right; seed {seed}")
     for name, w in (("independent", before), ("fitted", weights)):
         print(f"{name:12s} loss a pair {loss_of(x, right, w) / max(len(x), 1):.4f}")
     print(PairWeights(*(round(float(w), 2) for w in weights)))

@@ -9,10 +9,8 @@ by what boxes of tracks are wrong by. A minute for a thousand vehicles.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from entry import parser_of
 
 from log2sim.agents.heading import HEIGHT_CELLS, Outline, outline_of
 from log2sim.datatypes.log_odds import probability_of
@@ -24,7 +22,6 @@ from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
-WEIGHTS = Path(__file__).resolve().parents[2] / "log2sim" / "agents" / "heading" / "outline_weights.py"
 # By whether the vehicle is tall, and whether most of its length shows.
 NAMES = {(False, True): "LOW", (False, False): "LOW_IN_PART", (True, True): "TALL", (True, False): "TALL_IN_PART"}
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)
@@ -146,34 +143,24 @@ def report(name: str, odds: np.ndarray) -> None:
             )
 
 
-def write(weights: dict[tuple[bool, bool], np.ndarray]) -> None:
-    text = '"""Weights of `Outline.features` in hundredths, made by `tools/fit.py outline`."""\n'
-    for kind, name in NAMES.items():
-        numbers = np.round(100 * weights[kind]).astype(int)
-        rows = [", ".join(map(str, row)) for row in numbers[:-1].reshape(-1, HEIGHT_CELLS)]
-        text += f"\n{name} = (\n" + "".join(f"    {row},\n" for row in rows) + f"    {numbers[-1]},\n)  # fmt: skip\n"
-    WEIGHTS.write_text(text, encoding="utf-8")
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--vehicles", type=int, default=4000)
-    parser.add_argument("--test", type=int, default=500)
-    options = parser.parse_args(arguments)
+def main(vehicles: int = 4000, test: int = 500) -> None:
     found: dict[tuple[bool, bool], list[np.ndarray]] = {kind: [] for kind in NAMES}
     tests: list[Outline] = []
-    for seed in range(options.vehicles + options.test):
+    for seed in range(vehicles + test):
         rng = np.random.default_rng([1, seed])
         seen = draw(rng)
         if seen is None:
             continue
         for _ in range(BOXES):
             outline = measured(seen, rng)
-            if outline is not None and seed < options.vehicles:
+            if outline is not None and seed < vehicles:
                 found[outline.kind].append(outline.features)
             elif outline is not None:
                 tests.append(outline)
     weights = {kind: fit(np.array(rows)) for kind, rows in found.items()}
     for kind, name in NAMES.items():
         report(name, np.array([o.features @ weights[kind] for o in tests if o.kind == kind]))
-    write(weights)
+    for kind, name in NAMES.items():
+        numbers = np.round(100 * weights[kind]).astype(int)
+        rows = [", ".join(map(str, row)) for row in numbers[:-1].reshape(-1, HEIGHT_CELLS)]
+        print(f"{name} = (\n" + "".join(f"    {row},\n" for row in rows) + f"    {numbers[-1]},\n)  # fmt: skip")

@@ -8,28 +8,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kitti.boxes import (
+from kitti.boxes import PERIOD_NS, Boxes, Index, Mask, View, from_map, hidden_share, is_small, overlap_3d, same_frame
+from kitti.tracks import (
     SCALE,
-    Boxes,
-    Index,
-    Mask,
     Rows,
     end_rows,
     exact_sums,
     first_of_run,
     last_of_run,
     neighbors,
-    overlap_3d,
     smooth_shapes,
     sum_so_far,
 )
-from kitti.map import PERIOD_NS, View, from_map, hidden_share, is_small, same_frame
 from log2sim.datatypes import Measurements
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.stitch import MAX_PEDESTRIAN_SPEED_MPS
 
 # Log-odds that a box of a car lies on a labeled one, of detected and of predicted boxes, with all frames at hand and with those
-# so far: logistic regression by tools/fit.py kitti on sequences 0000, 0002, 0004, 0005, 0007, 0009 and 0011, all of the part on
+# so far: logistic regression by `bench.py kitti --fit` on sequences 0000, 0002, 0004, 0005, 0007, 0009 and 0011, all of the part on
 # which the benchmark's validation does not run.
 SEEN = {"constant": -8.89, "score": 0.2, "near_score": 1.0, "near_share": 3.25, "hidden": -3.67, "height": -4.68}
 PREDICTED = {"constant": -5.5, "near_score": 0.67, "near_share": 3.59}

@@ -19,7 +19,8 @@ DIRECTION, QUALITY, SEGMENT, VOTE = slice(16, 18), slice(18, 19), slice(19, 23),
 HEAT_PRIOR_LOGIT = -3.5
 
 
-def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+def conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """Make a convolution with batch normalization and ReLU."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False),
         nn.BatchNorm2d(outputs),
@@ -35,12 +36,12 @@ class BevNetwork(nn.Module):
     ) -> None:
         super().__init__()
         a, b, c, d = widths
-        self.stem = nn.Sequential(_conv(IN_CHANNELS, a, kernel=6, stride=2), _conv(a, a))
-        self.down4 = nn.Sequential(_conv(a, b, stride=2), *[_conv(b, b) for _ in range(depths[0])])
-        self.down8 = nn.Sequential(_conv(b, c, stride=2), *[_conv(c, c) for _ in range(depths[1])])
-        self.down16 = nn.Sequential(_conv(c, d, stride=2), *[_conv(d, d) for _ in range(depths[2])])
-        self.lateral8, self.lateral4, self.lateral2 = _conv(d, c, 1), _conv(c, b, 1), _conv(b, a, 1)
-        self.merge8, self.merge4, self.merge2 = _conv(c, c), _conv(b, b), _conv(a, 32)
+        self.stem = nn.Sequential(conv(IN_CHANNELS, a, kernel=6, stride=2), conv(a, a))
+        self.down4 = nn.Sequential(conv(a, b, stride=2), *[conv(b, b) for _ in range(depths[0])])
+        self.down8 = nn.Sequential(conv(b, c, stride=2), *[conv(c, c) for _ in range(depths[1])])
+        self.down16 = nn.Sequential(conv(c, d, stride=2), *[conv(d, d) for _ in range(depths[2])])
+        self.lateral8, self.lateral4, self.lateral2 = conv(d, c, 1), conv(c, b, 1), conv(b, a, 1)
+        self.merge8, self.merge4, self.merge2 = conv(c, c), conv(b, b), conv(a, 32)
         self.head = nn.Conv2d(32, OUT_CHANNELS, 1)
         self.up = nn.Upsample(scale_factor=2, mode="nearest")
         with torch.no_grad():
@@ -57,8 +58,6 @@ class BevNetwork(nn.Module):
         return self.head(self.merge2(s2 + self.up(self.lateral2(s4))))
 
 
-# Meters of x, y, z and logarithms of length, width, height.
-BOX_WEIGHTS = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 VEHICLE_CATEGORIES, TWO_WHEELER_CATEGORIES = 3, 2
 
 
@@ -67,8 +66,7 @@ def loss_of(maps: Tensor, targets: Targets, grid: Tensor) -> tuple[Tensor, dict[
     where = targets.regressed
     count = where.sum().clamp(min=1)
     parts = {"heat": _heat_loss(maps[:, HEAT], targets)}
-    weights = torch.tensor(BOX_WEIGHTS).view(1, 6, 1, 1)
-    parts["box"] = ((maps[:, BOX] - targets.box[:, :6]).abs() * where * weights).sum() / count
+    parts["box"] = ((maps[:, BOX] - targets.box[:, :6]).abs() * where).sum() / count
     parts["axis"] = ((maps[:, AXIS] - targets.box[:, 6:8]).abs() * where).sum() / count
     # Least squares, so that the answer is the mean where front and back cannot be told apart.
     parts["direction"] = (((maps[:, DIRECTION] - targets.box[:, 8:10]) ** 2) * where).sum() / count
@@ -182,29 +180,17 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
                 considered[(k, 0, *area)][inside] = 0
                 continue
             group = GROUPS.index(GROUP_OF[name])
-            peak = np.exp(
-                -0.5
-                * (
-                    (along / max(length * PEAK_LENGTH, cell * MIN_PEAK_CELLS)) ** 2
-                    + (across / max(width * PEAK_WIDTH, cell * MIN_PEAK_CELLS)) ** 2
-                )
-            )
+            spread_m = [
+                max(length * PEAK_LENGTH, cell * MIN_PEAK_CELLS),
+                max(width * PEAK_WIDTH, cell * MIN_PEAK_CELLS),
+            ]
+            peak = np.exp(-0.5 * ((along / spread_m[0]) ** 2 + (across / spread_m[1]) ** 2))
             peak[int(u) - i0, int(v) - j0] = 1
             stronger = peak > heat[(k, group, *area)]
             heat[(k, group, *area)][stronger] = peak[stronger]
             near = (peak > MIN_REGRESSED_PEAK) & stronger
-            values = (
-                dx + 0 * dy,
-                dy + 0 * dx,
-                z,
-                np.log(length),
-                np.log(width),
-                np.log(height),
-                np.sin(2 * yaw),
-                np.cos(2 * yaw),
-                s,
-                c,
-            )
+            sizes = np.log([length, width, height]), np.sin(2 * yaw), np.cos(2 * yaw)
+            values = (dx + 0 * dy, dy + 0 * dx, z, *sizes[0], *sizes[1:], s, c)
             for q, value in enumerate(values):
                 box[(k, q, *area)][near] = value[near] if isinstance(value, np.ndarray) else value
             regressed[(k, 0, *area)][near] = 1

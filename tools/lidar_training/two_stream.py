@@ -2,14 +2,13 @@
 
     pip install 'log2sim[train]'
     log2sim synth --traffic vehicle --layout kitti --scenes 300 --out PAIRS
-    python tools/train_lidar.py two_stream --data PAIRS --out OUT --steps 1500 --test KITTI=DRIVE --write BENCHMARKS.md
+    python tools/train_lidar.py two_stream PAIRS OUT --steps 1500 --test KITTI=DRIVE --write BENCHMARKS.md
 
 A pair is a picture and a cloud of one moment with the road users in both; x of the cloud points where the camera looks.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +20,12 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from benchmarks.table import markdown, replace_section
-from entry import parser_of
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_training.export import export_checked
 from lidar_training.fitting import FitPlan, fit
+from lidar_training.network import conv
 from lidar_training.real_logs import LogSweep, LogView, ground_under, labeled_by, read_sweeps
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Log
@@ -317,13 +316,8 @@ def encode(boxes: Array, anchors: NDArray[np.float32]) -> NDArray[np.float32]:
 def decode(goal: NDArray[np.floating], anchors: NDArray[np.float32]) -> Array:
     """Boxes (N, 7) from offsets, the inverse of `encode` but for front and back."""
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None].astype(np.float64)
-    return np.column_stack(
-        [
-            anchors[:, :3] + goal[:, :3] * diagonal,
-            anchors[:, 3:6] * np.exp(np.clip(goal[:, 3:6], -1.5, 1.5)),
-            anchors[:, 6] + goal[:, 6],
-        ]
-    )
+    size = anchors[:, 3:6] * np.exp(np.clip(goal[:, 3:6], -1.5, 1.5))
+    return np.column_stack([anchors[:, :3] + goal[:, :3] * diagonal, size, anchors[:, 6] + goal[:, 6]])
 
 
 BLOCKS = ((8, 2), (16, 2), (32, 3), (64, 3))
@@ -336,12 +330,6 @@ PRIOR_LOGIT = -4.6
 MAX_ANCHORS = 6000
 
 
-def _conv(inputs: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
-    )
-
-
 class Stream(nn.Module):
     """Encoder and decoder of one input, to its own resolution."""
 
@@ -349,13 +337,13 @@ class Stream(nn.Module):
         super().__init__()
         down, width = [], channels
         for outputs, count in blocks:
-            down.append(nn.Sequential(*[_conv(width if k == 0 else outputs, outputs) for k in range(count)]))
+            down.append(nn.Sequential(*[conv(width if k == 0 else outputs, outputs) for k in range(count)]))
             width = outputs
         self.down = nn.ModuleList(down)
         ups, merges = [], []
         for lower, upper in zip(blocks[::-1], blocks[-2::-1], strict=False):
             ups.append(nn.ConvTranspose2d(lower[0], upper[0], 2, 2))
-            merges.append(_conv(2 * upper[0], upper[0]))
+            merges.append(conv(2 * upper[0], upper[0]))
         self.ups, self.merges = nn.ModuleList(ups), nn.ModuleList(merges)
         # The paper's 1 x 1 convolution before the crops.
         self.squeeze = nn.Conv2d(blocks[0][0], blocks[0][0], 1)
@@ -481,28 +469,20 @@ def export_two_stream(network: TwoStream, path: Path) -> None:
     export_checked(network.eval(), path, tensors, ("logits", "codes"), axes)
 
 
-@dataclass(frozen=True, eq=False)
-class TwoStreamDetector:
-    """Detector on pairs from the exported network."""
+def search_by_network(path: Path) -> Search:
+    """Search pairs by an exported network, in the frames of their clouds, with one thread."""
+    import onnxruntime
 
-    session: Any
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
-    @classmethod
-    def open(cls, path: Path) -> TwoStreamDetector:
-        """Load the network for one thread."""
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        return cls(onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"]))
-
-    def __call__(self, pair: Pair) -> SceneBoxes:
-        """Detect road users in a pair, in the frame of its cloud."""
+    def search(pair: Pair) -> SceneBoxes:
         seen = inputs_of(pair)
         if not len(seen.kind):
             return SceneBoxes.of(np.zeros((0, 7)))
         arrays = (seen.bev[None], seen.image[None], seen.bev_boxes, seen.image_boxes)
-        logits, codes = self.session.run(["logits", "codes"], dict(zip(INPUTS, arrays, strict=True)))
+        logits, codes = session.run(["logits", "codes"], dict(zip(INPUTS, arrays, strict=True)))
         rows = np.arange(len(seen.kind))
         score = 1 / (1 + np.exp(-logits[rows, seen.kind].astype(np.float64)))
         best = np.argsort(-score)[:MAX_CANDIDATES]
@@ -512,6 +492,8 @@ class TwoStreamDetector:
         boxes, best = boxes[kept], best[kept]
         boxes[:, 2] += boxes[:, :2] @ pair.ground[:2] + pair.ground[2]
         return SceneBoxes.of(boxes, np.array(CLASSES)[seen.kind[best]], score[best])
+
+    return search
 
 
 def search_by_lidar(detector: LidarDetector) -> Search:
@@ -554,6 +536,7 @@ def truth_of(pair: Pair, kind: str) -> SceneBoxes:
 
 
 TEST_SHARE = 0.15
+EVERY = 3  # of the sweeps of other logs
 PEAK_RATE = 2e-3
 
 
@@ -575,51 +558,31 @@ def train(pairs: list[Pair], out: Path, *, steps: int, seed: int) -> Path:
         batch = Batch.of(inputs_of(pair, mirrored=bool(rng.random() < 0.5)), rng)
         return loss_of_anchors(*batch.run(n), batch)
 
-    mean = fit(network, step, FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt"))
-    network.load_state_dict(mean)
-    path = out / "two_stream.onnx"
-    export_two_stream(network, path)
-    return path
+    network.load_state_dict(fit(network, step, FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt")))
+    export_two_stream(network, out / "two_stream.onnx")
+    return out / "two_stream.onnx"
 
 
-def table(results: dict[str, dict[str, dict[str, Any]]], pairs: dict[str, int]) -> str:
-    """Write average precision by test, detector, class and criterion."""
-    columns = [(kind, str(c)) for kind, criteria in CRITERIA.items() for c in criteria]
-    head = ["tested on", "detector", *[f"{kind}, {c}" for kind, c in columns], "truths", "CPU ms"]
-    rows = []
-    for test, by_detector in results.items():
-        for name, row in by_detector.items():
-            values = [row[kind][c] for kind, c in columns]
-            cells = ["-" if v is None else f"{v:.3f}" for v in values]
-            truths = " / ".join(str(row[kind]["truths"]) for kind in CRITERIA)
-            rows.append([f"{test} ({pairs[test]})", name, *cells, truths, f"{row['ms']:.0f}"])
-    return markdown(head, rows)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Read the command line, train and compare."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder in KITTI's object layout")
-    parser.add_argument(
-        "--out", type=Path, required=True, help="folder of the checkpoint, the ONNX file and the results"
-    )
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--test", action="append", default=[], metavar="NAME=PATH", help="another labeled log")
-    parser.add_argument("--every", type=int, default=3, help="every n-th sweep of other logs")
-    parser.add_argument("--write", type=Path, help="Markdown file whose section two-stream is replaced")
-    options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    pairs = read_pairs(options.data)
+def main(
+    data: Path, out: Path, steps: int = 1500, seed: int = 1, test: list[str] = [], write: Path | None = None
+) -> None:
+    """Train on a folder in KITTI's object layout and compare on pairs that are left out, and on other logs, NAME=PATH each."""
+    out.mkdir(parents=True, exist_ok=True)
+    pairs = read_pairs(data)
     held = max(1, round(len(pairs) * TEST_SHARE))
-    path = train([p.in_picture_only() for p in pairs[:-held]], options.out, steps=options.steps, seed=options.seed)
-    tests = {"simulated": pairs[-held:]}
-    tests |= {name: read_pairs(Path(log), options.every) for name, log in (t.split("=", 1) for t in options.test)}
+    path = train([p.in_picture_only() for p in pairs[:-held]], out, steps=steps, seed=seed)
+    tests = {"simulated": pairs[-held:]} | {
+        n: read_pairs(Path(log), EVERY) for n, log in (t.split("=", 1) for t in test)
+    }
     lidar = open_network(WEIGHTS / "vehicle.onnx", LidarConfig(min_score=MIN_SCORE), name="lidar:vehicle")
-    searches = {"two-stream": TwoStreamDetector.open(path), "`lidar:vehicle`": search_by_lidar(lidar)}
-    results = {name: compare(searches, frames) for name, frames in tests.items()}
-    (options.out / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    text = table(results, {name: len(frames) for name, frames in tests.items()})
+    searches = {"two-stream": search_by_network(path), "`lidar:vehicle`": search_by_lidar(lidar)}
+    columns, rows = [(kind, str(c)) for kind, criteria in CRITERIA.items() for c in criteria], []
+    for name, frames in tests.items():
+        for detector, row in compare(searches, frames).items():
+            cells = ["-" if row[kind][c] is None else f"{row[kind][c]:.3f}" for kind, c in columns]
+            truths = " / ".join(str(row[kind]["truths"]) for kind in CRITERIA)
+            rows.append([f"{name} ({len(frames)})", detector, *cells, truths, f"{row['ms']:.0f}"])
+    text = markdown(["tested on", "detector", *(f"{kind}, {c}" for kind, c in columns), "truths", "CPU ms"], rows)
     print(text)
-    if options.write:
-        replace_section(options.write, "two-stream", text)
+    if write:
+        replace_section(write, "two-stream", text)

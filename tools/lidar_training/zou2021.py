@@ -2,7 +2,7 @@
 
     pip install 'log2sim[train]'
     python tools/train_lidar.py roadside --out DIR --only generate
-    python tools/train_lidar.py zou2021 --data DIR/data --out OUT --steps 1500
+    python tools/train_lidar.py zou2021 DIR/data OUT --steps 1500
     log2sim reconstruct LOG --detector lidar:OUT/zou2021.onnx --set lidar.decode=votes
 
 The paper leaves some things open or prints what cannot be meant. What is done here:
@@ -26,14 +26,13 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from entry import parser_of
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lidar_training.clouds import CATEGORIES, Sample, Shard, augmented, grid_of, window_of
 from lidar_training.export import describe, description, export_checked
 from lidar_training.fitting import FitPlan, fit
-from lidar_training.network import IN_CHANNELS, MIN_POINTS
+from lidar_training.network import IN_CHANNELS, MIN_POINTS, conv
 
 PAPER_CHANNELS, PAPER_OUTPUTS = 8, 11
 OFFSET, CLASSES, HEIGHT, HEADING = slice(0, 2), slice(2, 8), slice(8, 9), slice(9, 11)
@@ -68,19 +67,9 @@ class PaperGrid(nn.Module):
         return torch.cat([2 * grid[:, 0:2], direction, distance, zero, zero, count, filled], dim=1)
 
 
-def _layers(*convolutions: nn.Module) -> nn.Sequential:
-    parts: list[nn.Module] = []
-    for layer in convolutions:
-        parts += [layer, nn.BatchNorm2d(layer.out_channels), nn.ReLU(inplace=True)]
-    return nn.Sequential(*parts)
-
-
-def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
-
-
-def _up(inputs: int, outputs: int) -> nn.ConvTranspose2d:
-    return nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=False)
+def _up(inputs: int, outputs: int) -> nn.Sequential:
+    layer = nn.ConvTranspose2d(inputs, outputs, 4, 2, 1, bias=False)
+    return nn.Sequential(layer, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
 
 
 class Zou2021Network(nn.Module):
@@ -93,16 +82,16 @@ class Zou2021Network(nn.Module):
         super().__init__()
         c24, c48, c64, c96, c128, c192 = (max(2, round(n * share)) for n in (24, 48, 64, 96, 128, 192))
         self.grid = PaperGrid()
-        self.c1 = _layers(_conv(PAPER_CHANNELS, c24, 1), _conv(c24, c24), _conv(c24, c48, stride=2), _conv(c48, c48))
-        self.c2 = _layers(_conv(c48, c64, stride=2), _conv(c64, c64), _conv(c64, c64))
-        self.c3 = _layers(_conv(c64, c96, stride=2), _conv(c96, c96), _conv(c96, c96))
-        self.c4 = _layers(_conv(c96, c128, stride=2), _conv(c128, c128), _conv(c128, c128))
-        self.c5 = _layers(_conv(c128, c192, stride=2), _conv(c192, c192))
-        self.d1 = _layers(_conv(c192, c192), _up(c192, c128))
-        self.d2 = _layers(_conv(2 * c128, c128), _up(c128, c96))
-        self.d3 = _layers(_conv(2 * c96, c96), _up(c96, c64))
-        self.d4 = _layers(_conv(2 * c64, c64), _up(c64, c48))
-        self.d5 = nn.Sequential(*_layers(_conv(2 * c48, c48)), nn.ConvTranspose2d(c48, PAPER_OUTPUTS, 4, 2, 1))
+        self.c1 = nn.Sequential(conv(PAPER_CHANNELS, c24, 1), conv(c24, c24), conv(c24, c48, stride=2), conv(c48, c48))
+        self.c2 = nn.Sequential(conv(c48, c64, stride=2), conv(c64, c64), conv(c64, c64))
+        self.c3 = nn.Sequential(conv(c64, c96, stride=2), conv(c96, c96), conv(c96, c96))
+        self.c4 = nn.Sequential(conv(c96, c128, stride=2), conv(c128, c128), conv(c128, c128))
+        self.c5 = nn.Sequential(conv(c128, c192, stride=2), conv(c192, c192))
+        self.d1 = nn.Sequential(conv(c192, c192), _up(c192, c128))
+        self.d2 = nn.Sequential(conv(2 * c128, c128), _up(c128, c96))
+        self.d3 = nn.Sequential(conv(2 * c96, c96), _up(c96, c64))
+        self.d4 = nn.Sequential(conv(2 * c64, c64), _up(c64, c48))
+        self.d5 = nn.Sequential(conv(2 * c48, c48), nn.ConvTranspose2d(c48, PAPER_OUTPUTS, 4, 2, 1))
 
     def forward(self, grid: Tensor, middle_m: Tensor | None = None) -> Tensor:
         """Map grids (B, 12, H, W), H and W even, to the paper's outputs (B, 11, H, W); `middle_m` as in `PaperGrid`."""
@@ -263,8 +252,13 @@ def export_zou2021(network: Zou2021Network, path: Path, card: dict[str, object])
     describe(path, description("zou2021", CELL_M, RANGE_M) | {"stride": 1, "card": card})
 
 
-def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | None, share: float = 1.0) -> Path:
-    """Train, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file."""
+def main(
+    data: list[Path], out: Path, steps: int = 1500, seed: int = 1, share: float = 1.0, start: Path | None = None
+) -> Path:
+    """Train on folders of shards, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file.
+
+    `share` of the paper's channels; `start` is the checkpoint of another run to start from.
+    """
     shards = [Shard(path) for folder in data for path in sorted(folder.glob("*.npz"))]
     if not shards:
         raise FileNotFoundError(
@@ -290,17 +284,3 @@ def train(data: list[Path], out: Path, *, steps: int, seed: int, start: Path | N
     path = out / "zou2021.onnx"
     export_zou2021(network, path, {"steps": steps, "seed": seed, "share": share, "samples": sum(map(len, shards))})
     return path
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Read the command line and train."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders of shards")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the ONNX file")
-    parser.add_argument("--steps", type=int, default=1500)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--share", type=float, default=1.0, help="share of the paper's channels")
-    parser.add_argument("--start", type=Path, help="checkpoint of another run to start from")
-    o = parser.parse_args(arguments)
-    path = train(o.data, o.out, steps=o.steps, seed=o.seed, start=o.start, share=o.share)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import MissingExtra, ScenarioError
+from log2sim.evaluation.bench import settings
 from log2sim.evaluation.bench.runs import STAGE as ENDS_STAGE
 from log2sim.evaluation.bench.runs import (
     BenchContext,
@@ -31,18 +32,7 @@ from log2sim.evaluation.bench.runs import (
     run_all,
     whole_points,
 )
-from log2sim.evaluation.bench.scores import EVERYTHING, Score, ScoreScope
-from log2sim.evaluation.bench.settings import (
-    COVERAGE,
-    Point,
-    Recommendation,
-    default_settings,
-    error_interval,
-    front_mask,
-    make_grid,
-    recommend,
-    short,
-)
+from log2sim.evaluation.bench.scores import EVERYTHING, ScoreScope
 from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.evaluation.road import cell
 from log2sim.files.documents import check
@@ -79,9 +69,9 @@ class Panel:
     error: str
     label: str
     unit: str
-    points: tuple[Point, ...]
+    points: tuple[settings.Point, ...]
     on_front: tuple[bool, ...]  # which points are Pareto-optimal
-    recommendation: Recommendation
+    recommendation: settings.Recommendation
 
 
 # Key, description and unit of a stage's error with truth, and without.
@@ -94,10 +84,7 @@ ERRORS = {
         ("error_m", "error of measured centers, cut at 2 m", "m"),
         ("smoothing_residual_m", "measurements' distance from the smoothed path", "m"),
     ),
-    "homography": (
-        ("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),
-        ("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),
-    ),
+    "homography": (("error_m", "feet of obstacles placed by it alone, distance from LiDAR's, cut at 2 m", "m"),) * 2,
     "smooth": (
         ("state_error_m", "error of the position one second ahead", "m"),
         ("jitter_m", "jitter of waypoints", "m"),
@@ -113,46 +100,42 @@ ERRORS = {
 }
 
 
-def make_panels(context: BenchContext, report: Progress, default: Sequence[Point] = ()) -> list[Panel]:
+def make_panels(context: BenchContext, report: Progress, default: Sequence[settings.Point] = ()) -> list[Panel]:
     """Run all settings and make one panel for each stage and one for whole runs, with those of the default beside them."""
     runs, observations = run_all(context, report)
-    whole_ms = context.ms_per_tick(runs[0].seconds)
-    known = context.truth is not None
-    by_stage = {stage: [runs[0], *(r for r in runs[1:] if r.setting.stage == stage)] for stage in OWN_STAGES}
     homographies = homography_points(context, observations, report)
     whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
+
+    def own(stage: str) -> list[settings.Point]:
+        return [_point(context, stage, r) for r in runs if r is runs[0] or r.setting.stage == stage]
+
     points = {
-        "detect": [_point(context, "detect", r) for r in by_stage["detect"]],
-        "measure": [_point(context, "measure", r) for r in by_stage["measure"]],
-        "homography": homographies,
-        "smooth": [_point(context, "smooth", r) for r in by_stage["smooth"]],
+        "detect": own("detect"), "measure": own("measure"), "homography": homographies, "smooth": own("smooth"),
         "whole run": _add_placed_shares(whole, homographies),
-    }
-    return [_panel(stage, own, whole_ms, known) for stage, own in points.items() if own]
+    }  # fmt: skip
+    whole_ms, known = context.ms_per_tick(runs[0].seconds), context.truth is not None
+    return [_panel(stage, found, whole_ms, known) for stage, found in points.items() if found]
 
 
-def _panel(stage: str, points: Sequence[Point], whole_ms: float, known: bool) -> Panel:
+def _panel(stage: str, points: Sequence[settings.Point], whole_ms: float, known: bool) -> Panel:
     error, label, unit = ERRORS[stage][0 if known else 1]
-    recommendation = recommend(points, unit, whole_ms)
+    recommendation = settings.recommend(points, unit, whole_ms)
     if not known and stage != "homography":
-        recommendation = Recommendation(None, recommendation.present, WITHOUT_TRUTH)
-    return Panel(stage, error, label, unit, tuple(points), tuple(bool(f) for f in front_mask(points)), recommendation)
+        recommendation = settings.Recommendation(None, recommendation.present, WITHOUT_TRUTH)
+    return Panel(
+        stage, error, label, unit, tuple(points), tuple(bool(f) for f in settings.front_mask(points)), recommendation
+    )
 
 
-def _point(context: BenchContext, stage: str, run: BenchRun) -> Point:
+def _point(context: BenchContext, stage: str, run: BenchRun) -> settings.Point:
     """Make the point of a run in a stage; the present run belongs to every stage."""
     name = run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
     ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
-    if stage == "measure" and context.truth is not None:
-        return _scored_point(name, run.setting.present, ms, run.measurement_score, "error_m")
-    return _scored_point(name, run.setting.present, ms, run.score, _error(context, stage))
+    score = run.measurement_score if stage == "measure" and context.truth is not None else run.score
+    return score.point(name, run.setting.present, ms, ERRORS[stage][context.truth is None][0])
 
 
-def _scored_point(name: str, present: bool, ms: float, score: Score, error: str) -> Point:
-    return Point(name, present, ms, score.figures.get(error), score.figures, score.by_object.get(error, {}))
-
-
-def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) -> list[Point]:
+def _add_placed_shares(whole: Sequence[settings.Point], homographies: Sequence[settings.Point]) -> list[settings.Point]:
     """Add to whole runs the share of the obstacles that their homographies place."""
     if not homographies:
         return list(whole)
@@ -161,18 +144,14 @@ def _add_placed_shares(whole: Sequence[Point], homographies: Sequence[Point]) ->
     return [replace(p, figures={**p.figures, "placed_share": shares.get(p.setting, present)}) for p in whole]
 
 
-def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> Point:
+def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> settings.Point:
     """Make the point of a run; where it is `compared` with the others, that of the present settings is marked."""
     present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
     name = present if run.setting.present else run.setting.key
     stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
+    error = ERRORS["whole run"][context.truth is None][0]
     marked, ms = run.setting.present and compared, context.ms_per_tick(run.seconds)
-    point = _scored_point(name, marked, ms, run.score, _error(context, "whole run"))
-    return replace(point, figures={**point.figures, "stages_ms_per_tick": stages})
-
-
-def _error(context: BenchContext, stage: str) -> str:
-    return ERRORS[stage][0 if context.truth is not None else 1][0]
+    return run.score.point(name, marked, ms, error, stages_ms_per_tick=stages)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,21 +224,20 @@ def bench(
     config = config or Config()
     ends = ends_settings(log, config)
     if log.cameras:
-        grid = make_grid(log, config, detectors)
+        grid = settings.make_grid(log, config, detectors)
         context = make_context(log, grid, truth, report, scope)
-        default = default_settings(log, config)
+        default = settings.default_settings(log, config)
         panels = make_panels(context, report, whole_points(log, default, truth, scope, report))
-        notes = []
-        if context.truth is None:
-            notes.append(
-                "no truth: jitter, gaps, residuals of the homography and consistency with LiDAR are all that is measured"
-            )
-        if len(context.grid.detect) == 1:
-            notes.append(
-                f"detector '{context.grid.detect[0].config.detect.name}' has no setting of tiles or input size to compare"
-            )
-        if all(p.stage != "homography" for p in panels):
-            notes.append("too few obstacles with LiDAR points within 60 m to judge homographies by")
+        detector = grid.present.config.detect.name
+        notes = [
+            note
+            for note, holds in {
+                "no truth: jitter, gaps, residuals of the homography and consistency with LiDAR are all that is measured": truth is None,
+                f"detector '{detector}' has no setting of tiles or input size to compare": len(grid.detect) == 1,
+                "too few obstacles with LiDAR points within 60 m to judge homographies by": all(p.stage != "homography" for p in panels),
+            }.items()
+            if holds
+        ]  # fmt: skip
     else:
         context = make_context_of_ends(log, ends, truth, scope)
         panels, notes = [], ["the log has no camera: only vehicle, road, and both are compared"]
@@ -281,7 +259,7 @@ CANDIDATES = np.array([
 ])  # fmt: skip
 
 
-def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array) -> None:
+def place_point_labels(ax: Axes, points: Sequence[settings.Point], xy: Array, line: Array) -> None:
     """Label points (K, 2) with their settings, clear of each other and of a line with corners `line` (n, 2)."""
     pt, to_data = float(ax.figure.dpi) / 72, ax.transData.inverted()
     at, corners = ax.transData.transform(xy) / pt, ax.transData.transform(line) / pt
@@ -293,7 +271,13 @@ def place_point_labels(ax: Axes, points: Sequence[Point], xy: Array, line: Array
         *(3 * [*np.hstack([at - POINT_PT, at + POINT_PT])]), *np.hstack([ends.min(axis=0) - 1, ends.max(axis=0) + 1]),
     ]  # fmt: skip
     for k in sorted(range(len(points)), key=lambda k: (not points[k].present, -at[k, 1])):
-        name = printable_label(_label(points[k], present), 42)
+        # Without its stage where the name identifies it; with the share found or placed where the present setting has more.
+        stage, _, name = points[k].setting.partition(": ")
+        name = points[k].setting if name in ("", "on", "off") or stage == "smooth" else name
+        if not points[k].covers_as_many_as(present):
+            key, share = min(points[k].coverage.items(), key=lambda item: item[1])
+            name = f"{name} ({share:.0%} {settings.COVERAGE[key]})"
+        name = printable_label(name, 42)
         size = np.array([len(name) * LETTER_PT, LINE_PT])
         middle = at[k] + np.column_stack([CANDIDATES[:, 0] + CANDIDATES[:, 1] * size[0] / 2, CANDIDATES[:, 2]])
         boxes = np.hstack([middle - size / 2, middle + size / 2])
@@ -316,21 +300,6 @@ def _shared(a: Array, b: Array) -> Array:
     return np.asarray(np.clip(high - low, 0, None).prod(axis=2))
 
 
-def short_name(setting: str) -> str:
-    """Drop the stage from a setting whose name identifies its stage."""
-    stage, _, name = setting.partition(": ")
-    return setting if name in ("", "on", "off") or stage == "smooth" else name
-
-
-def _label(point: Point, present: Point) -> str:
-    """Name a point, with the share of objects that it finds or places where the present setting does so with more."""
-    name = short_name(point.setting)
-    if point.covers_as_many_as(present):
-        return name
-    key, share = min(point.coverage.items(), key=lambda item: item[1])
-    return f"{name} ({share:.0%} {COVERAGE[key]})"
-
-
 COLUMNS = 3
 CELL_IN = (4.3, 3.6)
 MARGIN_IN = {"left": 0.62, "right": 0.2, "top": 0.62, "bottom": 0.56}
@@ -339,12 +308,7 @@ FRONT, CHOSEN = PALETTE[0], PALETTE[4]
 
 
 def write_picture(result: Benchmark, path: Path) -> None:
-    """Write all panels into a PNG, atomically."""
-    save_png(draw(result), path, 150)
-
-
-def draw(result: Benchmark) -> Figure:
-    """Draw all panels; the last cell explains the marks and gives the recommendations."""
+    """Draw all panels into a PNG, atomically; the last cell explains the marks and gives the recommendations."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
     width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
     figure = new_figure(width, height)
@@ -352,7 +316,7 @@ def draw(result: Benchmark) -> Figure:
     for k, panel in enumerate(result.panels):
         _draw_panel(figure.add_axes(_cell(k, rows, width, height)), panel)
     _draw_recommendations(figure.add_axes(_cell(len(result.panels), rows, width, height)), result)
-    return figure
+    save_png(figure, path, 150)
 
 
 def _cell(k: int, rows: int, width: float, height: float) -> tuple[float, float, float, float]:
@@ -405,26 +369,21 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     x = np.array([p.ms_per_tick for p in points])
     y = np.array([p.error for p in points], dtype=np.float64)
     present = next((p for p in points if p.present), None)
-    spread = None if present is None else error_interval(present.by_object)
+    spread = None if present is None else settings.error_interval(present.by_object)
     if present is not None and spread is not None:
         ax.vlines(present.ms_per_tick, *spread, color=CROWD_COLOR, lw=1.0, alpha=0.6, zorder=1.8)
     _limits(ax, x, np.append(y, spread or ()))
     front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
     ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
     for point, on_front in shown:
-        _mark(ax, point, on_front=on_front, chosen=point.setting == panel.recommendation.supported)
+        at = np.array([[point.ms_per_tick], [point.error]], dtype=np.float64)
+        if point.setting == panel.recommendation.supported:
+            ax.plot(*at, "o", ms=13, mfc="none", mec=CHOSEN, mew=1.6, zorder=3)
+        face, edge = (FRONT, PAPER) if on_front else (PAPER, CROWD_COLOR)
+        shape, size = ("D", 6.5) if point.present else ("o", 5.5)
+        ax.plot(*at, shape, ms=size, mfc=face, mec=edge, mew=1.1, zorder=4)
     corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
     place_point_labels(ax, points, np.column_stack([x, y]), np.array(corners).reshape(-1, 2))
-
-
-def _mark(ax: Axes, point: Point, *, on_front: bool, chosen: bool) -> None:
-    x, y = np.array([point.ms_per_tick]), np.array([point.error], dtype=np.float64)
-    if chosen:
-        ax.plot(x, y, "o", ms=13, mfc="none", mec=CHOSEN, mew=1.6, zorder=3)
-    face, edge = (FRONT, PAPER) if on_front else (PAPER, CROWD_COLOR)
-    ax.plot(
-        x, y, "D" if point.present else "o", ms=6.5 if point.present else 5.5, mfc=face, mec=edge, mew=1.1, zorder=4
-    )
 
 
 def _limits(ax: Axes, x: Array, y: Array) -> None:
@@ -477,16 +436,10 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
 VERSION = 1
 # Figures of the table next to the error, in panels that have them.
 TABLE_COLUMNS = (
-    ("recall", "recall", 3),
-    ("precision", "precis.", 3),
-    ("position_rmse_m", "pos rmse m", 2),
-    ("placed_share", "placed", 3),
-    ("median_m", "median m", 2),
-    ("near_error_m", "<25 m", 2),
-    ("far_error_m", ">25 m", 2),
-    ("center_error_m", "center m", 2),
+    ("recall", "recall", 3), ("precision", "precis.", 3), ("position_rmse_m", "pos rmse m", 2), ("placed_share", "placed", 3),
+    ("median_m", "median m", 2), ("near_error_m", "<25 m", 2), ("far_error_m", ">25 m", 2), ("center_error_m", "center m", 2),
     ("jitter_m", "jitter m", 4),
-)
+)  # fmt: skip
 
 
 def bench_document(result: Benchmark) -> dict[str, Any]:
@@ -497,17 +450,12 @@ def bench_document(result: Benchmark) -> dict[str, Any]:
         "bench_version": VERSION,
         "log": {"name": context.log.name, "format": context.log.format, "digest": context.log.digest},
         "log2sim_version": __version__,
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "ticks": len(t),
-        "duration_s": int(t[-1] - t[0]) / NS_PER_S,
-        "cameras": list(context.plan.cameras),
-        "truth": context.truth.name if context.truth is not None else None,
-        "max_range_m": context.scope.max_range_m,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(), "ticks": len(t),
+        "duration_s": int(t[-1] - t[0]) / NS_PER_S, "cameras": list(context.plan.cameras),
+        "truth": context.truth.name if context.truth is not None else None, "max_range_m": context.scope.max_range_m,
         "categories": None if context.scope.categories is None else list(context.scope.categories),
-        "config": config.to_dict(),
-        "notes": list(result.notes),
-        "panels": [_panel_document(p) for p in result.panels],
-    }
+        "config": config.to_dict(), "notes": list(result.notes), "panels": [_panel_document(p) for p in result.panels],
+    }  # fmt: skip
     check(out, "bench-1", ScenarioError)
     return out
 
@@ -538,8 +486,8 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
     }
 
 
-def _interval(point: Point) -> list[float] | None:
-    found = error_interval(point.by_object) if point.error is not None else None
+def _interval(point: settings.Point) -> list[float] | None:
+    found = settings.error_interval(point.by_object) if point.error is not None else None
     return None if found is None else [round(value, 6) for value in found]
 
 
@@ -564,9 +512,9 @@ def _rows(panel: Panel) -> list[str]:
         [
             f"  {'*' if p.present else ' '}{'+' if on_front else ' '}",
             p.setting,
-            short(p.ms_per_tick),
-            short(p.error),
-            "-" if (interval := _interval(p)) is None else " - ".join(map(short, interval)),
+            settings.short(p.ms_per_tick),
+            settings.short(p.error),
+            "-" if (interval := _interval(p)) is None else " - ".join(map(settings.short, interval)),
             *(cell(p.figures.get(key), digits) for key, _, digits in columns),
         ]
         for p, on_front in sorted(zip(panel.points, panel.on_front, strict=True), key=lambda pair: pair[0].ms_per_tick)

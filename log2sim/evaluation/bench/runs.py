@@ -16,7 +16,6 @@ from log2sim.datatypes import ENDS, ROAD, Detections, Frame, Log, Scenario, end_
 from log2sim.errors import LogError, NothingToReconstruct, RecordError
 from log2sim.evaluation.bench.scores import (
     EVERYTHING,
-    Holdout,
     Score,
     ScoreScope,
     check_scope,
@@ -53,18 +52,6 @@ class RecordedDetections:
     found: dict[tuple[str, int], Detections] = field(default_factory=dict)  # by camera and stamp
     spent_s: list[float] = field(default_factory=list)  # time of the recorded detector for each frame
 
-    @property
-    def seconds(self) -> float:
-        """Return the time of the recorded detector for all frames, s."""
-        return sum(self.spent_s)
-
-    def record(self, detector: Detector, frame: Frame) -> None:
-        """Run a detector on one frame and record the result and its time."""
-        begin = time.perf_counter()
-        boxes = detector.detect(frame)
-        self.spent_s.append(time.perf_counter() - begin)
-        self.found[frame.camera.name, frame.t_ns] = boxes
-
     def detect(self, frame: Frame) -> Detections:
         """Return the recorded boxes of one frame."""
         return self.found.get((frame.camera.name, frame.t_ns), Detections.empty())
@@ -98,7 +85,9 @@ def detect_once(
                 continue
             frame = Frame(log.cameras[camera], int(log.streams[camera].t_ns[index[tick]]), partial(_decoded, image))
             for key, detector in detectors.items():
-                recorded[key].record(detector, frame)
+                begin = time.perf_counter()
+                recorded[key].found[camera, frame.t_ns] = detector.detect(frame)
+                recorded[key].spent_s.append(time.perf_counter() - begin)
         progress(tick + 1, len(schedule))
     records.require_some()
     return recorded, decoding_s
@@ -106,9 +95,7 @@ def detect_once(
 
 def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
     if image is None:
-        raise RecordError(
-            "a detector needs the image, but no image was decoded because all detectors were expected to need none"
-        )
+        raise RecordError("a detector needs the image, but all were expected to need none, and none was decoded")
     return image
 
 
@@ -189,7 +176,7 @@ def timed_first_pass(
         config=measure.config, clock=clock, progress=lambda done, total: report(f"measure ({what})", done, total),
     )  # fmt: skip
     shared = {k: v for k, v in context.shared_s.items() if k != "decode" or detect.config.detect.name != LABELS}
-    return observations, {**clock.seconds, **shared, "detect": context.found[detect.name].seconds}
+    return observations, {**clock.seconds, **shared, "detect": sum(context.found[detect.name].spent_s)}
 
 
 def run_settings(
@@ -211,15 +198,8 @@ def run_settings(
             scores[setting.key] = _concluded(context, setting, observations, clock)
             spent[setting.key].append(clock.seconds)
             report("track and smooth", repeat * len(settings) + k + 1, REPEATS * len(settings))
-    return [
-        BenchRun(
-            s,
-            scores[s.key],
-            measurement_score,
-            {**before_s, **{k: min(t[k] for t in spent[s.key]) for k in spent[s.key][0]}},
-        )
-        for s in settings
-    ]
+    least_s = {key: {k: min(t[k] for t in times) for k in times[0]} for key, times in spent.items()}
+    return [BenchRun(s, scores[s.key], measurement_score, {**before_s, **least_s[s.key]}) for s in settings]
 
 
 def _concluded(context: BenchContext, setting: Setting, observations: Observations, clock: StageClock) -> Score:
@@ -235,7 +215,10 @@ def _concluded(context: BenchContext, setting: Setting, observations: Observatio
 def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Observations]:
     """Run every setting, the present one first; returns the runs and the observations of the present one."""
     grid = context.grid
-    warm_up(context)
+    # The first tick alone, so that imports and caches count for no stage.
+    short = replace(context, schedule=take_ticks(context.schedule, slice(1)))
+    first, _ = timed_first_pass(short, grid.present, grid.measure[0], lambda *_: None)
+    _concluded(short, grid.present, first, StageClock())
     passes = [
         [timed_first_pass(context, grid.present, s, report) for s in grid.measure] for _ in range(MEASURE_REPEATS)
     ]
@@ -250,13 +233,6 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
         runs += run_settings(context, [setting], timed_first_pass(context, setting, grid.measure[0], report), report)
     least = min(r.stages_s["cloud"] for r in runs)
     return [replace(r, stages_s={**r.stages_s, "cloud": least}) for r in runs], observations[0]
-
-
-def warm_up(context: BenchContext) -> None:
-    """Run the first tick once, so that imports and caches count for no stage."""
-    grid, short = context.grid, replace(context, schedule=take_ticks(context.schedule, slice(1)))
-    observations, _ = timed_first_pass(short, grid.present, grid.measure[0], lambda what, done, total: None)
-    _concluded(short, grid.present, observations, StageClock())
 
 
 def score_of_measurements(context: BenchContext, observations: Observations) -> Score:
@@ -279,28 +255,23 @@ def homography_points(context: BenchContext, observations: Observations, report:
     if not len(holdout):
         return []
     settings = (*context.grid.homography, *context.grid.hypotheses)
+    plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
     spent: dict[str, list[float]] = {s.name: [] for s in settings}
     fits: dict[str, dict[str, CameraHomography]] = {}
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
-            begin = time.perf_counter()
-            fits[setting.name] = fit_setting(context, setting, holdout)
+            begin, rng = time.perf_counter(), np.random.default_rng(setting.config.seed)
+            fits[setting.name] = fit_homographies(
+                context.log, holdout.observations, plan, setting.config.topdown, rng=rng
+            )
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
     for setting in settings:
         score = score_homographies(context.log, holdout, fits[setting.name])
-        figures = score.figures | fit_figures(fits[setting.name])
         ms = context.ms_per_tick(min(spent[setting.name]))
-        out.append(Point(setting.name, setting.present, ms, figures["error_m"], figures, score.by_object["error_m"]))
+        out.append(score.point(setting.name, setting.present, ms, "error_m", **fit_figures(fits[setting.name])))
     return out
-
-
-def fit_setting(context: BenchContext, setting: Setting, holdout: Holdout) -> dict[str, CameraHomography]:
-    """Fit the homographies of all cameras by one method."""
-    plan = replace(context.plan, homography=HomographyScope.ALL_CAMERAS)
-    rng = np.random.default_rng(setting.config.seed)
-    return fit_homographies(context.log, holdout.observations, plan, setting.config.topdown, rng=rng)
 
 
 def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
@@ -380,9 +351,6 @@ def whole_points(
         ms = (time.perf_counter() - begin) * 1e3 / len(run.schedule)
         stages = {stage: s * 1e3 / len(run.schedule) for stage, s in run.clock.seconds.items()}
         error = "error_m" if truth is not None else "jitter_m"
-        figures = {**score.figures, "stages_ms_per_tick": stages}
-        out.append(
-            Point(setting.name, setting.present, ms, score.figures.get(error), figures, score.by_object.get(error, {}))
-        )
+        out.append(score.point(setting.name, setting.present, ms, error, stages_ms_per_tick=stages))
         report(setting.stage, k + 1, len(settings))
     return out

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Agent, Log, Measurements, Scenario
 from log2sim.errors import ConfigError
-from log2sim.evaluation.bench.settings import ErrorSums, error_of
+from log2sim.evaluation.bench.settings import ErrorSums, Point, error_of
 from log2sim.evaluation.metrics.comparison import StateTable, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
@@ -25,15 +25,8 @@ CUTOFF_M = 2.0  # cutoff distance of GOSPA, m; the metrics match objects up to i
 HORIZON_S = 1.0
 # Figures of `evaluate` that a score keeps.
 EVALUATE_KEYS = (
-    "recall",
-    "precision",
-    "position_rmse_m",
-    "position_median_m",
-    "speed_rmse_mps",
-    "yaw_median_deg",
-    "hota",
-    "id_switches",
-)
+    "recall", "precision", "position_rmse_m", "position_median_m", "speed_rmse_mps", "yaw_median_deg", "hota", "id_switches",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,6 +55,10 @@ class Score:
     figures: dict[str, Any]
     # Contributions of single objects, for figures that are errors.
     by_object: Mapping[str, ErrorSums] = field(default_factory=dict)
+
+    def point(self, name: str, present: bool, ms: float, error: str, **more: Any) -> Point:
+        """Return a setting's point, whose error is the figure of this name, with more figures."""
+        return Point(name, present, ms, self.figures.get(error), self.figures | more, self.by_object.get(error, {}))
 
 
 def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, scope: ScoreScope = EVERYTHING) -> Score:
@@ -97,25 +94,19 @@ def _error_parts(found: Mapping[str, Any]) -> ErrorSums:
     """
     parts = {}
     for row in found["agents"]:
-        lost = (row["ticks"] - row["matched"]) / 2
-        parts[row["id"]] = (
-            row["matched"] * (row["position_rmse_m"] or 0.0) ** 2 + CUTOFF_M**2 * lost,
-            row["matched"] + lost,
-        )
+        n, lost = row["matched"], (row["ticks"] - row["matched"]) / 2
+        parts[row["id"]] = n * (row["position_rmse_m"] or 0.0) ** 2 + CUTOFF_M**2 * lost, n + lost
     for row in found["false_agents"]:
         parts[f"false {row['id']}"] = CUTOFF_M**2 * row["false_ticks"] / 2, row["false_ticks"] / 2
     return parts
 
 
 def _state_parts(found: Mapping[str, Any]) -> ErrorSums:
-    rows = [row for row in found["agents"] if row["matched"]]
-    return {
-        row["id"]: (
-            row["matched"] * (row["position_rmse_m"] ** 2 + (HORIZON_S * row["speed_rmse_mps"]) ** 2),
-            row["matched"],
-        )
-        for row in rows
-    }
+    parts = {}
+    for row in found["agents"]:
+        if n := row["matched"]:
+            parts[row["id"]] = n * (row["position_rmse_m"] ** 2 + (HORIZON_S * row["speed_rmse_mps"]) ** 2), n
+    return parts
 
 
 def jitter(scenario: Scenario, tick_s: float) -> float | None:
@@ -145,15 +136,11 @@ def _third_differences(agent: Agent, tick_s: float) -> float | None:
 
 
 def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
-    lives = [
-        (a.quality["detections"], a.waypoints.t_s[-1] - a.waypoints.t_s[0])
-        for a in scenario.others
-        if "detections" in a.quality
-    ]
-    if not lives or tick_s <= 0:
+    known = [a for a in scenario.others if "detections" in a.quality]
+    if not known or tick_s <= 0:
         return None
-    detected, ticks = (sum(v) for v in zip(*((n, life / tick_s + 1) for n, life in lives)))
-    return float(np.clip(1 - detected / ticks, 0.0, 1.0))
+    ticks = sum((a.waypoints.t_s[-1] - a.waypoints.t_s[0]) / tick_s + 1 for a in known)
+    return float(np.clip(1 - sum(a.quality["detections"] for a in known) / ticks, 0.0, 1.0))
 
 
 MIN_IOU = 0.5
@@ -200,7 +187,10 @@ def true_positions(
                 boxes = _boxes_in_image(log, camera, table, int(k), inverse(map_T_cam[k]))
                 pairs = _matched_agents(m.take(rows), table, boxes)
                 later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
-                out[ticks[k]].xy[rows] = _true_xy(table, int(k), pairs, later_s)
+                # A few hundredths of a second at most.
+                yaw, way_m = table.yaw_rad[pairs, k], (table.speed_mps[pairs, k] * later_s)[:, None]
+                xy = table.xy_m[pairs, k] + way_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
+                out[ticks[k]].xy[rows] = np.where((pairs >= 0)[:, None], xy, np.nan)
                 out[ticks[k]].object_id[rows] = pairs
     return out
 
@@ -217,10 +207,8 @@ def _boxes_in_image(log: Log, camera: str, table: StateTable, k: int, cam_T_map:
     """Project the truth agents that count at a frame: boxes (A, 4), px, NaN for the others."""
     boxes = np.full((len(table.agents), 4), np.nan)
     rows = np.flatnonzero(table.present[:, k] & table.visible[:, k])
-    projected = project_boxes(
-        table.center_m[rows, k], table.size_m[rows], table.yaw_rad[rows, k], log.cameras[camera], cam_T_map
-    )
-    boxes[rows] = projected.box_px
+    solids = table.center_m[rows, k], table.size_m[rows], table.yaw_rad[rows, k]
+    boxes[rows] = project_boxes(*solids, log.cameras[camera], cam_T_map).box_px
     return boxes
 
 
@@ -232,13 +220,6 @@ def _matched_agents(m: Measurements, table: StateTable, boxes: Array) -> NDArray
     best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
     rows = np.arange(len(m))
     return np.where((overlap[rows, best] >= MIN_IOU) & (back[best] == rows), best, -1)
-
-
-def _true_xy(table: StateTable, k: int, pairs: NDArray[np.intp], later_s: Array) -> Array:
-    """Extrapolate true centers (M, 2) by `later_s` (M,), a few hundredths of a second, from frame `k`."""
-    speed, yaw = table.speed_mps[pairs, k], table.yaw_rad[pairs, k]
-    xy = table.xy_m[pairs, k] + (speed * later_s)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    return np.where((pairs >= 0)[:, None], xy, np.nan)
 
 
 def score_measurements(observations: Observations, known: Sequence[KnownPositions]) -> Score:
@@ -283,9 +264,10 @@ def split_holdout(
     log: Log, schedule: Schedule, observations: Observations, known: Sequence[KnownPositions], rng: np.random.Generator
 ) -> Holdout:
     """Hold out a random part of the measured obstacles within 60 m, with their known positions at the images' stamps."""
-    obstacles: dict[str, list[Measurements]] = {camera: [] for camera in observations.feet}
-    places: dict[str, list[KnownPositions]] = {camera: [] for camera in observations.feet}
-    holdout: dict[str, list[Correspondences]] = {camera: [] for camera in observations.feet}
+    cameras = observations.feet
+    obstacles: dict[str, list[Measurements]] = {camera: [] for camera in cameras}
+    places: dict[str, list[KnownPositions]] = {camera: [] for camera in cameras}
+    holdout: dict[str, list[Correspondences]] = {camera: [] for camera in cameras}
     for tick, m in enumerate(observations.measurements):
         xy, object_id = known[tick].xy, known[tick].object_id
         near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= MAX_RANGE_M
@@ -299,23 +281,17 @@ def split_holdout(
             holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
             obstacles[camera].append(_drop_positions(m.take(rows), stamp))
             places[camera].append(KnownPositions(xy[rows], object_id[rows]))
-    feet = {
-        camera: [_drop_feet(log.cameras[camera], parts, obstacles[camera])]
-        for camera, parts in observations.feet.items()
-    }
+    feet = {name: [_drop_feet(log.cameras[name], parts, obstacles[name])] for name, parts in cameras.items()}
     return Holdout(replace(observations, feet=feet), obstacles, places, holdout)
 
 
 def _drop_positions(m: Measurements, stamp: int) -> Measurements:
     """Reset the rows to detections in the image of that stamp, without LiDAR evidence."""
+    n = len(m)
     return replace(
-        m,
-        t_ns=np.full(len(m), stamp),
-        source=np.full(len(m), "", dtype="<U16"),
-        center_m=np.full((len(m), 3), np.nan),
-        covariance=np.full((len(m), 2, 2), np.nan),
-        cluster=tuple(np.zeros((0, 3)) for _ in range(len(m))),
-    )
+        m, t_ns=np.full(n, stamp), source=np.full(n, "", dtype="<U16"), center_m=np.full((n, 3), np.nan),
+        covariance=np.full((n, 2, 2), np.nan), cluster=tuple(np.zeros((0, 3)) for _ in range(n)),
+    )  # fmt: skip
 
 
 def _drop_feet(camera: Camera, parts: Sequence[Correspondences], obstacles: Sequence[Measurements]) -> Correspondences:
@@ -341,7 +317,9 @@ def score_homographies(log: Log, holdout: Holdout, grounds: Mapping[str, CameraH
     feet, centers, range_m, object_id = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
     for camera in (c for c in holdout.obstacles if c in grounds):
         for tick, (m, known) in enumerate(zip(holdout.obstacles[camera], holdout.known[camera], strict=True)):
-            feet.append(_foot_distances(holdout.feet[camera][tick], at_tick(grounds[camera], tick)))
+            foot, ground = holdout.feet[camera][tick], at_tick(grounds[camera], tick)
+            if len(foot.uv):  # NaN above the horizon
+                feet.append(np.hypot(*(apply_homography(ground.fit.ground_H_image, foot.uv)[0] - foot.xy_ego).T))
             centers.append(np.hypot(*(_places(log, tick, m, grounds[camera]) - known.xy).T))
             range_m.append(np.hypot(*(known.xy - m.sensor_m[:, :2]).T))
             object_id.append(known.object_id)
@@ -353,13 +331,6 @@ def score_homographies(log: Log, holdout: Holdout, grounds: Mapping[str, CameraH
     }
     figures |= {f"center_{key}": center[key] for key in ("error_m", "median_m")}
     return Score(score.figures | figures, score.by_object)
-
-
-def _foot_distances(feet: Correspondences, ground: CameraHomography) -> Array:
-    """Compute the distances (N,), m, of foot points placed by a homography from their positions; NaN above its horizon."""
-    if not len(feet.uv):
-        return np.zeros(0)
-    return np.asarray(np.hypot(*(apply_homography(ground.fit.ground_H_image, feet.uv)[0] - feet.xy_ego).T))
 
 
 def _places(log: Log, tick: int, m: Measurements, ground: CameraHomography) -> Array:

@@ -191,9 +191,8 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
             continue
-        for key, value in _inputs(log, own, detector):
-            other = own.changed(detect={key: value})
-            out.append(Setting("detect", f"{label}{_input_name(key, value)}", other, not out))
+        for title, key, value in _inputs(log, own, detector):
+            out.append(Setting("detect", f"{label}{title}", own.changed(detect={key: value}), not out))
     return out
 
 
@@ -204,8 +203,8 @@ def _short(name: str, names: Sequence[str]) -> str:
     return stem if stems.count(stem) == 1 else name
 
 
-def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, int]]:
-    """List settings of a detector with different inputs, the present one first."""
+def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, str, int]]:
+    """List names and settings of a detector with different inputs, the present one first."""
     inputs, seen = [], set()
     side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
     cameras = [log.cameras[name] for name in config.cameras or log.cameras]
@@ -213,16 +212,11 @@ def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str,
         plan = tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
         if plan not in seen:
             seen.add(plan)
-            inputs.append(("tiles", tiles))
+            inputs.append(({0: "auto tiles", 1: "no tiles"}.get(tiles, f"{tiles} tiles"), "tiles", tiles))
     if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
-        inputs += [("input_px", side) for side in SIDES_PX if side != detector.layout.preprocessing.default_px]
+        usual = detector.layout.preprocessing.default_px
+        inputs += [(f"input {side} px", "input_px", side) for side in SIDES_PX if side != usual]
     return inputs
-
-
-def _input_name(key: str, value: int) -> str:
-    if key == "input_px":
-        return f"input {value} px"
-    return "auto tiles" if value == 0 else "no tiles" if value == 1 else f"{value} tiles"
 
 
 NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"
@@ -280,11 +274,9 @@ class Recommendation:
 def pareto_front(cost: ArrayLike, error: ArrayLike) -> NDArray[np.bool_]:
     """Mark (K,) the Pareto-optimal points (K,), (K,); a point with a NaN is never one."""
     c, e = np.asarray(cost, dtype=np.float64), np.asarray(error, dtype=np.float64)
-    known = np.isfinite(c) & np.isfinite(e)
     no_worse = (c[None] <= c[:, None]) & (e[None] <= e[:, None])
     better = (c[None] < c[:, None]) | (e[None] < e[:, None])
-    beaten = (no_worse & better).any(axis=1)
-    return known & ~beaten
+    return np.isfinite(c) & np.isfinite(e) & ~(no_worse & better).any(axis=1)
 
 
 def front_mask(points: Sequence[Point]) -> NDArray[np.bool_]:

@@ -12,12 +12,6 @@ from log2sim.evaluation.detection.evaluation import (
 from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 
 __all__ = [
-    "Criterion",
-    "Matches",
-    "PrecisionRecall",
-    "SceneBoxes",
-    "average_precision",
-    "match_detections",
-    "operating_point",
+    "Criterion", "Matches", "PrecisionRecall", "SceneBoxes", "average_precision", "match_detections", "operating_point",
     "precision_recall",
-]
+]  # fmt: skip

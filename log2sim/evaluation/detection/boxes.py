@@ -72,15 +72,9 @@ class SceneBoxes:
         def column(values: ArrayLike, kind: Any = None) -> NDArray[Any]:
             return np.array(np.broadcast_to(np.asarray(values, dtype=kind), len(rows)))
 
-        return cls(
-            column(scene, np.int64),
-            rows,
-            column(category, np.str_),
-            column(score, np.float64),
-            None if points is None else column(points, np.int64),
-            column(away, np.float64),
-            column(ignored, np.bool_),
-        )
+        counts = None if points is None else column(points, np.int64)
+        named = column(scene, np.int64), rows, column(category, np.str_), column(score, np.float64)
+        return cls(*named, counts, column(away, np.float64), column(ignored, np.bool_))
 
     @classmethod
     def join(cls, scenes: Sequence[SceneBoxes]) -> SceneBoxes:
@@ -129,12 +123,10 @@ class DetectedBoxes:
 
     def save(self, path: Path | str) -> None:
         """Write the file under a temporary name and rename it."""
-        frames = [
-            {"t_ns": int(t), "boxes": _to_rows(found)} for t, found in zip(self.t_ns.tolist(), self.boxes, strict=True)
-        ]
-        document = {"format": FORMAT, "version": VERSION, "log": self.log, "detector": self.detector}
-        document |= ({"poses": dict(self.poses)} if self.poses else {}) | {"frames": frames}
-        write_json(path, document)
+        document: dict[str, Any] = {"format": FORMAT, "version": VERSION, "log": self.log, "detector": self.detector}
+        document |= {"poses": dict(self.poses)} if self.poses else {}
+        stamped = zip(self.t_ns.tolist(), self.boxes, strict=True)
+        write_json(path, {**document, "frames": [{"t_ns": t, "boxes": _to_rows(found)} for t, found in stamped]})
 
     @classmethod
     def load(cls, path: Path | str) -> DetectedBoxes:
@@ -210,10 +202,8 @@ def _column_is_valid(values: list[Any], expected: dict[str, Any]) -> bool:
     if not values:
         return True
     types = {int} if expected["type"] == "integer" else {int, float}
-    low = min(values) > expected.get("exclusiveMinimum", -math.inf) and min(values) >= expected.get(
-        "minimum", -math.inf
-    )
-    return set(map(type, values)) <= types and low and max(values) <= expected["maximum"]
+    low, above = expected.get("minimum", -math.inf), expected.get("exclusiveMinimum", -math.inf)
+    return set(map(type, values)) <= types and above < min(values) >= low and max(values) <= expected["maximum"]
 
 
 def _to_rows(boxes: Boxes3D) -> list[dict[str, Any]]:
@@ -234,17 +224,7 @@ def _to_rows(boxes: Boxes3D) -> list[dict[str, Any]]:
 def _from_rows(rows: list[dict[str, Any]], t_ns: int) -> Boxes3D:
     if not rows:
         return Boxes3D.empty()
-
-    def column(key: str, kind: Any = np.float64) -> NDArray[Any]:
-        return np.array([row[key] for row in rows], dtype=kind)
-
-    return Boxes3D(
-        np.full(len(rows), t_ns, dtype=np.int64),
-        column("center_m"),
-        column("size_m"),
-        column("yaw_rad"),
-        column("heading_score"),
-        column("category", np.str_),
-        column("score"),
-        column("points", np.int64),
-    )
+    kinds = {"category": np.str_, "points": np.int64}
+    keys = ("center_m", "size_m", "yaw_rad", "heading_score", "category", "score", "points")
+    columns: list[Any] = [np.array([row[key] for row in rows], dtype=kinds.get(key, np.float64)) for key in keys]
+    return Boxes3D(np.full(len(rows), t_ns, dtype=np.int64), *columns)

@@ -25,26 +25,14 @@ from log2sim.plan import FusionLevel
 from log2sim.report import Run, unreadable_records
 
 
-@dataclass(frozen=True, eq=False)
-class SearchedCloud:
-    """A cloud and what a detector found in it."""
-
-    tick: int
-    cloud: Cloud | None  # none where the sweep cannot be read or has no pose
-    boxes: Boxes3D  # empty without a detector
-
-
-def clouds(run: Run, records: RecordSource, detector: LidarDetector | None) -> Iterator[SearchedCloud]:
-    """Yield the clouds of all ticks of a run without cameras."""
+def clouds(
+    run: Run, records: RecordSource, detector: LidarDetector | None
+) -> Iterator[tuple[int, Cloud | None, Boxes3D]]:
+    """Yield all ticks of a run without cameras: the cloud, None where the sweep cannot be read or has no pose, and what a detector finds."""
     maker = CloudMaker(run.log, run.schedule, run.plan, run.config, detector)
     for tick in range(len(run.schedule)):
         (cloud,) = maker.clouds(tick, records)
-        yield SearchedCloud(tick, cloud, Boxes3D.empty() if detector is None else maker.boxes(tick))
-
-
-def stamps_of(run: Run) -> NDArray[np.int64]:
-    """Return the stamps (T,) of the sweeps that make the ticks of a run without cameras."""
-    return run.schedule.t_ns - middle_ns(run)
+        yield tick, cloud, Boxes3D.empty() if detector is None else maker.boxes(tick)
 
 
 def middle_ns(run: Run) -> int:
@@ -100,13 +88,13 @@ def detect_log(
         config = config.changed(cooperation={"fusion": "boxes"})
     run = start(log, config)
     records, detector = RecordSource(run.log), run.detectors.sweeps
-    of_sweeps, stamps, boxes = stamps_of(run), [], []
-    for searched in clouds(run, records, detector):
-        if searched.cloud is not None:
-            stamps.append(of_sweeps[searched.tick])
-            boxes.append(drop_ego(run.log, searched.boxes))
+    of_sweeps, stamps, boxes = run.schedule.t_ns - middle_ns(run), [], []
+    for tick, cloud, of_tick in clouds(run, records, detector):
+        if cloud is not None:
+            stamps.append(of_sweeps[tick])
+            boxes.append(drop_ego(run.log, of_tick))
         if progress is not None:
-            progress(searched.tick + 1, len(run.schedule))
+            progress(tick + 1, len(run.schedule))
     records.require_some()
     if not stamps:
         raise LogError(f"{log.name}: none of the {len(run.schedule)} sweeps has a known pose and points")

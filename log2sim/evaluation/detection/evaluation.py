@@ -139,14 +139,10 @@ def detection_rates(right: int, false: int, missed: int) -> dict[str, Any]:
     recall = right / (right + missed) if right + missed else None
     both = precision is not None and recall is not None
     return {
-        "true_positives": right,
-        "false_positives": false,
-        "false_negatives": missed,
-        "precision": precision,
-        "recall": recall,
+        "true_positives": right, "false_positives": false, "false_negatives": missed, "precision": precision, "recall": recall,
         "f1": 2 * right / (2 * right + false + missed) if both else None,
         "precision_times_recall": precision * recall if precision is not None and recall is not None else None,
-    }
+    }  # fmt: skip
 
 
 def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
@@ -159,21 +155,10 @@ def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
     """
     judged = matches.right | matches.false
     table = reliability(found.score[judged], matches.right[judged])
-    bins = [
-        {
-            "low": b["low"],
-            "high": b["high"],
-            "boxes": b["count"],
-            "mean_score": b["mean_confidence"],
-            "precision": b["right"],
-        }
-        for b in table["bins"]
-    ]
-    return {
-        "boxes": table["count"],
-        "expected_calibration_error": table["expected_calibration_error"],
-        "bins": bins,
-    }
+    names = {"count": "boxes", "mean_confidence": "mean_score", "right": "precision"}
+    bins = [{names.get(key, key): value for key, value in b.items()} for b in table["bins"]]
+    error = table["expected_calibration_error"]
+    return {"boxes": table["count"], "expected_calibration_error": error, "bins": bins}
 
 
 Mask = NDArray[np.bool_]
@@ -263,16 +248,11 @@ def difficulties(boxes: BothBoxes) -> Iterator[Objects]:
 
 def by_range(boxes: BothBoxes) -> Iterator[Objects]:
     """Select the objects of each range; a found box that matches nothing is false in its own range."""
-    everything = all_objects(boxes)
+    enough = all_objects(boxes).truth
     for low, high in RANGES_M:
         beyond, elsewhere = (((b.range_m < low) | (b.range_m >= high)) for b in (boxes.truth, boxes.found))
-        yield Objects(
-            f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g}+ m",
-            boxes,
-            boxes.found,
-            everything.truth.ignoring(beyond),
-            boxes.far | elsewhere,
-        )
+        name = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g}+ m"
+        yield Objects(name, boxes, boxes.found, enough.ignoring(beyond), boxes.far | elsewhere)
 
 
 def by_points(boxes: BothBoxes) -> Iterator[Objects]:
@@ -285,31 +265,24 @@ def by_points(boxes: BothBoxes) -> Iterator[Objects]:
         outside = (boxes.truth.points < low) | (boxes.truth.points > high)
         own = boxes.found.points
         elsewhere = np.zeros(len(boxes.found), dtype=bool) if own is None else (own < low) | (own > high)
-        yield Objects(
-            f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points",
-            boxes,
-            boxes.found,
-            boxes.truth.ignoring(outside),
-            boxes.far | elsewhere,
-        )
+        name = f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points"
+        yield Objects(name, boxes, boxes.found, boxes.truth.ignoring(outside), boxes.far | elsewhere)
 
 
 def figures(objects: Objects, pairs: BoxPairs, criterion: Criterion, min_score: float) -> dict[str, Any]:
-    """Compute average precision, the figures at a score, and how many headings are off by more than 90 degrees."""
+    """Compute average precision, the figures at a score, and the share of right boxes there that are off by more than 90 degrees."""
     matches = objects.matches(pairs, criterion)
     curve = precision_recall(objects.found, matches)
-    in_images = objects.boxes.found_views is not None
+    rows = np.flatnonzero(matches.right & (objects.found.score >= min_score))
+    turned = wrap_angle(objects.found.box[rows, 6] - objects.truth.box[matches.truth[rows], 6])
     return {
-        "objects": objects.name,
-        "match": match_entry(criterion),
-        "truths": matches.truths,
-        "ap_r40": curve.average(40),
+        "objects": objects.name, "match": match_entry(criterion), "truths": matches.truths, "ap_r40": curve.average(40),
         "ap_r11": curve.average(11),
         "ap_nuscenes": curve.nuscenes_average() if criterion.measure == "center_m" else None,
-        **(published(objects, pairs, criterion) if in_images else {}),
+        **(published(objects, pairs, criterion) if objects.boxes.found_views is not None else {}),
         **operating_point(objects.found, matches, min_score),
-        "heading_over_90_deg": heading_figures(objects, matches, min_score),
-    }
+        "heading_over_90_deg": float((np.abs(turned) > np.pi / 2).mean()) if len(rows) else None,
+    }  # fmt: skip
 
 
 def published(objects: Objects, pairs: BoxPairs, criterion: Criterion) -> dict[str, Any]:
@@ -320,14 +293,6 @@ def published(objects: Objects, pairs: BoxPairs, criterion: Criterion) -> dict[s
     found = assign_boxes(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
     curve = precision_recall(objects.found, found)
     return {"ap_r40_published": curve.sampled_average(40), "ap_r11_published": curve.sampled_average(11)}
-
-
-def heading_figures(objects: Objects, matches: Matches, min_score: float) -> float | None:
-    """Compute the share of right boxes at a score whose heading is off by more than 90 degrees; None without any."""
-    rows = np.flatnonzero(matches.right & (objects.found.score >= min_score))
-    off = wrap_angle(objects.found.box[rows, 6] - objects.truth.box[matches.truth[rows], 6])
-    wrong = np.abs(off) > np.pi / 2
-    return float(wrong.mean()) if len(rows) else None
 
 
 def match_entry(criterion: Criterion) -> dict[str, Any]:
@@ -359,12 +324,9 @@ AVERAGES = {
     "center": (("ap_nuscenes", "AP nuSc"), ("ap_r40", "AP R40")),
 }
 AT_SCORE = (
-    ("precision", "precis."),
-    ("recall", "recall"),
-    ("f1", "F1"),
-    ("precision_times_recall", "P x R"),
+    ("precision", "precis."), ("recall", "recall"), ("f1", "F1"), ("precision_times_recall", "P x R"),
     ("heading_over_90_deg", "> 90 deg"),
-)
+)  # fmt: skip
 
 
 def format_verdict(result: Mapping[str, Any]) -> str:
@@ -411,8 +373,12 @@ def format_table(result: Mapping[str, Any]) -> str:
                 values = [cell(row.get(key), 3) for key, _ in columns]
                 cells.append(["all classes", row["objects"], "each its first", str(row["truths"]), *values])
     lines = columns_text(cells, heads=3)
-    scores = [_score_note(name, result["classes"][name]["calibration"]) for name in shown]
-    return "\n".join([*lines, *filter(None, scores)])
+    for name in shown:
+        scores = result["classes"][name]["calibration"]
+        if (error := scores["expected_calibration_error"]) is not None:
+            where = f"{scores['boxes']} boxes, {Criterion(**scores['match'])}"
+            lines.append(f"{name}: expected calibration error of the scores {error:.3f} ({where})")
+    return "\n".join(lines)
 
 
 def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -425,14 +391,6 @@ def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
         # Only false boxes, which one match tells as well as all.
         return [row for row in everything[:1] if row["false_positives"]]
     return [*everything, *(row for row in parts if row["truths"])]
-
-
-def _score_note(name: str, scores: Mapping[str, Any]) -> str:
-    error = scores["expected_calibration_error"]
-    if error is None:
-        return ""
-    where = f"{scores['boxes']} boxes, {Criterion(**scores['match'])}"
-    return f"{name}: expected calibration error of the scores {error:.3f} ({where})"
 
 
 def _scope(result: Mapping[str, Any]) -> str:
@@ -465,10 +423,8 @@ class DetectionOptions:
     def __post_init__(self) -> None:
         """Check the values."""
         if self.protocol not in PROTOCOLS:
-            raise ConfigError(
-                f"--protocol: unknown protocol '{self.protocol}'{nearest(self.protocol, list(PROTOCOLS))}; "
-                f"known: {', '.join(PROTOCOLS)}"
-            )
+            hint = f"{nearest(self.protocol, list(PROTOCOLS))}; known: {', '.join(PROTOCOLS)}"
+            raise ConfigError(f"--protocol: unknown protocol '{self.protocol}'{hint}")
         if not 0 <= self.min_score <= 1:
             raise ConfigError(f"--score: {self.min_score:g}; expected a score from 0 to 1")
         if self.max_range_m is not None and not self.max_range_m > 0:
@@ -485,10 +441,8 @@ class DetectionOptions:
         known = list(dict.fromkeys(n for c in classes for n in (c.name, *c.categories)))
         for name in self.classes:
             if name not in known:
-                raise ConfigError(
-                    f"--categories: protocol '{self.protocol}' has no '{name}'{nearest(name, known)}; "
-                    f"it has {', '.join(known)}"
-                )
+                hint = f"{nearest(name, known)}; it has {', '.join(known)}"
+                raise ConfigError(f"--categories: protocol '{self.protocol}' has no '{name}'{hint}")
         return tuple(c for c in classes if c.name in self.classes or set(c.categories) <= set(self.classes))
 
 
@@ -518,21 +472,14 @@ def evaluate_boxes(
     boxes = _project(log, detected.t_ns, found, truth, camera, options)
     figures = {c.name: class_figures(_class_boxes(boxes, c), c, options.min_score) for c in classes}
     return {
-        "detection_metrics_version": VERSION,
-        "log": detected.log,
-        "truth": log.name,
-        "detector": detected.detector,
-        "protocol": protocol.name,
-        "min_score": options.min_score,
-        "max_range_m": options.max_range_m,
-        "sweeps": int(truth.labeled.sum()),
-        "sweeps_without_labels": int((~truth.labeled).sum()),
+        "detection_metrics_version": VERSION, "log": detected.log, "truth": log.name, "detector": detected.detector,
+        "protocol": protocol.name, "min_score": options.min_score, "max_range_m": options.max_range_m,
+        "sweeps": int(truth.labeled.sum()), "sweeps_without_labels": int((~truth.labeled).sum()),
         "reference_camera": camera,
         "occlusion_known": None if camera is None else log.labels is not None and log.labels.occlusion is not None,
-        "min_points": None if truth.boxes.points is None else MIN_POINTS,
-        "overall": overall(figures),
+        "min_points": None if truth.boxes.points is None else MIN_POINTS, "overall": overall(figures),
         "classes": figures,
-    }
+    }  # fmt: skip
 
 
 def _reference_camera(log: Log, protocol: Protocol) -> str | None:
@@ -559,9 +506,8 @@ def _project(
     options: DetectionOptions,
 ) -> BothBoxes:
     """Project boxes where it is needed; with a reference camera, only what it shows is kept."""
-    far = found.range_m > (np.inf if options.max_range_m is None else options.max_range_m)
-    beyond = truth.boxes.range_m > (np.inf if options.max_range_m is None else options.max_range_m)
-    true = truth.boxes.ignoring(beyond)
+    limit_m = np.inf if options.max_range_m is None else options.max_range_m
+    far, true = found.range_m > limit_m, truth.boxes.ignoring(truth.boxes.range_m > limit_m)
     if camera is None:
         return BothBoxes(found, true, far, _unlabeled(log, t_ns, found), truth.kind, truth.occlusion)
     views = image_views(log, camera, t_ns, found)

@@ -26,7 +26,7 @@ class Criterion:
     # {"iou_3d", "iou_bev", "center_m"}, ioU of the boxes, IoU of their outlines on the ground, or horizontal distance
     # of their centers.
     measure: Measure
-    limit: float  # ioU above which, or distance in m below which, boxes match
+    limit: float  # IoU above which, or distance in m below which, boxes match
 
     def __post_init__(self) -> None:
         """Check the limit."""

@@ -12,7 +12,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.detect_log import clouds, middle_ns, stamps_of, take_ticks
+from log2sim.evaluation.detection.detect_log import clouds, middle_ns, take_ticks
 from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares, rows_by_track
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of, project_boxes, wrap_angle
 from log2sim.perception.detect3d.box_points import points_of_boxes
@@ -43,14 +43,9 @@ class LabelTracks:
         rows = rows_by_track(labels)
         order = np.concatenate(rows)
         steps = np.concatenate([np.diff(labels.t_ns[r]) for r in rows])
-        return cls(
-            labels.t_ns[order],
-            np.column_stack([labels.center_m[order], labels.yaw_rad[order]]),
-            labels.size_m,
-            order,
-            np.cumsum([0, *map(len, rows)]),
-            float(np.median(steps)) / NS_PER_S if len(steps) else 0.0,
-        )
+        pose = np.column_stack([labels.center_m[order], labels.yaw_rad[order]])
+        period_s = float(np.median(steps)) / NS_PER_S if len(steps) else 0.0
+        return cls(labels.t_ns[order], pose, labels.size_m, order, np.cumsum([0, *map(len, rows)]), period_s)
 
     def present(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """List the moments (P,), indices into `t_ns` (F,), and tracks (P,) labeled at them, in the order of moments."""
@@ -193,44 +188,36 @@ def truth_of_sweeps(
     labels = log.labels
     if labels is None or len(labels.t_ns) == 0:
         raise LogError(f"{log.name}: the log has no labeled 3D boxes; name a log with labels as truth")
-    run = _run_of(log)
+    run = None
+    if any(len(log.streams[name].t_ns) for name in log.lidars if name in log.streams):
+        run = start(log, Config().changed(detect={"name": "lidar:labels"}, measure={"max_range_m": 200.0}))
     middle = t_ns + (0 if run is None else middle_ns(run))
     tracks = LabelTracks.of(labels)
     labeled = labeled_sweeps(labels, middle, tracks.period_s)
     if not labeled.any():
-        raise LogError(_nothing_in_common(log, labels, t_ns))
+        (first, last), (first_label, last_label) = (
+            (v.min() / NS_PER_S, v.max() / NS_PER_S) for v in (t_ns, labels.t_ns)
+        )
+        raise LogError(
+            f"{log.name}: none of the {len(t_ns)} sweeps is labeled; they last from {first:.3f} to {last:.3f} s, the labels "
+            f"from {first_label:.3f} to {last_label:.3f} s; are both of one log?"
+        )
     sweep, track = tracks.present(middle)
     sweep, track = sweep[labeled[sweep]], track[labeled[sweep]]
-    seen = Sightings(sweep, track, middle[sweep], None)
+    seen_ns, points = middle[sweep], None
     if run is not None:
-        seen = _seen_by_lidar(run, t_ns, tracks, seen, progress)
-    pose, rows = tracks.at(track, seen.t_ns)
+        seen_ns, points = _seen_by_lidar(run, t_ns, tracks, sweep, track, progress)
+    pose, rows = tracks.at(track, seen_ns)
     origin = np.array([cloud_origin(log, int(t))[0] for t in t_ns])
     box = np.column_stack([pose[:, :3], labels.size_m[rows], pose[:, 3]])
     away = np.hypot(*(box[:, :2] - origin[sweep, :2]).T)
     return SweepTruth(
         labeled,
-        SceneBoxes.of(box, labels.category[rows], scene=sweep, points=seen.points, range_m=away),
+        SceneBoxes.of(box, labels.category[rows], scene=sweep, points=points, range_m=away),
         origin,
         np.full(len(rows), "") if labels.kind is None else labels.kind[rows],
         np.zeros(len(rows), dtype=np.int64) if labels.occlusion is None else labels.occlusion[rows],
     )
-
-
-def _nothing_in_common(log: Log, labels: Labels, t_ns: NDArray[np.int64]) -> str:
-    times = ((v.min() / NS_PER_S, v.max() / NS_PER_S) for v in (t_ns, labels.t_ns))
-    (first, last), (first_label, last_label) = times
-    return (
-        f"{log.name}: none of the {len(t_ns)} sweeps is labeled; they last from {first:.3f} to {last:.3f} s, the labels "
-        f"from {first_label:.3f} to {last_label:.3f} s; are both of one log?"
-    )
-
-
-def _run_of(log: Log) -> Run | None:
-    """Plan to read all sweeps of a log; None without a LiDAR."""
-    if not any(len(log.streams[name].t_ns) for name in log.lidars if name in log.streams):
-        return None
-    return start(log, Config().changed(detect={"name": "lidar:labels"}, measure={"max_range_m": 200.0}))
 
 
 def labeled_sweeps(labels: Labels, middle_ns: NDArray[np.int64], period_s: float) -> NDArray[np.bool_]:
@@ -246,45 +233,34 @@ def labeled_sweeps(labels: Labels, middle_ns: NDArray[np.int64], period_s: float
     return np.asarray(near | ((middle_ns >= stamps[0]) & (middle_ns <= stamps[-1])))
 
 
-@dataclass(frozen=True, eq=False)
-class Sightings:
-    """Labeled objects in sweeps; L rows."""
-
-    # sweep, track: (L,) indices of both.
-    sweep: NDArray[np.int64]
-    track: NDArray[np.int64]
-    t_ns: NDArray[np.int64]  # (L,) when the LiDARs saw the object, the middle of the sweep where they did not
-    points: NDArray[np.int64] | None  # (L,) points above the ground in its box
-
-
 def _seen_by_lidar(
     run: Run,
     t_ns: NDArray[np.int64],
     tracks: LabelTracks,
-    asked: Sightings,
+    sweep: NDArray[np.int64],
+    track: NDArray[np.int64],
     progress: Callable[[int, int], None] | None,
-) -> Sightings:
-    """Read the sweeps with stamps (F,) to find when objects were seen and with how many points."""
-    stamps = stamps_of(run)
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Read the sweeps with stamps (F,) that labels (L,) of tracks are in.
+
+    Returns (L,) each: when the LiDARs saw the object, ns, the middle of the sweep where they did not, and the points above the ground in its box.
+    """
+    stamps = run.schedule.t_ns - middle_ns(run)
     tick = nearest_index(stamps, t_ns)
     known = np.flatnonzero(np.abs(stamps[tick] - t_ns) <= MAX_STAMP_ERROR_NS)
-    seen_ns, points = asked.t_ns.copy(), np.zeros(len(asked.sweep), dtype=np.int64)
-    needed = known[np.isin(known, asked.sweep)]
+    seen_ns, points = (t_ns + middle_ns(run))[sweep], np.zeros(len(sweep), dtype=np.int64)
+    needed = known[np.isin(known, sweep)]
     run = replace(run, schedule=take_ticks(run.schedule, tick[needed]))
-    for done, searched in enumerate(clouds(run, RecordSource(run.log), None), start=1):
-        mine = np.flatnonzero(asked.sweep == needed[searched.tick])
-        if searched.cloud is not None:
+    for k, cloud, _ in clouds(run, RecordSource(run.log), None):
+        mine = np.flatnonzero(sweep == needed[k])
+        if cloud is not None:
             for _ in range(2):  # where objects are in the middle of the sweep, then where they were seen
-                pose, rows = tracks.at(asked.track[mine], seen_ns[mine])
-                cloud = searched.cloud
-                size_m = tracks.size_m[rows]
+                pose, rows = tracks.at(track[mine], seen_ns[mine])
                 above = ~cloud.ground
-                inside = points_of_boxes(cloud.xyz[above], pose[:, :3] - cloud.origin, size_m, pose[:, 3])
-                points[mine], mean_ns = (
-                    inside.count,
-                    cloud.stamp_ns + np.round(inside.mean(cloud.t_s[above]) * NS_PER_S).astype(np.int64),
-                )
+                inside = points_of_boxes(cloud.xyz[above], pose[:, :3] - cloud.origin, tracks.size_m[rows], pose[:, 3])
+                points[mine] = inside.count
+                mean_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s[above]) * NS_PER_S).astype(np.int64)
                 seen_ns[mine] = np.where(points[mine] > 0, mean_ns, seen_ns[mine])
         if progress is not None:
-            progress(done, len(needed))
-    return Sightings(asked.sweep, asked.track, seen_ns, points)
+            progress(k + 1, len(needed))
+    return seen_ns, points

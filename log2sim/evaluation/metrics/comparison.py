@@ -64,11 +64,9 @@ def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mas
         i, j = np.nonzero(distance <= gates_m[a, None])
         found.append((np.full(len(i), t), a[i], b[j]))
         distances.append(distance[i, j])
-    if not found:
-        none = np.zeros(0, dtype=np.int64)
-        return AgentPairs(none, none, none, np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
-    tick, truth, other = (np.concatenate(column) for column in zip(*found))
-    distance_m = np.concatenate(distances)
+    none = np.zeros(0, dtype=np.int64)
+    tick, truth, other = (np.concatenate(column) for column in zip((none, none, none), *found))
+    distance_m = np.concatenate([np.zeros(0), *distances])
     same = same_group[truth, other]
     similarity = np.where(same, 1 - distance_m / gates_m[truth], 0.0)
     return AgentPairs(tick, truth, other, distance_m, similarity, same)
@@ -103,17 +101,11 @@ def assign(rows: Index, cols: Index, score: Array) -> Index:
     return np.sort(np.concatenate([usable[alone], chosen[chosen >= 0]]))
 
 
-@dataclass(frozen=True, eq=False)
-class Association:
-    """Matches of A truth agents and B reconstructed agents at T ticks."""
-
-    match: NDArray[np.int64]  # (A, T) index of the reconstructed agent, -1 for none
-    used: Mask  # (B, T) reconstructed agents matched within their group of categories
-    absorbed: Mask  # (B, T) reconstructed agents without such a match that are at a labeled object of another group
-
-
-def associate(pairs: AgentPairs, truths: int, others: int, ticks: int) -> Association:
+def associate(pairs: AgentPairs, truths: int, others: int, ticks: int) -> tuple[Index, Mask, Mask]:
     """Match agents tick by tick, keeping what was matched before while it is within the gate.
+
+    Returns, of A truth agents and B reconstructed agents at T ticks: (A, T) index of the reconstructed agent, -1 for none;
+    (B, T) those matched within their group of categories; (B, T) others that are at a labeled object of another group.
 
     Bernardin and Stiefelhagen (2008), section 2.2.1: previous matches within the gate are kept, then the remaining agents
     are matched with the most pairs and the least total distance. A truth agent keeps its previous match over gaps. When two
@@ -134,7 +126,7 @@ def associate(pairs: AgentPairs, truths: int, others: int, ticks: int) -> Associ
             else:
                 absorbed[near.other[chosen], t] = True
         last = np.where(match[:, t] >= 0, match[:, t], last)
-    return Association(match, used, absorbed)
+    return match, used, absorbed
 
 
 def _kept(near: AgentPairs, rows: Index, last: Index) -> Index:
@@ -329,14 +321,10 @@ def _frames_at(view: LabelView, t_s: Array) -> tuple[Index, Mask, Array]:
         return np.zeros(len(t_s), dtype=np.int64), np.zeros(len(t_s), dtype=bool), np.zeros((len(t_s), 4, 4))
     frame = nearest_index(view.t_s, t_s)
     near = np.abs(view.t_s[frame] - t_s) <= MAX_FRAME_LAG_S
-    at_frames = view.map_T_cam
-    track = PoseTrack(_to_ns(view.t_s), at_frames)
-    poses, known = track.at(_to_ns(np.clip(t_s, view.t_s[0], view.t_s[-1])))
+    at_frames, times_s = view.map_T_cam, (view.t_s, np.clip(t_s, view.t_s[0], view.t_s[-1]))
+    frames_ns, ticks_ns = (np.round(s * NS_PER_S).astype(np.int64) for s in times_s)
+    poses, known = PoseTrack(frames_ns, at_frames).at(ticks_ns)
     return frame, near, np.where(known[:, None, None], poses, at_frames[frame])
-
-
-def _to_ns(t_s: Array) -> Index:
-    return np.round(t_s * NS_PER_S).astype(np.int64)
 
 
 def _inside_any(uv: Array, regions: Array) -> Mask:
@@ -417,7 +405,7 @@ def compare_agents(
     """
     same_group = truth.group[:, None] == other.group[None]
     pairs = near_pairs(truth.xy_m, other.xy_m, gate_m(truth.size_m[:, 0]), same_group)
-    found = associate(pairs, len(truth.agents), len(other.agents), truth.range_m.shape[1])
+    match, used, absorbed = associate(pairs, len(truth.agents), len(other.agents), truth.range_m.shape[1])
     in_sight = counted = selection.covers(truth) & truth.visible
     # Half a tick of tolerance, since stamps jitter.
     enough = counted.sum(1) * tick_s >= MIN_COUNTED_S - tick_s / 2 if tick_s else np.zeros(len(counted), dtype=bool)
@@ -428,10 +416,9 @@ def compare_agents(
     codes = [NOT_LABELED, COUNTED, *range(1, len(REASONS) + 1)]
     why_not = np.select([*first, ~truth.visible & ~hidden, hidden, in_sight], codes, NOT_LABELED)
     selected = selection.covers(other)
-    false = selected & ~found.used & ~found.absorbed
-    switched = switches(found.match, counted)
-    none = np.zeros_like(false)
-    return Comparison(truth, other, pairs, found.match, counted, why_not, switched, selected, false, none)
+    false = selected & ~used & ~absorbed
+    switched, none = switches(match, counted), np.zeros_like(false)
+    return Comparison(truth, other, pairs, match, counted, why_not, switched, selected, false, none)
 
 
 def coverage(c: Comparison, selected: Mask) -> dict[str, Any]:

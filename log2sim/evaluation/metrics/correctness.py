@@ -32,16 +32,11 @@ def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
     of_bin = np.clip((confidence * BINS).astype(np.int64), 0, BINS - 1)
     count = np.bincount(of_bin, minlength=BINS)
     sums, rights = (np.bincount(of_bin, weights=v, minlength=BINS) for v in (confidence, right))
-    bins = [
-        {
-            "low": k / BINS,
-            "high": (k + 1) / BINS,
-            "count": int(count[k]),
-            "mean_confidence": float(sums[k] / count[k]) if count[k] else None,
-            "right": float(rights[k] / count[k]) if count[k] else None,
-        }
-        for k in range(BINS)
-    ]
+    bins = []
+    for k, n in enumerate(count.tolist()):
+        mean, share = (float(column[k] / n) if n else None for column in (sums, rights))
+        span = {"low": k / BINS, "high": (k + 1) / BINS}
+        bins.append({**span, "count": n, "mean_confidence": mean, "right": share})
     error = float(np.abs(sums - rights).sum() / len(right)) if len(right) else None
     return {"count": len(right), "expected_calibration_error": error, "bins": bins}
 
@@ -157,15 +152,19 @@ def over_ticks(which: Mask, like: Mask) -> Mask:
 
 def _detailed(j: JudgedAgents, selected: Mask, *, ranged: bool) -> dict[str, Any]:
     """Compute the figures of the selected ticks, their calibration, and the figures by range."""
+    ticks, range_m = j.verdicts.judged & selected, j.states.range_m
+    agents = ticks.any(axis=1)
+    confidence = np.broadcast_to(j.confidence[:, None], ticks.shape)
     by_range = {
-        f"{low:g}-{high:g}" if np.isfinite(high) else f"{low:g}-": _figures(
-            j, selected & (j.states.range_m >= low) & (j.states.range_m < high)
-        )
+        f"{low:g}-{high:g}".removesuffix("inf"): _figures(j, selected & (range_m >= low) & (range_m < high))
         for low, high in RANGES_M
     }
     return {
         **_figures(j, selected),
-        "calibration": _calibration(j, selected),
+        "calibration": {
+            "ticks": reliability(confidence[ticks], ~j.wrong[ticks]),
+            "agents": reliability(j.confidence[agents], ~_wrong_agents(ticks, j.wrong)[agents]),
+        },
         "by_range": by_range if ranged else None,
     }
 
@@ -173,7 +172,8 @@ def _detailed(j: JudgedAgents, selected: Mask, *, ranged: bool) -> dict[str, Any
 def _figures(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
     """Count the selected judged ticks and their agents, and the wrong and doubted ones among them."""
     v, ticks = j.verdicts, j.verdicts.judged & selected
-    wrong_agents, right_agents = _wrong_agents(ticks, j.wrong), ticks.any(axis=1) & ~_wrong_agents(ticks, j.wrong)
+    wrong_agents = _wrong_agents(ticks, j.wrong)
+    right_agents = ticks.any(axis=1) & ~wrong_agents
     doubted: Mask = np.asarray((j.doubted & ticks).any(axis=1))
     matched = ticks & (v.matched >= 0)
     return {
@@ -210,16 +210,6 @@ def _mean(values: Mask) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _calibration(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
-    """Compare confidences with the right ticks and the right agents."""
-    ticks = j.verdicts.judged & selected
-    agents = ticks.any(axis=1)
-    return {
-        "ticks": reliability(np.broadcast_to(j.confidence[:, None], ticks.shape)[ticks], ~j.wrong[ticks]),
-        "agents": reliability(j.confidence[agents], ~_wrong_agents(ticks, j.wrong)[agents]),
-    }
-
-
 def _confusion(j: JudgedAgents, true_category: NDArray[np.str_]) -> dict[str, Any]:
     """Count, by category of the agent and of what is there, judged ticks, and agents by what is there most of the time."""
     names = np.array([*CATEGORIES, "nothing"])
@@ -234,13 +224,12 @@ def _confusion(j: JudgedAgents, true_category: NDArray[np.str_]) -> dict[str, An
     ticks, agents = (np.zeros((len(CATEGORIES), len(names)), dtype=np.int64) for _ in range(2))
     np.add.at(ticks, ours, counts)
     np.add.at(agents, (ours[rows], counts[rows].argmax(axis=1)), 1)
-    return {"ticks": _matrix(ticks, names), "agents": _matrix(agents, names)}
-
-
-def _matrix(counts: NDArray[np.int64], names: NDArray[np.str_]) -> dict[str, dict[str, int]]:
     return {
-        str(names[r]): {str(names[k]): int(counts[r, k]) for k in np.flatnonzero(counts[r])}
-        for r in np.flatnonzero(counts.any(axis=1))
+        what: {
+            str(names[r]): {str(names[k]): int(matrix[r, k]) for k in np.flatnonzero(matrix[r])}
+            for r in np.flatnonzero(matrix.any(axis=1))
+        }
+        for what, matrix in (("ticks", ticks), ("agents", agents))
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,35 +13,9 @@ import numpy as np
 
 from log2sim.datatypes import CATEGORIES, GROUPS, Agent, LabelView, Log, Scenario
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.evaluation.metrics.comparison import (
-    GATE_M,
-    MIN_COUNTED_S,
-    AgentPairs,
-    Comparison,
-    Mask,
-    Selection,
-    StateTable,
-    assign,
-    compare_agents,
-    coverage,
-    drop_ignored,
-    evaluation_ticks_s,
-    matched_ticks,
-    mota,
-    reconstructed_states,
-    states_of_ego,
-    truth_states,
-)
+from log2sim.evaluation.metrics import comparison, verdicts
 from log2sim.evaluation.metrics.correctness import correctness, over_ticks
 from log2sim.evaluation.metrics.truth import load_truth
-from log2sim.evaluation.metrics.verdicts import (
-    counting_rules,
-    matching_rules,
-    median,
-    root_mean_square,
-    state_errors,
-    summarize_verdicts,
-)
 from log2sim.evaluation.road import color_figures, map_figures, signal_figures
 from log2sim.export.exporters import on_map
 from log2sim.files.plugins import nearest
@@ -62,28 +36,20 @@ if TYPE_CHECKING:
 ALPHAS: Array = np.arange(1, 20) / 20
 
 
-@dataclass(frozen=True)
-class Hota:
-    """HOTA with its detection and association parts, each the mean over `ALPHAS`."""
-
-    hota: float
-    det_a: float
-    ass_a: float
-
-
-def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | None:
-    """Score the tracking.
+def hota(
+    pairs: comparison.AgentPairs, truth_present: comparison.Mask, other_present: comparison.Mask
+) -> dict[str, float | None]:
+    """Score the tracking: "hota" with its detection and association parts "det_a" and "ass_a", each the mean over `ALPHAS`.
 
     `pairs`: candidates; those of absent agents and those with similarity 0 are left out. `truth_present`,
-    `other_present` (A, T), (B, T): which agents count at which ticks. None when there is no truth.
+    `other_present` (A, T), (B, T): which agents count at which ticks. All are None when there is no truth.
 
     Luiten et al., "HOTA", IJCV 129 (2021). Matches of a tick maximize the sum of similarity times the global alignment of
     both identities. Without any reconstructed agent all figures are 0.
     """
-    if not truth_present.any():
-        return None
-    if not other_present.any():
-        return Hota(0.0, 0.0, 0.0)
+    names = ("hota", "det_a", "ass_a")
+    if not (truth_present.any() and other_present.any()):
+        return dict.fromkeys(names, 0.0 if truth_present.any() else None)
     present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
     pairs = pairs.take(present)
     truth_count, other_count = truth_present.sum(1), other_present.sum(1)
@@ -99,7 +65,9 @@ def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | 
     alignment = np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
     score = alignment[pairs.truth, pairs.other] * pairs.similarity
     parts = pairwise(pairs.bounds(ticks))
-    matched = pairs.take(np.concatenate([a + assign(pairs.truth[a:b], pairs.other[a:b], score[a:b]) for a, b in parts]))
+    matched = pairs.take(
+        np.concatenate([a + comparison.assign(pairs.truth[a:b], pairs.other[a:b], score[a:b]) for a, b in parts])
+    )
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
     for k, alpha in enumerate(ALPHAS):
@@ -113,19 +81,19 @@ def hota(pairs: AgentPairs, truth_present: Mask, other_present: Mask) -> Hota | 
         i, j = np.divmod(code, len(other_present))
         ass_a[k] = np.sum(tpa * tpa / (truth_count[i] + other_count[j] - tpa)) / tpa.sum()
         det_a[k] = tpa.sum() / (total - tpa.sum())
-    return Hota(float(np.sqrt(det_a * ass_a).mean()), float(det_a.mean()), float(ass_a.mean()))
+    return {name: float(v.mean()) for name, v in zip(names, (np.sqrt(det_a * ass_a), det_a, ass_a))}
 
 
 DIGITS = 6
 
 
-def agent_rows(c: Comparison) -> list[dict[str, Any]]:
+def agent_rows(c: comparison.Comparison) -> list[dict[str, Any]]:
     """Make one row per counted truth agent: its matches and errors; size errors are signed."""
     truth, other, counted, switched = c.truth, c.other, c.counted, c.switched
-    errors = state_errors(truth, other, c.match, counted)
+    errors = verdicts.state_errors(truth, other, c.match, counted)
     rows, rows_of = [], np.broadcast_to(np.arange(len(truth.agents))[:, None], counted.shape)
     for i in np.flatnonzero(counted.any(1)):
-        mine, covered = errors.take(errors.truth == i), coverage(c, rows_of == i)
+        mine, covered = errors.take(errors.truth == i), comparison.coverage(c, rows_of == i)
         ids, ticks = np.unique(mine.other, return_counts=True)
         size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
         headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
@@ -139,9 +107,9 @@ def agent_rows(c: Comparison) -> list[dict[str, Any]]:
                 "matched_ids": {other.agents[j].id: int(n) for j, n in zip(ids, ticks)},
                 "id_switches": int(switched[i].sum()),
                 "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
-                "position_rmse_m": root_mean_square(mine.position_m),
-                "yaw_median_deg": median(np.degrees(headed)),
-                "speed_rmse_mps": root_mean_square(mine.speed_mps),
+                "position_rmse_m": verdicts.root_mean_square(mine.position_m),
+                "yaw_median_deg": verdicts.median(np.degrees(headed)),
+                "speed_rmse_mps": verdicts.root_mean_square(mine.speed_mps),
                 "length_error_m": float(size[0]),
                 "width_error_m": float(size[1]),
                 "height_error_m": float(size[2]),
@@ -150,7 +118,9 @@ def agent_rows(c: Comparison) -> list[dict[str, Any]]:
     return rows
 
 
-def uncounted_rows(other: StateTable, kind: str, mask: Mask, **counts: Mask) -> list[dict[str, Any]]:
+def uncounted_rows(
+    other: comparison.StateTable, kind: str, mask: comparison.Mask, **counts: comparison.Mask
+) -> list[dict[str, Any]]:
     """Make one row per reconstructed agent that is of a kind, such as false, at the ticks of a mask (B, T), if there are any.
 
     Ticks of the agent in the masks `counts` are counted by their names.
@@ -199,7 +169,7 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
     if theirs.projection and ours.projection:
         if theirs.projection == ours.projection:
             apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
-            return truth, _placement("same_map", apart_m)
+            return truth, {"method": "same_map", "ego_apart_m": apart_m}
         altitudes = theirs.altitude_m, ours.altitude_m
         rise_m = 0.0 if altitudes[0] is None or altitudes[1] is None else altitudes[0] - altitudes[1]
         target = on_map(theirs, ours.projection, ours.offset_m)
@@ -212,13 +182,12 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
         near: Move = far if truth.ego is None else _around(truth.ego, far)
     else:
         apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
-        if apart_m is None or apart_m <= GATE_M:
-            return truth, _placement("same_map", apart_m)
+        if apart_m is None or apart_m <= comparison.GATE_M:
+            return truth, {"method": "same_map", "ego_apart_m": apart_m}
         method = "ego_path"
         near = far = _fit_egos(truth, scenario)
-    moved = _moved(truth, near, far)
-    moved = replace(moved, map=scenario.map)
-    return moved, _placement(method, _ego_apart_m(moved, scenario, np.zeros(3)))
+    moved = replace(_moved(truth, near, far), map=scenario.map)
+    return moved, {"method": method, "ego_apart_m": _ego_apart_m(moved, scenario, np.zeros(3))}
 
 
 def describe_placement(placement: dict[str, Any]) -> str | None:
@@ -231,10 +200,6 @@ def describe_placement(placement: dict[str, Any]) -> str | None:
     }[placement["method"]]
     apart_m = placement["ego_apart_m"]
     return how if apart_m is None else f"{how}; then the boxes of the egos are {apart_m:.2f} m apart (median)"
-
-
-def _placement(method: str, ego_apart_m: float | None) -> dict[str, Any]:
-    return {"method": method, "ego_apart_m": ego_apart_m}
 
 
 def _common_egos(truth: Scenario, scenario: Scenario) -> tuple[Array, Array]:
@@ -371,10 +336,24 @@ def evaluate(
     quarantined = [agent.id for agent in scenario.agents if agent.quarantined]
     scenario = replace(scenario, agents=tuple(_while_observed(agent) for agent in scenario.active.agents))
     truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
-    compared, ticks_s, ego = compare_scenarios(scenario, truth, Selection(max_range_m, _selected(categories)))
+    compared, ticks_s, ego = compare_scenarios(
+        scenario, truth, comparison.Selection(max_range_m, _selected(categories))
+    )
     ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
+    sides = compared.truth, compared.other
+    by_range = {
+        f"{low:g}-{high:g}": _figures(compared, *((s.range_m >= low) & (s.range_m < high) for s in sides))
+        for low, high in RANGES_M
+    }
+    # By the category of the truth for matched ticks, of the reconstructed agent for false ones.
+    names = {*compared.truth.category[compared.asked_for.any(1)], *compared.other.category[compared.false.any(1)]}
+    by_category = {
+        name: _figures(compared, *(over_ticks(s.category == name, s.present) for s in sides))
+        for name in CATEGORIES
+        if name in names
+    }
     # The agent that each truth agent is matched with most often, by its id.
     agents = {agent.id: agent for agent in scenario.others}
     partners = {}
@@ -393,18 +372,18 @@ def evaluate(
         "placement": placement,
         "quarantined": quarantined,
         **_figures(compared, *everywhere),
-        "by_range": None if ego is None else _by_range(compared),
-        "by_category": _by_category(compared),
+        "by_range": None if ego is None else by_range,
+        "by_category": by_category,
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
         "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
         "map_features": map_figures(scenario, truth),
         "colors": color_figures(truth.others, partners),
         "signals": signal_figures(scenario, truth),
-        "matching": matching_rules(),
-        "counting": counting_rules(truth, MIN_COUNTED_S),
+        "matching": verdicts.matching_rules(),
+        "counting": verdicts.counting_rules(truth, comparison.MIN_COUNTED_S),
         "agents": agent_rows(compared),
         "false_agents": uncounted_rows(
-            ours, "false", compared.false, matched_ticks=matched_ticks(compared, compared.counted)
+            ours, "false", compared.false, matched_ticks=comparison.matched_ticks(compared, compared.counted)
         ),
         "ignored_agents": uncounted_rows(ours, "ignored", compared.ignored),
     }
@@ -412,25 +391,35 @@ def evaluate(
 
 
 def compare_scenarios(
-    scenario: Scenario, truth: Scenario, selection: Selection
-) -> tuple[Comparison, Array, StateTable | None]:
+    scenario: Scenario, truth: Scenario, selection: comparison.Selection
+) -> tuple[comparison.Comparison, Array, comparison.StateTable | None]:
     """Match the agents of a scenario with those of its truth; also the ticks (T,), s of the scenario, and the ego, one row.
 
     Raises `ConfigError` and `ScenarioError` as `evaluate`.
     """
-    ticks_s = evaluation_ticks_s(scenario, truth)
+    ticks_s = comparison.evaluation_ticks_s(scenario, truth)
     if len(ticks_s) == 0 and scenario.agents and truth.agents:
-        raise ScenarioError(_no_common_time(scenario, truth))
+        spans = [
+            f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
+            f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
+            for s in (scenario, truth)
+        ]
+        raise ScenarioError(
+            f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
+        )
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     shift_m = truth.shift_to(scenario)
-    ego = states_of_ego(scenario, truth, ticks_s, truth_ticks_s, shift_m)
+    ego = comparison.states_of_ego(scenario, truth, ticks_s, truth_ticks_s, shift_m)
     ego_xy = None if ego is None else ego.xy_m[0]
-    _check_range(selection.max_range_m, ego_xy)
-    true = truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
-    ours = reconstructed_states(scenario.others, ticks_s, ego_xy)
+    if selection.max_range_m is not None and not selection.max_range_m > 0:
+        raise ConfigError(f"range is {selection.max_range_m:g} m; it must be greater than 0")
+    if selection.max_range_m is not None and ego_xy is None:
+        raise ConfigError("a range is given, but neither the scenario nor the truth has an ego to measure it from")
+    true = comparison.truth_states(truth.others, truth_ticks_s, shift_m, ego_xy)
+    ours = comparison.reconstructed_states(scenario.others, ticks_s, ego_xy)
     stated = truth.provenance.get("visibility") != "computed"
-    compared = compare_agents(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
-    return drop_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
+    compared = comparison.compare_agents(true, ours, _tick_s(ticks_s), selection, visibility_stated=stated)
+    return comparison.drop_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
 
 
 def _tick_s(ticks_s: Array) -> float:
@@ -438,25 +427,26 @@ def _tick_s(ticks_s: Array) -> float:
     return float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
 
 
-def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[str, Any]:
+def _figures(
+    c: comparison.Comparison, truth_selected: comparison.Mask, other_selected: comparison.Mask
+) -> dict[str, Any]:
     """Compute all figures over the selected ticks of the truth (A, T) and the selected false ticks (B, T)."""
     counted, false = c.counted & truth_selected, c.false & other_selected
-    hit = matched_ticks(c, counted)
+    hit = comparison.matched_ticks(c, counted)
     truth_ticks, matched, wrong = int(counted.sum()), int(hit.sum()), int(false.sum())
     agents, found = counted.any(1), (counted & (c.match >= 0)).sum(1) >= 0.5 * counted.sum(1)
     ours, real = (hit | false).any(1), hit.sum(1) >= false.sum(1)
     id_switches = int((c.switched & counted).sum())
-    tracking = hota(c.pairs, counted, hit | false)
     return {
         "recall": matched / truth_ticks if truth_ticks else None,
         "precision": matched / (matched + wrong) if matched + wrong else None,
         "recall_agents": float(found[agents].mean()) if agents.any() else None,
         "precision_agents": float(real[ours].mean()) if ours.any() else None,
-        **summarize_verdicts(state_errors(c.truth, c.other, c.match, counted)),
+        **verdicts.summarize_verdicts(verdicts.state_errors(c.truth, c.other, c.match, counted)),
         "id_switches": id_switches,
-        "mota": mota(truth_ticks, truth_ticks - matched, wrong, id_switches),
-        **(dict.fromkeys(("hota", "det_a", "ass_a")) if tracking is None else vars(tracking)),
-        "coverage": coverage(c, truth_selected),
+        "mota": comparison.mota(truth_ticks, truth_ticks - matched, wrong, id_switches),
+        **hota(c.pairs, counted, hit | false),
+        "coverage": comparison.coverage(c, truth_selected),
         "counts": {
             "truth_agents": int(agents.sum()),
             "truth_agents_found": int((agents & found).sum()),
@@ -468,25 +458,6 @@ def _figures(c: Comparison, truth_selected: Mask, other_selected: Mask) -> dict[
             "reconstructed_agents": int(ours.sum()),
             "false_agents": int((ours & ~real).sum()),
         },
-    }
-
-
-def _by_range(c: Comparison) -> dict[str, Any]:
-    return {
-        f"{low:g}-{high:g}": _figures(c, *((s.range_m >= low) & (s.range_m < high) for s in (c.truth, c.other)))
-        for low, high in RANGES_M
-    }
-
-
-def _by_category(c: Comparison) -> dict[str, Any]:
-    """Compute the figures by category: of the truth for matched ticks, of the reconstructed agent for false ones."""
-    names = set(c.truth.category[c.asked_for.any(1)]) | set(c.other.category[c.false.any(1)])
-    return {
-        name: _figures(
-            c, over_ticks(c.truth.category == name, c.counted), over_ticks(c.other.category == name, c.false)
-        )
-        for name in CATEGORIES
-        if name in names
     }
 
 
@@ -508,36 +479,18 @@ def _selected(categories: Sequence[str] | None) -> frozenset[str]:
     return frozenset(c for name in categories for c in GROUPS.get(name, (name,)))
 
 
-def _no_common_time(scenario: Scenario, truth: Scenario) -> str:
-    spans = [
-        f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
-        f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
-        for s in (scenario, truth)
-    ]
-    return f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
-
-
-def _check_range(max_range_m: float | None, ego_xy: Array | None) -> None:
-    if max_range_m is None:
-        return
-    if not max_range_m > 0:
-        raise ConfigError(f"range is {max_range_m:g} m; it must be greater than 0")
-    if ego_xy is None:
-        raise ConfigError("a range is given, but neither the scenario nor the truth has an ego to measure it from")
-
-
 def _ego_figures(
     scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array
 ) -> dict[str, Any] | None:
     if truth.ego is None or scenario.ego is None:
         return None
-    true = truth_states((truth.ego,), truth_ticks_s, shift_m, None)
-    ours = reconstructed_states((scenario.ego,), ticks_s, None)
+    true = comparison.truth_states((truth.ego,), truth_ticks_s, shift_m, None)
+    ours = comparison.reconstructed_states((scenario.ego,), ticks_s, None)
     both = true.present & true.visible & ours.present
-    errors = state_errors(true, ours, np.where(ours.present, 0, -1), both)
+    errors = verdicts.state_errors(true, ours, np.where(ours.present, 0, -1), both)
     return {
         "ticks": int(both.sum()),
-        "position_rmse_m": root_mean_square(errors.position_m),
-        "yaw_median_deg": median(np.degrees(errors.yaw_rad)),
-        "speed_rmse_mps": root_mean_square(errors.speed_mps),
+        "position_rmse_m": verdicts.root_mean_square(errors.position_m),
+        "yaw_median_deg": verdicts.median(np.degrees(errors.yaw_rad)),
+        "speed_rmse_mps": verdicts.root_mean_square(errors.speed_mps),
     }

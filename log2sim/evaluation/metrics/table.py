@@ -12,19 +12,10 @@ from log2sim.evaluation.metrics.verdicts import MEASURES
 from log2sim.evaluation.road import cell, map_lines, road_verdict, whole_percent
 
 CORRECTNESS_COLUMNS = (
-    ("invented", "invented"),
-    ("duplicate", "duplicate"),
-    ("in_ego", "in ego"),
-    ("wrong_speed", "speed"),
-    ("wrong_motion", "motion"),
-    ("backwards", "backwards"),
-    ("wrong_size", "size"),
-    ("wrong", "wrong"),
-    ("wrong_class", "class"),
-)
-_FAULTS = dict(CORRECTNESS_COLUMNS) | {
-    k: f"wrong {n}" for k, n in CORRECTNESS_COLUMNS if k in ("wrong_speed", "wrong_motion", "wrong_size")
-}
+    ("invented", "invented"), ("duplicate", "duplicate"), ("in_ego", "in ego"), ("wrong_speed", "speed"), ("wrong_motion", "motion"),
+    ("backwards", "backwards"), ("wrong_size", "size"), ("wrong", "wrong"), ("wrong_class", "class"),
+)  # fmt: skip
+_FAULTS = {key: f"wrong {name}" if key == f"wrong_{name}" else name for key, name in CORRECTNESS_COLUMNS}
 NEES = {"sigma": "NEES", "sigma_yaw": "yaw", "sigma_speed": "speed"}
 MAX_WORST = 6  # agents that are named; the document has all
 
@@ -33,18 +24,12 @@ def wrong_parts(found: Mapping[str, Any]) -> list[str]:
     """Say which share of the agents' ticks is wrong, by what, and how much of it the scenario doubts."""
     share = found["wrong"]["share"]
     parts = [f"{found[key]['share']:.1%} {_FAULTS[key]}".replace("%", " %") for key in MEASURES if found[key]["ticks"]]
-    text = (
-        f"{share:.1%} of {found['ticks']} agent-ticks, {_noun(found['wrong']['agents'], 'agent')} of {found['agents']}"
-    )
-    doubted = found["doubted"]
-    lines = [text.replace("%", " %") + (f": {', '.join(parts)}" if parts else "")]
+    agents = _noun(found["wrong"]["agents"], "agent")
+    text = f"{share:.1%} of {found['ticks']} agent-ticks, {agents} of {found['agents']}".replace("%", " %")
+    wrong, right = (whole_percent(found["doubted"][key]) for key in ("wrong_ticks", "right_ticks"))
     if parts:
-        lines.append(
-            f"{whole_percent(doubted['wrong_ticks'])} of it doubted, {whole_percent(doubted['right_ticks'])} of the right"
-        )
-    elif doubted["right_ticks"]:
-        lines.append(f"{whole_percent(doubted['right_ticks'])} of the right doubted")
-    return lines
+        return [f"{text}: {', '.join(parts)}", f"{wrong} of it doubted, {right} of the right"]
+    return [text, f"{right} of the right doubted"] if found["doubted"]["right_ticks"] else [text]
 
 
 def correctness_lines(found: Mapping[str, Any]) -> list[str]:
@@ -52,16 +37,11 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     if not found["ticks"]:
         return []
     return [
-        "",
-        "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
-        "NEES: squared errors of position, yaw and speed over sigma, 1 is right",
-        *columns_text(_cells(found)),
-        *textwrap.wrap(_confused_line(found["confusion"]), 100, subsequent_indent="  "),
-        "",
-        *_calibration_lines(found),
-        "",
-        *worst_agents(found["judged_agents"], MAX_WORST),
-    ]
+        "", "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
+        "NEES: squared errors of position, yaw and speed over sigma, 1 is right", *columns_text(_cells(found)),
+        *textwrap.wrap(_confused_line(found["confusion"]), 100, subsequent_indent="  "), "", *_calibration_lines(found),
+        "", *worst_agents(found["judged_agents"], MAX_WORST),
+    ]  # fmt: skip
 
 
 def _cells(found: Mapping[str, Any]) -> list[list[str]]:
@@ -113,24 +93,18 @@ def worst_agents(agents: Sequence[Mapping[str, Any]], count: int, *, brief: bool
     """Name the agents with the most wrong ticks, those first that the scenario does not doubt."""
     wrong = [row for row in agents if row["wrong_ticks"]]
     worst = sorted(wrong, key=lambda row: (row["doubted"], -row["wrong_ticks"], row["id"]))[:count]
-    more = len(wrong) - len(worst)
-    return [
-        *(_brief(row) if brief else _sentence(row) for row in worst),
-        *([f"and {more} more with wrong ticks"] if more else []),
-    ]
-
-
-def _brief(row: Mapping[str, Any]) -> str:
-    faults = [_FAULTS[key] for key in MEASURES if row[f"{key}_ticks"]]
-    return (
-        f"{row['id']} {', '.join(faults)} ({row['wrong_ticks']} of {row['ticks']} ticks{', doubted' * row['doubted']})"
-    )
-
-
-def _sentence(row: Mapping[str, Any]) -> str:
-    faults = [f"{_FAULTS[key]} in {row[f'{key}_ticks']}" for key in MEASURES if row[f"{key}_ticks"]]
-    doubt = f"doubted ({', '.join(row['doubts'])})" if row["doubted"] else "not doubted"
-    return f"{row['id']}: {', '.join(faults)} of {_noun(row['ticks'], 'tick')}, confidence {row['confidence']:.2f}, {doubt}"
+    lines = []
+    for row in worst:
+        faults = {_FAULTS[key]: row[f"{key}_ticks"] for key in MEASURES if row[f"{key}_ticks"]}
+        if brief:
+            share = f"{row['wrong_ticks']} of {row['ticks']} ticks{', doubted' * row['doubted']}"
+            lines.append(f"{row['id']} {', '.join(faults)} ({share})")
+        else:
+            what = ", ".join(f"{fault} in {ticks}" for fault, ticks in faults.items())
+            doubt = f"doubted ({', '.join(row['doubts'])})" if row["doubted"] else "not doubted"
+            of = f"of {_noun(row['ticks'], 'tick')}, confidence {row['confidence']:.2f}, {doubt}"
+            lines.append(f"{row['id']}: {what} {of}")
+    return [*lines, *([f"and {len(wrong) - len(worst)} more with wrong ticks"] if len(wrong) > len(worst) else [])]
 
 
 def _noun(count: int, noun: str) -> str:
@@ -180,12 +154,10 @@ def counted_text(coverage: Mapping[str, Any], agents: str = "") -> str:
 def recall_text(result: Mapping[str, Any]) -> str:
     """Give both recalls: of what counts, and of what the LiDARs hit."""
     text = f"{percent(result['recall'])} of what counts"
-    coverage = result.get("coverage")
-    if coverage is None or coverage["hit"] is None:
+    hit = result.get("coverage") or {"hit": None}
+    if hit["hit"] is None:
         return text
-    return (
-        f"{text}; {percent(coverage['hit_recall'])} of all {coverage['hit']} with {MIN_HIT_POINTS} LiDAR points or more"
-    )
+    return f"{text}; {percent(hit['hit_recall'])} of all {hit['hit']} with {MIN_HIT_POINTS} LiDAR points or more"
 
 
 def error_text(result: Mapping[str, Any]) -> str:
@@ -219,13 +191,8 @@ def verdict_text(lines: Iterable[tuple[str, str]]) -> str:
     room = max((len(name) for name, _ in found), default=0) + 2
     out: list[str] = []
     for name, text in found:
-        out += textwrap.wrap(
-            text.replace(" %", "\N{NO-BREAK SPACE}%"),
-            MAX_COLUMNS,
-            initial_indent=name.ljust(room),
-            subsequent_indent=" " * room,
-            break_on_hyphens=False,
-        )
+        kept, first, rest = text.replace(" %", "\N{NO-BREAK SPACE}%"), name.ljust(room), " " * room
+        out += textwrap.wrap(kept, MAX_COLUMNS, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False)
     return "\n".join(out).replace("\N{NO-BREAK SPACE}", " ")
 
 
@@ -286,15 +253,11 @@ def columns_text(cells: Sequence[Sequence[str]], heads: int = 1, columns: int = 
     for block in blocks:
         lines += [""] if lines else []
         for row in cells:
-            texts = [
-                _short(row[k], widths[k]).ljust(widths[k]) if k < heads else row[k].rjust(widths[k]) for k in block
-            ]
+            texts = [row[k].rjust(widths[k]) for k in block]
+            for k in range(heads):
+                texts[k] = (row[k] if len(row[k]) <= widths[k] else f"..{row[k][2 - widths[k] :]}").ljust(widths[k])
             lines.append("  ".join(texts).rstrip())
     return lines
-
-
-def _short(text: str, width: int) -> str:
-    return text if len(text) <= width else f"..{text[2 - width :]}"
 
 
 def percent(share: float | None) -> str:

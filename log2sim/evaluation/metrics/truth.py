@@ -241,7 +241,11 @@ def truth_from_log(
     t0_ns = int(min([labels.t_ns.min(), *ego_t_ns[:1]]))
     agents = [_label_agent(labels, visible, counts, rows, t0_ns) for rows in rows_by_track(labels)]
     if len(ego_t_ns):
-        agents.insert(0, _ego_agent(log, ego_t_ns, map_T_ego, t0_ns))
+        vehicle, center, t_s = log.ego_vehicle, log.ego_centers(map_T_ego), (ego_t_ns - t0_ns) / NS_PER_S
+        yaw, static = yaw_of(map_T_ego), is_static(t_s, center[:, :2])
+        w = _waypoints(t_s, center, yaw, speed_along(t_s, center[:, :2], yaw), np.ones(len(t_s), dtype=bool))
+        offset_m = vehicle.rear_axle_offset_m
+        agents.insert(0, Agent("ego", "car", vehicle.size_m, w, static=static, rear_axle_offset_m=offset_m))
     return Scenario(
         name=log.name,
         t0_ns=t0_ns,
@@ -371,18 +375,12 @@ def _label_agent(
     static = is_static(t_s, center[:, :2])
     speed = np.zeros(len(rows)) if static else speed_along(t_s, center[:, :2], yaw)
     track_id = str(labels.track_id[rows[0]])
+    if track_id == "ego":  # it is reserved
+        track_id = "label-ego"
     length, width, height = np.median(labels.size_m[rows], axis=0).tolist()
-    return Agent(
-        # The id "ego" is reserved.
-        id=track_id if track_id != "ego" else "label-ego",
-        category=str(labels.category[rows[0]]),
-        size_m=(length, width, height),
-        waypoints=replace(
-            _waypoints(t_s, center, yaw, speed, visible[rows]),
-            lidar_points=None if points is None else points[rows].astype(np.float64),
-        ),
-        static=static,
-    )
+    w = _waypoints(t_s, center, yaw, speed, visible[rows])
+    w = replace(w, lidar_points=None if points is None else points[rows].astype(np.float64))
+    return Agent(track_id, str(labels.category[rows[0]]), (length, width, height), w, static=static)
 
 
 def _ego_poses(log: Log) -> tuple[NDArray[np.int64], Array]:
@@ -401,33 +399,10 @@ def _ego_poses(log: Log) -> tuple[NDArray[np.int64], Array]:
     return t_ns[known], poses[known]
 
 
-def _ego_agent(log: Log, t_ns: NDArray[np.int64], map_T_ego: Array, t0_ns: int) -> Agent:
-    vehicle = log.ego_vehicle
-    center = log.ego_centers(map_T_ego)
-    yaw, t_s = yaw_of(map_T_ego), (t_ns - t0_ns) / NS_PER_S
-    static = is_static(t_s, center[:, :2])
-    return Agent(
-        id="ego",
-        category="car",
-        size_m=vehicle.size_m,
-        waypoints=_waypoints(t_s, center, yaw, speed_along(t_s, center[:, :2], yaw), np.ones(len(t_s), dtype=bool)),
-        static=static,
-        rear_axle_offset_m=vehicle.rear_axle_offset_m,
-    )
-
-
 def _waypoints(t_s: Array, center: Array, yaw: Array, speed: Array, visible: NDArray[np.bool_]) -> Waypoints:
-    return Waypoints(
-        t_s=t_s,
-        x_m=center[:, 0],
-        y_m=center[:, 1],
-        z_m=center[:, 2],
-        yaw_rad=wrap_angle(yaw),
-        speed_mps=speed,
-        observed=np.ones(len(t_s), dtype=bool),
-        sigma_xy_m=np.zeros(len(t_s)),
-        visible=visible,
-    )
+    observed, sigma = np.ones(len(t_s), dtype=bool), np.zeros(len(t_s))
+    x, y, z = center.T
+    return Waypoints(t_s, x, y, z, wrap_angle(yaw), speed, observed, sigma, visible=visible)
 
 
 def is_static(t_s: Array, xy_m: Array) -> bool:
@@ -462,20 +437,9 @@ def speed_along(t_s: Array, xy_m: Array, yaw_rad: Array) -> Array:
 
 
 def _provenance(log: Log, cameras: Sequence[str], labels: Labels, unreadable: int) -> dict[str, Any]:
-    stated = labels.visible is not None
-    rule = (
-        "as the log states"
-        if stated
-        else f"at least {MIN_IMAGE_SHARE:g} of the projected box inside a used camera and "
-        f"at least {MIN_POINTS} LiDAR points in the box"
-    )
+    computed = f"at least {MIN_IMAGE_SHARE:g} of the projected box inside a used camera and at least {MIN_POINTS} LiDAR points in the box"
+    visible = ("as the log states", "stated") if labels.visible is not None else (computed, "computed")
     return {
-        "source": "labels",
-        "log": log.name,
-        "format": log.format,
-        "digest": log.digest,
-        "cameras": list(cameras),
-        "visible": rule,
-        "visibility": "stated" if stated else "computed",
-        "unreadable_sweeps": unreadable,
-    }
+        "source": "labels", "log": log.name, "format": log.format, "digest": log.digest, "cameras": list(cameras),
+        "visible": visible[0], "visibility": visible[1], "unreadable_sweeps": unreadable,
+    }  # fmt: skip

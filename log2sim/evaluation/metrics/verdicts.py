@@ -58,15 +58,9 @@ def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64],
     sign = np.where(yaw > np.pi / 2, -1.0, 1.0)
     walking = (truth.group[i] != "pedestrian") | (np.abs(truth.speed_mps[i, t]) >= MIN_WALKING_MPS)
     headed = walking & (truth.group[i] != "other")
-    return StateErrors(
-        truth=i,
-        tick=t,
-        other=j,
-        position_m=np.hypot(gap[:, 0], gap[:, 1]),
-        yaw_rad=np.where(headed, yaw, np.nan),
-        speed_mps=sign * other.speed_mps[j, t] - truth.speed_mps[i, t],
-        size_m=other.size_m[j] - truth.size_m[i],
-    )
+    speed_mps = sign * other.speed_mps[j, t] - truth.speed_mps[i, t]
+    position_m, size_m = np.hypot(gap[:, 0], gap[:, 1]), other.size_m[j] - truth.size_m[i]
+    return StateErrors(i, t, j, position_m, np.where(headed, yaw, np.nan), speed_mps, size_m)
 
 
 def summarize_verdicts(errors: StateErrors) -> dict[str, float | None]:
@@ -83,17 +77,13 @@ def summarize_verdicts(errors: StateErrors) -> dict[str, float | None]:
     np.add.at(total, index, values)
     by_agent = total / count[:, None]
     return {
-        "position_rmse_m": root_mean_square(errors.position_m),
-        "position_median_m": median(errors.position_m),
-        "ade_m": float(by_agent[:, 3].mean()) if len(by_agent) else None,
-        "yaw_median_deg": median(np.degrees(headed)),
+        "position_rmse_m": root_mean_square(errors.position_m), "position_median_m": median(errors.position_m),
+        "ade_m": float(by_agent[:, 3].mean()) if len(by_agent) else None, "yaw_median_deg": median(np.degrees(headed)),
         "yaw_flipped": float(np.mean(headed > np.pi / 2)) if len(headed) else None,
-        "speed_rmse_mps": root_mean_square(errors.speed_mps),
-        "size_median_m": median(by_agent[:, :3].mean(axis=1)),
-        "length_median_m": median(by_agent[:, 0]),
-        "width_median_m": median(by_agent[:, 1]),
+        "speed_rmse_mps": root_mean_square(errors.speed_mps), "size_median_m": median(by_agent[:, :3].mean(axis=1)),
+        "length_median_m": median(by_agent[:, 0]), "width_median_m": median(by_agent[:, 1]),
         "height_median_m": median(by_agent[:, 2]),
-    }
+    }  # fmt: skip
 
 
 def root_mean_square(values: Array) -> float | None:
@@ -158,8 +148,11 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     matched: Index = np.full(c.false.shape, -1, dtype=np.int64)
     matched[c.match[i, t], t] = i
     same = c.pairs.take(c.pairs.same_group)
-    near, near_labeled = (_marked(c.false.shape, same.other[k], same.tick[k]) for k in (slice(None), _labeled_rows(c)))
-    in_ego = _in_ego(truth, other, matched, ego)
+    labeled = same.take(truth.labeled[same.truth, same.tick])
+    near, near_labeled = (_marked(c.false.shape, pairs.other, pairs.tick) for pairs in (same, labeled))
+    in_ego = np.zeros(matched.shape, dtype=bool)
+    if ego is not None:  # where the truth that an agent matches is not
+        in_ego = _overlapping(other, ego) & ~_marks_of_matched(matched, _overlapping(truth, ego))
     lone = c.selected & (matched < 0) & (in_ego | ~c.ignored)
     invented, duplicate = lone & ~near, lone & near_labeled
     known = c.selected & _marks_of_matched(matched, truth.labeled)
@@ -167,7 +160,8 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     errors = state_errors(truth, other, c.match, truth.labeled)
     errors = errors.take(known[errors.other, errors.tick])
     measures = {"invented": invented, "duplicate": duplicate, "in_ego": in_ego & judged}
-    measures |= {k: _at(errors, wrong, judged.shape) for k, wrong in _state_verdicts(truth, other, errors).items()}
+    for name, wrong in _state_verdicts(truth, other, errors).items():
+        measures[name] = _marked(judged.shape, errors.other[wrong], errors.tick[wrong])
     # (B, T) the matched truth agent, else the nearest within the gate, those of the same kind first; -1 for none.
     p = c.pairs
     place = p.other * matched.shape[1] + p.tick
@@ -177,7 +171,8 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     nearest = np.full(matched.shape, -1, dtype=np.int64)
     nearest[p.other[rows], p.tick[rows]] = p.truth[rows]
     taken_for = np.where(judged, np.where(matched >= 0, matched, nearest), -1)
-    measures["wrong_class"] = (taken_for >= 0) & (_category(truth, taken_for) != other.category[:, None])
+    true_category = np.append(truth.category, "")[taken_for]  # "" for none
+    measures["wrong_class"] = (taken_for >= 0) & (true_category != other.category[:, None])
     gap = other.xy_m[errors.other, errors.tick] - truth.xy_m[errors.truth, errors.tick]
     return Verdicts(
         judged,
@@ -208,13 +203,6 @@ def _state_verdicts(truth: StateTable, other: StateTable, errors: StateErrors) -
     }
 
 
-def _in_ego(truth: StateTable, other: StateTable, matched: Index, ego: StateTable | None) -> Mask:
-    """Mark (B, T) the agents in the ego whose matched truth is not."""
-    if ego is None:
-        return np.zeros(matched.shape, dtype=bool)
-    return _overlapping(other, ego) & ~_marks_of_matched(matched, _overlapping(truth, ego))
-
-
 def _overlapping(side: StateTable, ego: StateTable) -> Mask:
     """Mark (A, T) the agents whose footprint overlaps that of the ego."""
     away = ego.xy_m - side.xy_m
@@ -236,26 +224,11 @@ def _marks_of_matched(matched: Index, of_truth: Mask) -> Mask:
     return mask
 
 
-def _labeled_rows(c: Comparison) -> Index:
-    """Select of the pairs of one kind those whose truth is labeled at the tick."""
-    same = c.pairs.take(c.pairs.same_group)
-    return np.flatnonzero(c.truth.labeled[same.truth, same.tick])
-
-
-def _category(truth: StateTable, index: Index) -> np.ndarray[tuple[int, ...], np.dtype[np.str_]]:
-    """Look up the category of truth agents; entries of -1 get that of the first one, and must be masked."""
-    return truth.category[np.maximum(index, 0)] if len(truth.category) else np.full(index.shape, "", dtype="<U16")
-
-
 def _spread(errors: StateErrors, values: Array, shape: tuple[int, ...]) -> Array:
     """Return (B, T, ...) the values (K, ...) of matched agent-ticks; NaN elsewhere."""
     out = np.full((*shape, *values.shape[1:]), np.nan)
     out[errors.other, errors.tick] = values
     return out
-
-
-def _at(errors: StateErrors, wrong: Mask, shape: tuple[int, ...]) -> Mask:
-    return _marked(shape, errors.other[wrong], errors.tick[wrong])
 
 
 def _marked(shape: tuple[int, ...], agent: Index, tick: Index) -> Mask:

@@ -123,9 +123,22 @@ def _scenario(root: Element, path: Path) -> Scenario:
     parameters = {
         p.get("name", ""): p.get("value", "") for p in root.iterfind("ParameterDeclarations/ParameterDeclaration")
     }
-    _resolve(root, parameters)
+    for node in root.iter():  # references to parameters in attributes stand for their values
+        for key, value in node.attrib.items():
+            if value.startswith("$"):
+                if value[1:] not in parameters:
+                    raise ScenarioError(
+                        f"<{node.tag}> {key}: {value[:40]!r} is no parameter of the file, expected one or a value"
+                    )
+                node.set(key, parameters[value[1:]])
     frame = _map(parameters.get("log2sim_map"))
-    placement = _placement(parameters, frame)
+    places = parameters.get("log2sim_origin_m", "0 0 0").split()
+    origin = [require_number(v, "parameter log2sim_origin_m") for v in places]
+    if len(origin) != 3:
+        raise ScenarioError("parameter log2sim_origin_m: expected three numbers")
+    target = parameters.get("log2sim_projection")
+    target = None if target is None else unescaped(target)
+    placement = ExportPlacement((origin[0], origin[1], origin[2]), frame.offset_m, frame.projection, target)
     vertices = vertices_by_entity(root)
     last_s = max((rows[-1, 0] for rows in vertices.values()), default=0.0)
     # By entity its initial position in the file.
@@ -145,33 +158,13 @@ def _scenario(root: Element, path: Path) -> Scenario:
     text = parameters.get("log2sim_t0_ns", "0")
     if not re.fullmatch(r"-?[0-9]{1,19}", text):
         raise ScenarioError(f"parameter log2sim_t0_ns is {text[:40]!r}, expected nanoseconds")
-    return Scenario.from_dict(
-        {
-            "scenario_version": VERSION,
-            "name": unescaped(parameters["log2sim_name"]) if "log2sim_name" in parameters else title or path.stem,
-            "t0_ns": int(text),
-            "duration_s": require_number(
-                parameters.get("log2sim_duration_s", str(last_s)), "parameter log2sim_duration_s"
-            ),
-            "map": {**vars(frame), "offset_m": list(frame.offset_m)},
-            "agents": agents,
-            "cameras": [],
-            "stages": [],
-            "provenance": {"imported_from": path.name},
-        }
-    )
-
-
-def _resolve(root: Element, parameters: Mapping[str, str]) -> None:
-    """Replace references to parameters in attributes by their values."""
-    for node in root.iter():
-        for key, value in node.attrib.items():
-            if value.startswith("$"):
-                if value[1:] not in parameters:
-                    raise ScenarioError(
-                        f"<{node.tag}> {key}: {value[:40]!r} is no parameter of the file, expected one or a value"
-                    )
-                node.set(key, parameters[value[1:]])
+    name = unescaped(parameters["log2sim_name"]) if "log2sim_name" in parameters else title or path.stem
+    long_s = require_number(parameters.get("log2sim_duration_s", str(last_s)), "parameter log2sim_duration_s")
+    return Scenario.from_dict({
+        "scenario_version": VERSION, "name": name, "t0_ns": int(text), "duration_s": long_s,
+        "map": {**vars(frame), "offset_m": list(frame.offset_m)}, "agents": agents, "cameras": [], "stages": [],
+        "provenance": {"imported_from": path.name},
+    })  # fmt: skip
 
 
 def _map(text: str | None) -> MapFrame:
@@ -185,21 +178,6 @@ def _map(text: str | None) -> MapFrame:
     if len(frame.offset_m) != 3:
         raise ScenarioError("parameter log2sim_map: offset_m, expected three numbers")
     return frame
-
-
-def _placement(parameters: Mapping[str, str], frame: MapFrame) -> ExportPlacement:
-    origin = [
-        require_number(v, "parameter log2sim_origin_m") for v in parameters.get("log2sim_origin_m", "0 0 0").split()
-    ]
-    if len(origin) != 3:
-        raise ScenarioError("parameter log2sim_origin_m: expected three numbers")
-    target = parameters.get("log2sim_projection")
-    return ExportPlacement(
-        (origin[0], origin[1], origin[2]),
-        frame.offset_m,
-        frame.projection,
-        None if target is None else unescaped(target),
-    )
 
 
 def _agent(
@@ -226,9 +204,15 @@ def _agent(
             )
         pose = _pose(start, where)
         vertices = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
+    is_ego = properties.get("type") == "ego_vehicle" or name.lower() in EGO_NAMES
+    own_id = properties.get(PREFIX + "id")
+    if body.tag == "Vehicle":
+        category = CATEGORY_OF.get(body.get("vehicleCategory", ""), "other")
+    else:
+        category = "other" if body.tag == "MiscObject" or body.get("pedestrianCategory") == "animal" else "pedestrian"
     return {
-        "id": unescaped(properties[PREFIX + "id"]) if PREFIX + "id" in properties else _agent_id(name, properties),
-        "category": properties.get(PREFIX + "category") or _category(body),
+        "id": unescaped(own_id) if own_id is not None else "ego" if is_ego else name,
+        "category": properties.get(PREFIX + "category") or category,
         "size_m": size_m,
         "color": _color(properties, where),
         "static": properties.get(PREFIX + "static", str(not np.ptp(vertices[:, 1:], axis=0).any()).lower()) == "true",
@@ -238,16 +222,6 @@ def _agent(
         "quality": {},
         "waypoints": _waypoints(vertices, properties, placement, (offset_m, height_m), where),
     }  # fmt: skip
-
-
-def _agent_id(name: str, properties: Mapping[str, str]) -> str:
-    return "ego" if properties.get("type") == "ego_vehicle" or name.lower() in EGO_NAMES else name
-
-
-def _category(body: Element) -> str:
-    if body.tag == "Vehicle":
-        return CATEGORY_OF.get(body.get("vehicleCategory", ""), "other")
-    return "pedestrian" if body.tag == "Pedestrian" and body.get("pedestrianCategory") != "animal" else "other"
 
 
 def _doubts(properties: Mapping[str, str], where: str) -> list[Any]:
@@ -310,8 +284,5 @@ def _waypoints(
 
 def _column(properties: Mapping[str, str], name: str, where: str) -> Array | None:
     text = properties.get(PREFIX + name)
-    return (
-        None
-        if text is None
-        else np.array([require_number(v, f"{where}: property {PREFIX}{name}") for v in text.split()])
-    )
+    where = f"{where}: property {PREFIX}{name}"
+    return None if text is None else np.array([require_number(v, where) for v in text.split()])

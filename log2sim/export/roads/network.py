@@ -312,14 +312,9 @@ def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
     # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
     for number, (group, opposite) in sorted(plain.items(), key=lambda item: -len(item[1][0]) - len(item[1][1])):
         before, after = (_link([*group, *opposite], place, by_id, number_of, at) for at in (0, -1))
-        road, own = road_of_lanes(
-            number,
-            group,
-            opposite,
-            headings=(headings.get((number, 0)), headings.get((number, -1))),
-            free=(before is None, after is None),
-            met=_met([*group, *opposite], place, (before, after), ends),
-        )
+        met = _met([*group, *opposite], place, (before, after), ends)
+        own_headings, free = (headings.get((number, 0)), headings.get((number, -1))), (before is None, after is None)
+        road, own = road_of_lanes(number, group, opposite, headings=own_headings, free=free, met=met)
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
     roads.sort(key=lambda road: road.number)
@@ -329,10 +324,8 @@ def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
         origin, target = lane.predecessors[0], lane.successors[0]
         one, two = place[origin], place[target]
         road = connecting_road(place[name].road, lane, ends[origin, -1], ends[target, 0])
-        before, after = (
-            Link("road", one.road, {-1: one.lane}, one.end),
-            Link("road", two.road, {-1: two.lane}, two.start),
-        )
+        before = Link("road", one.road, {-1: one.lane}, one.end)
+        after = Link("road", two.road, {-1: two.lane}, two.start)
         junction = number_of[str(lane.junction)]
         roads.append(replace(road, junction=junction, before=before, after=after))
         connections.append(RoadConnection(junction, one.road, road.number, one.lane))

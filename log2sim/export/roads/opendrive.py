@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal
+from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
 from log2sim.export.roads.network import MarkFinder, Road, RoadMark, RoadNetwork, build_network
@@ -32,24 +32,17 @@ def lanes(scenario: Scenario) -> tuple[MapLane, ...]:
     if features.lanes:
         return add_missing_lanes(features.lanes, scenario)
     found, _ = infer_lanes(features.markings, features.borders, scenario)
-    return found or (_lane_of_standing_agent(_first_agent(scenario)),)
-
-
-def _first_agent(scenario: Scenario) -> Agent:
+    if found:
+        return found
     vehicles = [a for a in scenario.agents if a.category != "pedestrian"] or list(scenario.agents)
-    return scenario.ego or max(
-        vehicles, key=lambda a: float(np.hypot(np.ptp(a.waypoints.x_m), np.ptp(a.waypoints.y_m)))
-    )
-
-
-def _lane_of_standing_agent(agent: Agent) -> MapLane:
+    agent = scenario.ego or max(vehicles, key=lambda a: np.hypot(np.ptp(a.waypoints.x_m), np.ptp(a.waypoints.y_m)))
     w = agent.waypoints
     x, y, yaw = (float(np.mean(v)) for v in (w.x_m, w.y_m, np.unwrap(w.yaw_rad)))
     ground = float(np.mean(w.z_m)) - agent.size_m[2] / 2
     ahead = np.array([-STANDING_M / 2, STANDING_M / 2])
     points = np.column_stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), [ground, ground]])
     width = np.full(2, max(STANDING_WIDTH_M, agent.size_m[1] + 0.8))
-    return MapLane("lane-1", points, width, inferred_from="paths", confidence=0.0)
+    return (MapLane("lane-1", points, width, inferred_from="paths", confidence=0.0),)
 
 
 def edges_of(lane: MapLane) -> tuple[Array, Array]:
@@ -191,12 +184,10 @@ def require_roads(root: Element, where: str) -> None:
     if not roads:
         raise ScenarioError(f"{where}: has no roads, expected at least one")
     for road in roads:
-        _require_geometry(road, f"{where}: road '{road.get('id', '')[:40]}'")
-        _require_order(road, f"{where}: road '{road.get('id', '')[:40]}'")
-        _require_widths(road, f"{where}: road '{road.get('id', '')[:40]}'")
+        _require_road(road, f"{where}: road '{road.get('id', '')[:40]}'")
 
 
-def _require_geometry(road: Element, where: str) -> None:
+def _require_road(road: Element, where: str) -> None:
     s = 0.0
     pieces = road.findall("planView/geometry")
     for piece in pieces:
@@ -209,9 +200,6 @@ def _require_geometry(road: Element, where: str) -> None:
     length = require_number(road.get("length"), f"{where}: length")
     if not pieces or abs(length - s) > GAP_M:
         raise ScenarioError(f"{where}: length {length:g}, but its geometry ends at {s:g}")
-
-
-def _require_order(road: Element, where: str) -> None:
     for path in ("elevationProfile/elevation", "lanes/laneOffset", "lanes/laneSection"):
         last = -1.0
         for node in road.iterfind(path):
@@ -221,9 +209,6 @@ def _require_order(road: Element, where: str) -> None:
                     f"{where}: {node.tag} at s={s:g} follows one at s={last:g}, expected stations in order"
                 )
             last = s
-
-
-def _require_widths(road: Element, where: str) -> None:
     sections = road.findall("lanes/laneSection")
     if not sections:
         raise ScenarioError(f"{where}: has no lanes, expected at least one <laneSection>")
@@ -271,16 +256,10 @@ def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> ExportPl
         )
     x, y, z = values
     placement = on_map(scenario.map, (root.findtext("header/geoReference") or "").strip() or None, (x, y, z))
-    _require_near(root, scenario, placement, map_path)
-    return placement
-
-
-def _require_near(root: Element, scenario: Scenario, placement: ExportPlacement, map_path: Path) -> None:
-    """Raise when no agent is near any road: the map is of another place, or in other coordinates."""
-    pieces = list(root.iter("geometry"))
-    roads = np.array(
-        [[require_number(p.get(key), f"{map_path}: geometry {key}") for key in ("x", "y", "length")] for p in pieces]
-    )
+    # Where no agent is near any road the map is of another place, or in other coordinates.
+    keys = ("x", "y", "length")
+    pieces = root.iter("geometry")
+    roads = np.array([[require_number(p.get(key), f"{map_path}: geometry {key}") for key in keys] for p in pieces])
     firsts = [(a.waypoints.x_m[0], a.waypoints.y_m[0], 0.0, 0.0) for a in scenario.agents]
     places = placement.forward(np.array(firsts))
     gaps = [(np.hypot(*(roads[:, :2] - place[:2]).T) - roads[:, 2]).min() for place in places]
@@ -289,6 +268,7 @@ def _require_near(root: Element, scenario: Scenario, placement: ExportPlacement,
             f"--map {map_path}: its roads are {min(gaps) / 1000:.0f} km away from all agents; is it the map of this place, and do"
             " its geoReference and offset, and the scenario's map, say where they lie?"
         )
+    return placement
 
 
 def opendrive_document(scenario: Scenario, placement: ExportPlacement) -> Element:

@@ -197,17 +197,20 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     return np.asarray(kept[np.hypot(*(xy_all[kept] - center).T) <= reach])
 
 
-def continued_sides(seed: Array, xy: Array, max_length_m: float) -> Index:
+def continued_sides(
+    seed: Array, xy: Array, max_length_m: float, yaw_rad: float | None = None, max_gap_m: float = np.inf
+) -> Index:
     """Find the points (m, 2) that continue the sides of a cluster (n, 2) where rays are far apart: their indices.
 
-    `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it.
+    `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it. `yaw_rad`: along one of the
+    sides; fitted to the cluster where it is not known. `max_gap_m`: a wider gap ends a side also where rays are farther apart.
 
     Notes
     -----
     The flank of a long vehicle is seen at so flat an angle that successive rays meet it farther apart than the cells of
     the clusters are: at 15 m along a flank 2.5 m aside, 0.4 degrees are 0.6 m.
     """
-    yaw, step_rad = fit_yaw(seed)[0], azimuth_step_rad(seed)
+    yaw, step_rad = fit_yaw(seed)[0] if yaw_rad is None else yaw_rad, azimuth_step_rad(seed)
     own, others = rotate(seed, -yaw), rotate(xy, -yaw)
     low, high = own.min(axis=0), own.max(axis=0)
     found = np.zeros(len(xy), dtype=bool)
@@ -218,17 +221,17 @@ def continued_sides(seed: Array, xy: Array, max_length_m: float) -> Index:
             continue
         on_side = np.abs(others[:, across] - side_m) < SIDE_DEPTH_M
         for sign, end in ((1.0, high[axis]), (-1.0, low[axis])):
-            farthest = _walk(sign * others[on_side, axis], sign * end, step_rad, abs(side_m))
+            farthest = _walk(sign * others[on_side, axis], sign * end, step_rad, abs(side_m), max_gap_m)
             farthest = min(farthest, sign * end + max_length_m - (high[axis] - low[axis]))
             along = sign * others[:, axis]
             found |= on_side & (along > sign * end) & (along <= farthest)
     return np.flatnonzero(found)
 
 
-def _walk(along_m: Array, end_m: float, step_rad: float, side_m: float) -> float:
+def _walk(along_m: Array, end_m: float, step_rad: float, side_m: float, max_gap_m: float) -> float:
     """Go on from an end over coordinates (m,) along a side at a distance, as long as the next is no farther than the next ray."""
     for next_m in np.sort(along_m[along_m > end_m]).tolist():
-        if next_m - end_m > MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m:
+        if next_m - end_m > min(MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m, max_gap_m):
             break
         end_m = next_m
     return end_m

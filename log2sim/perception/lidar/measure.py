@@ -36,6 +36,7 @@ from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, Camera, box_iou
 from log2sim.perception.boxes import (
     TOP_QUANTILE,
+    corrected_yaw,
     fit_extents_of_clusters,
     place_boxes,
     quantile_of_clusters,
@@ -263,8 +264,8 @@ def logit(p: Array) -> Array:
     return log_odds_of(np.clip(p, MIN_SCORE, MAX_SCORE))
 
 
-# A box that ends nearer to the image border may be cut by it.
-BORDER_PX = 3.0
+# A box that ends nearer to the image border may be cut by it: detectors place edges to some pixels and percent of a box's side.
+BORDER_PX, BORDER_SHARE = 3.0, 0.02
 # Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
 MIN_LONG_M = 10.0
 NEAR_END_QUANTILE = 0.05
@@ -273,8 +274,9 @@ MIN_EXTENT_M = 0.1
 
 
 def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
-    border = np.array([camera.width_px, camera.height_px]) - BORDER_PX
-    return np.asarray((box_px[:, :2] < BORDER_PX).any(axis=1) | (box_px[:, 2:] > border).any(axis=1))
+    near_px = np.maximum(BORDER_PX, BORDER_SHARE * (box_px[:, 2:] - box_px[:, :2]))
+    far_px = np.array([camera.width_px, camera.height_px]) - box_px[:, 2:]
+    return np.asarray((box_px[:, :2] < near_px).any(axis=1) | (far_px < near_px).any(axis=1))
 
 
 def _free_points(
@@ -423,6 +425,8 @@ def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[ND
 
 # A box is wrong by less than this at each side; neighbors are farther away.
 BOX_MARGIN_M = 0.2
+# Two vehicles of a row stand this near to each other.
+ROW_GAP_M = 1.0
 # Mirrors reach so far beyond a vehicle's width, and boxes around them half as far again.
 EGO_MARGIN_M = 0.4
 # A box is sought at the times of another viewpoint's points up to this speed and distance, in steps of a LiDAR's noise and
@@ -500,5 +504,22 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
         order = np.lexsort((outside_m, point))
         own[shared[order[np.r_[False, np.diff(point[order]) == 0]]]] = False
     edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
-    members = cloud.obstacles[found.point[own]]
-    return [members[a:b] for a, b in pairwise(edges)]
+    free = np.ones(len(xyz), dtype=bool)
+    free[found.point] = False
+    members = [found.point[own][a:b] for a, b in pairwise(edges)]
+    for k, category in enumerate(boxes.category):
+        longest_m, seed = MAX_SIZE_M[category][0], members[k]
+        if longest_m < MIN_LONG_M or len(seed) < MIN_CLUSTER_POINTS:
+            continue
+        # The boxes of a detector that sees little of a long flank at a time end before it does.
+        near = free & (np.abs(xyz[:, :2] - center[k, :2].astype(xyz.dtype)).max(axis=1) < longest_m)
+        rest, place = np.flatnonzero(near), xyz[:, :2] - cloud.sensor[:2]
+        yaw_rad = corrected_yaw(place[seed].astype(np.float64), float(boxes.yaw_rad[k]))
+        for _ in range(2):  # along the flank, then round the corner
+            own, more = (place[index].astype(np.float64) for index in (seed, rest))
+            added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
+            seed, rest = np.union1d(seed, rest[added]), np.delete(rest, added)
+        # A side that goes on past the longest vehicle is a wall's.
+        if np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0).max() <= longest_m:
+            free[seed], members[k] = False, seed
+    return [cloud.obstacles[index] for index in members]

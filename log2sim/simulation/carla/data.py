@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -27,39 +27,19 @@ from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHE
 Size = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Asset:
-    """A blueprint and the difference of its size from the agent's."""
-
-    blueprint: str
-    size_m: Size  # (3,), m length, width, height
-    error_m: Size  # (3,), m size of the blueprint less that of the agent
-
-
 CARS: Mapping[str, Size] = {
-    "vehicle.audi.a2": (3.71, 1.79, 1.55),
-    "vehicle.audi.etron": (4.86, 2.03, 1.65),
-    "vehicle.audi.tt": (4.18, 1.99, 1.39),
-    "vehicle.bmw.grandtourer": (4.61, 2.24, 1.67),
-    "vehicle.chevrolet.impala": (5.36, 2.03, 1.41),
-    "vehicle.citroen.c3": (3.99, 1.85, 1.62),
-    "vehicle.dodge.charger_2020": (5.01, 1.88, 1.53),
-    "vehicle.ford.mustang": (4.72, 1.89, 1.30),
-    "vehicle.jeep.wrangler_rubicon": (3.87, 1.91, 1.88),
-    "vehicle.lincoln.mkz_2017": (4.90, 2.13, 1.51),
-    "vehicle.lincoln.mkz_2020": (4.89, 1.84, 1.49),
-    "vehicle.mercedes.coupe": (5.03, 2.15, 1.65),
-    "vehicle.mercedes.coupe_2020": (4.67, 1.81, 1.44),
-    "vehicle.micro.microlino": (2.21, 1.48, 1.38),
-    "vehicle.mini.cooper_s": (3.81, 1.97, 1.48),
-    "vehicle.mini.cooper_s_2021": (4.55, 2.10, 1.77),
-    "vehicle.nissan.micra": (3.63, 1.85, 1.50),
-    "vehicle.nissan.patrol": (4.60, 1.93, 1.85),
-    "vehicle.nissan.patrol_2021": (5.57, 2.15, 2.05),
-    "vehicle.seat.leon": (4.19, 1.82, 1.47),
-    "vehicle.tesla.model3": (4.79, 2.16, 1.49),
-    "vehicle.toyota.prius": (4.51, 2.01, 1.52),
-}
+    "vehicle.audi.a2": (3.71, 1.79, 1.55), "vehicle.audi.etron": (4.86, 2.03, 1.65),
+    "vehicle.audi.tt": (4.18, 1.99, 1.39), "vehicle.bmw.grandtourer": (4.61, 2.24, 1.67),
+    "vehicle.chevrolet.impala": (5.36, 2.03, 1.41), "vehicle.citroen.c3": (3.99, 1.85, 1.62),
+    "vehicle.dodge.charger_2020": (5.01, 1.88, 1.53), "vehicle.ford.mustang": (4.72, 1.89, 1.30),
+    "vehicle.jeep.wrangler_rubicon": (3.87, 1.91, 1.88), "vehicle.lincoln.mkz_2017": (4.90, 2.13, 1.51),
+    "vehicle.lincoln.mkz_2020": (4.89, 1.84, 1.49), "vehicle.mercedes.coupe": (5.03, 2.15, 1.65),
+    "vehicle.mercedes.coupe_2020": (4.67, 1.81, 1.44), "vehicle.micro.microlino": (2.21, 1.48, 1.38),
+    "vehicle.mini.cooper_s": (3.81, 1.97, 1.48), "vehicle.mini.cooper_s_2021": (4.55, 2.10, 1.77),
+    "vehicle.nissan.micra": (3.63, 1.85, 1.50), "vehicle.nissan.patrol": (4.60, 1.93, 1.85),
+    "vehicle.nissan.patrol_2021": (5.57, 2.15, 2.05), "vehicle.seat.leon": (4.19, 1.82, 1.47),
+    "vehicle.tesla.model3": (4.79, 2.16, 1.49), "vehicle.toyota.prius": (4.51, 2.01, 1.52),
+}  # fmt: skip
 VANS: Mapping[str, Size] = {
     "vehicle.mercedes.sprinter": (5.92, 1.99, 2.56),
     "vehicle.volkswagen.t2": (4.48, 2.07, 2.04),
@@ -96,22 +76,15 @@ def _walker(number: str) -> Size:
 
 WALKERS: Mapping[str, Size] = {f"walker.pedestrian.{k:04}": _walker(f"{k:04}") for k in range(1, 53)}
 PROPS: Mapping[str, Size] = {
-    "static.prop.barrel": (0.46, 0.47, 0.81),
-    "static.prop.busstop": (3.88, 1.89, 2.74),
-    "static.prop.clothcontainer": (1.24, 1.89, 1.81),
-    "static.prop.constructioncone": (0.34, 0.34, 0.59),
-    "static.prop.container": (1.93, 1.01, 1.71),
-    "static.prop.glasscontainer": (1.95, 2.01, 1.79),
-    "static.prop.kiosk_01": (1.63, 1.65, 3.25),
-    "static.prop.plantpot04": (4.97, 0.74, 0.12),
-    "static.prop.shoppingcart": (0.67, 1.21, 1.08),
-    "static.prop.streetbarrier": (1.21, 0.37, 1.07),
-    "static.prop.trafficcone01": (0.88, 0.88, 1.13),
-    "static.prop.trafficwarning": (2.37, 2.87, 3.57),
-    "static.prop.trashbag": (0.38, 0.43, 0.70),
-    "static.prop.trashcan03": (0.63, 0.55, 0.93),
+    "static.prop.barrel": (0.46, 0.47, 0.81), "static.prop.busstop": (3.88, 1.89, 2.74),
+    "static.prop.clothcontainer": (1.24, 1.89, 1.81), "static.prop.constructioncone": (0.34, 0.34, 0.59),
+    "static.prop.container": (1.93, 1.01, 1.71), "static.prop.glasscontainer": (1.95, 2.01, 1.79),
+    "static.prop.kiosk_01": (1.63, 1.65, 3.25), "static.prop.plantpot04": (4.97, 0.74, 0.12),
+    "static.prop.shoppingcart": (0.67, 1.21, 1.08), "static.prop.streetbarrier": (1.21, 0.37, 1.07),
+    "static.prop.trafficcone01": (0.88, 0.88, 1.13), "static.prop.trafficwarning": (2.37, 2.87, 3.57),
+    "static.prop.trashbag": (0.38, 0.43, 0.70), "static.prop.trashcan03": (0.63, 0.55, 0.93),
     "static.prop.vendingmachine": (0.87, 1.10, 2.11),
-}
+}  # fmt: skip
 
 BY_CATEGORY: Mapping[str, Mapping[str, Size]] = {
     "car": {**CARS, **VANS},
@@ -125,20 +98,21 @@ BY_CATEGORY: Mapping[str, Mapping[str, Size]] = {
 }
 
 
-def nearest_assets(agent: Agent, *, turn: int = 0, count: int = 3) -> tuple[Asset, ...]:
-    """Return the blueprints of an agent's category nearest in size (Euclidean over the three lengths), nearest first.
+def nearest_assets(agent: Agent, *, turn: int = 0) -> list[dict[str, Any]]:
+    """Return the three assets of an agent's category nearest in size (Euclidean over the three lengths), nearest first.
 
-    Among blueprints of one size, such as CARLA's adults, the `turn`-th comes first, so that not all look the same.
+    Each has "blueprint", "size_m", its length, width and height, and "error_m", that size less the agent's. Among
+    blueprints of one size, such as CARLA's adults, the `turn`-th comes first, so that not all look the same.
     """
     offers: dict[Size, list[str]] = {}
     for blueprint, size_m in BY_CATEGORY[agent.category].items():
         offers.setdefault(size_m, []).append(blueprint)
     assets = []
     for size_m in sorted(offers, key=lambda s: math.dist(s, agent.size_m)):
-        same = offers[size_m]
-        error_m = tuple(round(a - b, 3) for a, b in zip(size_m, agent.size_m))
-        assets += [Asset(same[(turn + k) % len(same)], size_m, error_m) for k in range(len(same))]  # type: ignore[arg-type]
-    return tuple(assets[:count])
+        same, error_m = offers[size_m], tuple(round(a - b, 3) for a, b in zip(size_m, agent.size_m))
+        turned = [same[(turn + k) % len(same)] for k in range(len(same))]
+        assets += [{"blueprint": blueprint, "size_m": size_m, "error_m": error_m} for blueprint in turned]
+    return assets[:3]
 
 
 SAMPLE_S = 0.05  # spacing of the samples; linear interpolation errs by at most a h^2 / 8 = 3 mm at 10 m/s2
@@ -160,18 +134,6 @@ def carla_agents(agents: Sequence[Agent]) -> list[dict[str, Any]]:
     Raises `ScenarioError` when their samples would take more than `MAX_SAMPLED_BYTES`, before anything is allocated for
     them.
     """
-    _require_few_samples(agents)
-    begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
-    end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
-    counts: Counter[str] = Counter()
-    described = []
-    for agent in agents:
-        described.append(_agent(agent, counts[agent.category], (begin_s, end_s)))
-        counts[agent.category] += 1
-    return described
-
-
-def _require_few_samples(agents: Sequence[Agent]) -> None:
     lasts_s = [0.0 if a.static else float(a.waypoints.t_s[-1] - a.waypoints.t_s[0]) for a in agents]
     size_bytes = sum(lasts_s) / SAMPLE_S * BYTES_PER_SAMPLE
     if size_bytes > MAX_SAMPLED_BYTES:
@@ -180,6 +142,14 @@ def _require_few_samples(agents: Sequence[Agent]) -> None:
             f"agents last {sum(lasts_s):g} s together, '{agents[k].id}' {lasts_s[k]:g} s: their samples every {SAMPLE_S:g} s take "
             f"{size_bytes / 2**30:.3g} GiB, at most {MAX_SAMPLED_BYTES / 2**30:g} GiB can be written; cut the scenario into parts"
         )
+    begin_s = min(float(a.waypoints.t_s[0]) for a in agents)
+    end_s = max(float(a.waypoints.t_s[-1]) for a in agents)
+    counts: Counter[str] = Counter()
+    described = []
+    for agent in agents:
+        described.append(_agent(agent, counts[agent.category], (begin_s, end_s)))
+        counts[agent.category] += 1
+    return described
 
 
 def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, Any]:
@@ -197,10 +167,7 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
         "color": None if agent.color is None else list(agent.color["rgb"]),
         "static": agent.static,
         "doubts": [doubt.to_dict() for doubt in agent.doubts],
-        "assets": [
-            {"blueprint": a.blueprint, "size_m": a.size_m, "error_m": a.error_m}
-            for a in nearest_assets(agent, turn=turn)
-        ],
+        "assets": nearest_assets(agent, turn=turn),
         "begin_s": life_s[0],
         "end_s": life_s[1],
         "discontinuities_s": [float(t) for t in trajectory.discontinuity_times()],
@@ -229,13 +196,9 @@ def _trajectories(
     bend = {"curvature_1pm": _rounded(-curvature)}
     exact = {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), **bend}
     pid = {
-        **_left_handed(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw),
-        **bend,
-        "speed_mps": _rounded(speed),
-        "accel_mps2": _rounded(accel),
-        "gear": _rounded(gear),
-        "stands": _rounded(stands),
-    }
+        **_left_handed(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw), **bend,
+        "speed_mps": _rounded(speed), "accel_mps2": _rounded(accel), "gear": _rounded(gear), "stands": _rounded(stands),
+    }  # fmt: skip
     return exact, pid
 
 
@@ -245,25 +208,18 @@ def _times(agent: Agent, trajectory: Trajectory) -> Array:
         return trajectory.t_s[:1]
     regular = np.arange(trajectory.t_s[0], trajectory.t_s[-1], SAMPLE_S)
     k = np.searchsorted(trajectory.t_s, regular, side="right")
-    gap_s = np.minimum(
-        regular - trajectory.t_s[k - 1], trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)] - regular
-    )
-    return np.sort(
-        np.concatenate(
-            [regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, trajectory.discontinuity_times() - DISCONTINUITY_S]
-        )
-    )
+    after = trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)]
+    gap_s = np.minimum(regular - trajectory.t_s[k - 1], after - regular)
+    before_jumps = trajectory.discontinuity_times() - DISCONTINUITY_S
+    return np.sort(np.concatenate([regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, before_jumps]))
 
 
 def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:
     """Convert columns to CARLA's left-handed frame."""
     return {
-        "t_s": _rounded(t_s, 7),
-        "x_m": _rounded(x),
-        "y_m": _rounded(-y),
-        "z_m": _rounded(z),
+        "t_s": _rounded(t_s, 7), "x_m": _rounded(x), "y_m": _rounded(-y), "z_m": _rounded(z),
         "yaw_deg": _rounded(-np.degrees(yaw)),
-    }
+    }  # fmt: skip
 
 
 def _rounded(values: ArrayLike, digits: int = 4) -> list[float]:

@@ -488,8 +488,7 @@ def load_client() -> ModuleType:
         import carla
     except ImportError as error:
         raise ReplayError(f"CARLA's Python client is needed: pip install carla ({error})", NO_CLIENT) from None
-    result: ModuleType = carla
-    return result
+    return carla  # type: ignore[no-any-return]
 
 
 def connect(carla: ModuleType, host: str, port: int, timeout_s: float) -> Any:
@@ -507,14 +506,6 @@ def connect(carla: ModuleType, host: str, port: int, timeout_s: float) -> Any:
         ) from None
     client.set_timeout(timeout_s)
     return client
-
-
-def version_note(client: Any) -> list[str]:
-    """Describe a difference between the versions of server and client."""
-    server, own = client.get_server_version(), client.get_client_version()
-    if server == own:
-        return []
-    return [f"note: the server is CARLA {server}, this client {own}; install carla=={server} if something fails"]
 
 
 def open_world(carla: ModuleType, client: Any, town: str | None, opendrive: Path | None) -> Any:
@@ -553,26 +544,6 @@ def load_data(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict) or data.get("format") != "log2sim-carla" or data.get("version") != VERSION:
         raise ReplayError(f"{path}: not the data of this script (format 'log2sim-carla', version {VERSION})", 3)
     return data
-
-
-def size_table(data: dict[str, Any]) -> str:
-    """List the asset of each agent, and by how much it is longer, wider and higher."""
-    width = max(len(a["id"]) for a in data["agents"])
-    lines = [f"{'agent':{width}}  {'length width height m':>21}  {'error of the asset m':>21}  asset"]
-    for a in data["agents"]:
-        own, asset = a["size_m"], a["assets"][0]
-        size, error = " ".join(f"{v:6.2f}" for v in own), " ".join(f"{v:+6.2f}" for v in asset["error_m"])
-        lines.append(f"{a['id']:{width}}  {size:>21}  {error:>21}  {asset['blueprint']}")
-    return "\n".join(lines)
-
-
-def drift_table(drift_m: dict[str, list[float]]) -> str:
-    """List the distance of driven agents from the scenario."""
-    lines = []
-    for name, values in drift_m.items():
-        rms = math.sqrt(sum(v * v for v in values) / len(values))
-        lines.append(f"{name}: {rms:.2f} m rms, {max(values):.2f} m at most from the scenario")
-    return "\n".join(lines)
 
 
 def play(player: ScenarioPlayer, data: dict[str, Any], *, follow: str, pace: float) -> None:
@@ -642,7 +613,13 @@ def run(words: Sequence[str] | None = None) -> None:
     """Execute the command line."""
     args = arguments(words)
     data = load_data(args.data)
-    print_now(size_table(data))
+    # The asset of each agent, and by how much it is longer, wider and higher.
+    width = max(len(a["id"]) for a in data["agents"])
+    print_now(f"{'agent':{width}}  {'length width height m':>21}  {'error of the asset m':>21}  asset")
+    for a in data["agents"]:
+        asset, size = a["assets"][0], " ".join(f"{v:6.2f}" for v in a["size_m"])
+        error = " ".join(f"{v:+6.2f}" for v in asset["error_m"])
+        print_now(f"{a['id']:{width}}  {size:>21}  {error:>21}  {asset['blueprint']}")
     if args.table:
         return
     mode = args.mode or data["mode"]
@@ -653,10 +630,14 @@ def run(words: Sequence[str] | None = None) -> None:
         ground = args.ground or ("map" if mode == "pid" else "log")
         player = ScenarioPlayer(session, data, mode, physics=args.physics, ground=ground)
         play(player, data, follow=args.follow, pace=args.pace)
-    for note in version_note(client) + session.notes:
+    server, own = client.get_server_version(), client.get_client_version()
+    if server != own:
+        print_now(f"note: the server is CARLA {server}, this client {own}; install carla=={server} if something fails")
+    for note in session.notes:
         print_now(note)
-    if player.drift_m:
-        print_now(drift_table(player.drift_m))
+    for name, values in player.drift_m.items():
+        rms = math.sqrt(sum(v * v for v in values) / len(values))
+        print_now(f"{name}: {rms:.2f} m rms, {max(values):.2f} m at most from the scenario")
 
 
 def main(words: Sequence[str] | None = None) -> int:

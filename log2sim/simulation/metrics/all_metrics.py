@@ -45,7 +45,13 @@ class TrackingErrors:
 
 def agent_errors(trajectory: Trajectory, agent: AgentReplay, *, follows: bool) -> TrackingErrors:
     """Compute the errors of an agent; one that is not on time may be far along its path and still on it."""
-    near_s = agent.t_s if follows else _nearest_times(trajectory, agent.x_m, agent.y_m)
+    near_s = agent.t_s
+    if not follows:  # the times at which the scenario is nearest
+        from scipy.spatial import cKDTree
+
+        t = np.arange(trajectory.t_s[0], trajectory.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)
+        tree = cKDTree(np.stack(trajectory.relative(t)[:2], axis=1))
+        near_s = t[tree.query(np.stack([agent.x_m, agent.y_m], axis=1) - trajectory.origin_m)[1]]
     across, along = tracking_errors(trajectory, agent.t_s, agent.x_m, agent.y_m, near_s)
     log = trajectory.at(agent.t_s)
     return TrackingErrors(across, along, agent.speed_mps - log.speed_mps, wrap_angle(agent.yaw_rad - log.yaw_rad))
@@ -89,32 +95,16 @@ def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
     """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
     across = np.abs(errors.across_m)
     return {
-        "cross_track_rms_m": round(_rms(errors.across_m), 6),
-        "cross_track_max_m": round(float(np.max(across)), 6),
-        "along_track_rms_m": round(_rms(errors.along_m), 6),
-        "speed_rms_mps": round(_rms(errors.speed_mps), 6),
-        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6),
-        "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
-    }
+        "cross_track_rms_m": round(_rms(errors.across_m), 6), "cross_track_max_m": round(float(np.max(across)), 6),
+        "along_track_rms_m": round(_rms(errors.along_m), 6), "speed_rms_mps": round(_rms(errors.speed_mps), 6),
+        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6), "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
+    }  # fmt: skip
 
 
 def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
     """Return the mean of the values weighted by their samples; 0 without any."""
     total = sum(samples.values())
     return sum(count * values[k] for k, count in samples.items()) / total if total else 0.0
-
-
-def _nearest_times(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
-    """Return the times (S,) at which the scenario is nearest to places."""
-    from scipy.spatial import cKDTree
-
-    t = np.arange(trajectory.t_s[0], trajectory.t_s[-1] + SEARCH_STEP_S / 2, SEARCH_STEP_S)
-    x, y = trajectory.relative(t)[:2]
-    _, nearest = cKDTree(np.stack([x, y], axis=1)).query(
-        np.stack([x_m - trajectory.origin_m[0], y_m - trajectory.origin_m[1]], axis=1)
-    )
-    result: Array = t[nearest]
-    return result
 
 
 def _rms(values: Array) -> float:
@@ -130,14 +120,9 @@ MIN_ROWS = 5
 
 # Comfort limits of nuPlan's planning benchmark (Karnchanachari et al., 2024), derived from human drivers.
 LIMITS = {
-    "lon_accel_max_mps2": 2.40,
-    "lon_decel_max_mps2": 4.05,
-    "lat_accel_max_mps2": 4.89,
-    "lon_jerk_max_mps3": 4.13,
-    "jerk_max_mps3": 8.37,
-    "yaw_rate_max_radps": 0.95,
-    "yaw_accel_max_radps2": 1.93,
-}
+    "lon_accel_max_mps2": 2.40, "lon_decel_max_mps2": 4.05, "lat_accel_max_mps2": 4.89, "lon_jerk_max_mps3": 4.13,
+    "jerk_max_mps3": 8.37, "yaw_rate_max_radps": 0.95, "yaw_accel_max_radps2": 1.93,
+}  # fmt: skip
 
 
 def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, float | bool] | None:
@@ -159,17 +144,12 @@ def comfort(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array) -> dict[str, flo
     cos, sin = np.cos(yaw), np.sin(yaw)
     lon_accel, lat_accel, lon_jerk = ax * cos + ay * sin, ay * cos - ax * sin, jx * cos + jy * sin
     out = {
-        "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0),
-        "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
-        "lon_accel_rms_mps2": _rms(lon_accel),
-        "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
-        "lat_accel_rms_mps2": _rms(lat_accel),
-        "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
-        "lon_jerk_rms_mps3": _rms(lon_jerk),
-        "jerk_max_mps3": float(np.hypot(jx, jy).max()),
-        "yaw_rate_max_radps": float(np.abs(yaw_rate).max()),
-        "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
-    }
+        "lon_accel_max_mps2": max(float(lon_accel.max()), 0.0), "lon_decel_max_mps2": max(float(-lon_accel.min()), 0.0),
+        "lon_accel_rms_mps2": _rms(lon_accel), "lat_accel_max_mps2": float(np.abs(lat_accel).max()),
+        "lat_accel_rms_mps2": _rms(lat_accel), "lon_jerk_max_mps3": float(np.abs(lon_jerk).max()),
+        "lon_jerk_rms_mps3": _rms(lon_jerk), "jerk_max_mps3": float(np.hypot(jx, jy).max()),
+        "yaw_rate_max_radps": float(np.abs(yaw_rate).max()), "yaw_accel_max_radps2": float(np.abs(yaw_accel).max()),
+    }  # fmt: skip
     rounded: dict[str, float | bool] = {k: round(v, 4) for k, v in out.items()}
     rounded["comfortable"] = all(out[k] <= limit for k, limit in LIMITS.items())
     return rounded
@@ -216,12 +196,9 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     length_m = float(table.at(np.zeros(1, dtype=np.intp), np.array([path.t_s[-1]])).distance_m[0])
     steps_m = np.hypot(np.diff(ego.x_m), np.diff(ego.y_m))
     return {
-        "driven_m": round(float(steps_m.sum()), 3),
-        "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
-        "path_m": round(length_m, 3),
-        "min_gap": smallest_gap(boxes, index, t_s),
-        "max_brake": hardest_brake(ego),
-    }
+        "driven_m": round(float(steps_m.sum()), 3), "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
+        "path_m": round(length_m, 3), "min_gap": smallest_gap(boxes, index, t_s), "max_brake": hardest_brake(ego),
+    }  # fmt: skip
 
 
 def hardest_brake(ego: AgentReplay) -> dict[str, float] | None:
@@ -245,10 +222,13 @@ def smallest_gap(boxes: BoxTracks, index: int, t_s: Array) -> dict[str, Any] | N
     rows, others = _near_pairs(boxes, index)
     if not len(rows):
         return None
-    gap = np.concatenate([
-        box_distances(boxes, rows[begin : begin + MAX_PAIRS], others[begin : begin + MAX_PAIRS], index)
-        for begin in range(0, len(rows), MAX_PAIRS)
-    ])  # fmt: skip
+    gaps = []
+    for begin in range(0, len(rows), MAX_PAIRS):
+        r, a = rows[begin : begin + MAX_PAIRS], others[begin : begin + MAX_PAIRS]
+        away = boxes.x_m[r, a] - boxes.x_m[r, index] + 1j * (boxes.y_m[r, a] - boxes.y_m[r, index])
+        size, yaws = np.broadcast_to(boxes.size_m[index], (len(r), 3)), (boxes.yaw_rad[r, index], boxes.yaw_rad[r, a])
+        gaps.append(np.maximum(signed_distance(away, *yaws, size, boxes.size_m[a]), 0.0))
+    gap = np.concatenate(gaps)
     k = int(np.argmin(gap))
     return {"m": round(float(gap[k]), 3), "t_s": round(float(t_s[rows[k]]), 6), "agent": int(others[k])}
 
@@ -269,14 +249,6 @@ def _near_pairs(boxes: BoxTracks, index: int) -> tuple[NDArray[np.intp], NDArray
         found.append(np.stack([row + begin, agent]))
     rows_near, agents_near = np.concatenate(found, axis=1)
     return rows_near, agents_near
-
-
-def box_distances(boxes: BoxTracks, rows: NDArray[np.intp], others: NDArray[np.intp], index: int) -> Array:
-    """Return the distances (P,), m, in plan between the box of an agent and those of others at rows; 0 where they overlap."""
-    away = boxes.x_m[rows, others] - boxes.x_m[rows, index] + 1j * (boxes.y_m[rows, others] - boxes.y_m[rows, index])
-    size = np.broadcast_to(boxes.size_m[index], (len(rows), 3))
-    yaws = boxes.yaw_rad[rows, index], boxes.yaw_rad[rows, others]
-    return np.maximum(signed_distance(away, *yaws, size, boxes.size_m[others]), 0.0)
 
 
 LOWER_LIMITS = ("min_ttc_s", "min_pet_s")
@@ -382,7 +354,10 @@ def replay_metrics(
             **agent_metrics(errors[a.id]),
             "min_ttc_s": (most_critical(near_of[a.id], "min_ttc") or {}).get("s"),
             "min_pet_s": (most_critical(near_of[a.id], "pet") or {}).get("s"),
-            "comfort": _comfort(a, trajectories[a.id]),
+            # Not of pedestrians, nor where the scenario has a discontinuity.
+            "comfort": comfort(a.t_s, a.x_m, a.y_m, a.yaw_rad)
+            if a.category in WHEELED and not len(trajectories[a.id].discontinuity_times())
+            else None,
             "collisions": events_of[a.id],
         }
         for a in agents
@@ -407,15 +382,10 @@ def replay_metrics(
     out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
     out["followers"] = len(on_time)
     return {
-        **out,
-        **ego,
-        "collisions": events,
-        "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
-        "min_ttc": most_critical(near, "min_ttc"),
-        "min_pet": most_critical(near, "pet"),
-        "conflicts": near,
+        **out, **ego, "collisions": events, "new_collisions": sum(e["belongs_to"] == REPLAY for e in events),
+        "min_ttc": most_critical(near, "min_ttc"), "min_pet": most_critical(near, "pet"), "conflicts": near,
         "by_agent": by_agent,
-    }
+    }  # fmt: skip
 
 
 def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
@@ -425,13 +395,6 @@ def _by_agent(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
         for id in record["agents"]:
             found[id].append(record)
     return found
-
-
-def _comfort(agent: AgentReplay, trajectory: Trajectory) -> dict[str, float | bool] | None:
-    """Return the comfort of a vehicle; None for pedestrians, and where the scenario has a discontinuity."""
-    if agent.category not in WHEELED or len(trajectory.discontinuity_times()):
-        return None
-    return comfort(agent.t_s, agent.x_m, agent.y_m, agent.yaw_rad)
 
 
 def _box_tracks(
@@ -467,18 +430,47 @@ def summarize(replay: Replay, *, limit: int | None = MAX_LISTED) -> str:
     shown as a dash. Of each list the first `limit` are named, or all without one.
     """
     m = replay.metrics
-    driven = any(a.driver == "policy" for a in replay.agents)
-    near = [e for e in m["conflicts"] if e["ego"] or not driven]
-    whose = " of the ego" if driven else ""
-    lines = [
-        *(_ego_lines(m) if "ego" in m else ()),
-        _error_line(replay),
-        f"{_collision_counts(m['collisions'])} · least time to collision{whose} {_critical_time(near, 'min_ttc')} · post-encroachment time {_critical_time(near, 'pet')}",
-    ]
-    lines += _model_lines(replay, limit)
     events = sorted(m["collisions"], key=lambda e: (e["belongs_to"] != REPLAY, e["t_s"]))
-    lines += _first([f"  {_collision_line(e)}" for e in events], limit)
-    lines += _left_out_lines(replay, limit)
+    drivers = {a.driver for a in replay.agents}
+    lines = _ego_lines(m) if "ego" in m else []
+    on_time, across, along, speed = bool(drivers & {*SCENARIO_FOLLOWERS}), "-", "-", "-"
+    if on_time or "reactive" in drivers:
+        across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
+    if on_time:
+        along, speed = f"{m['along_track_rms_m']:.3f} m rms", f"{m['speed_rms_mps']:.3f} m/s rms"
+    lines.append(f"cross-track {across} · along-track {along} · speed {speed}")
+    counts = f"{len(events)} collision{'' if len(events) == 1 else 's'}"
+    if events:
+        owners = Counter(e["belongs_to"] for e in m["collisions"])
+        parts = [
+            f"{owners[REPLAY]} of the replay",
+            *(f"{n} of the {k} itself" for k, n in owners.items() if k != REPLAY),
+        ]
+        counts += f", {' and '.join(parts)}"
+    whose = " of the ego" if "policy" in drivers else ""
+    times = []
+    for key in ("min_ttc", "pet"):
+        found = most_critical([e for e in m["conflicts"] if e["ego"] or not whose], key)
+        times.append(
+            "-" if found is None else f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"
+        )
+    lines.append(f"{counts} · least time to collision{whose} {times[0]} · post-encroachment time {times[1]}")
+    models = Counter(a.model for a in replay.agents if a.model != "none")
+    if models:
+        lines.append("models: " + ", ".join(f"{count} {model}" for model, count in models.most_common()))
+        chosen = [a for a in replay.agents if a.model == "dynamic" and replay.model == "auto"]
+        lines += _first([f"  {a.id} dynamic: {a.model_reason}" for a in chosen], limit)
+    shown = []
+    for e in events:
+        known = "" if e["belongs_to"] == REPLAY else f", in the {e['belongs_to']} itself"
+        pair, speed_mps = " and ".join(e["agents"]), e["relative_speed_mps"]
+        shown.append(f"  {pair} collide at {e['t_s']:.2f} s ({speed_mps:.1f} m/s){known}")
+    lines += _first(shown, limit)
+    if replay.left_out:
+        count, named = len(replay.left_out), [f"{k} ({why})" for k, why in replay.left_out.items()]
+        more = f" and {count - limit} more" if limit is not None and count > limit else ""
+        total = count + sum(agent.id != EGO for agent in replay.agents)
+        lines.append(f"{count} of {total} agents left out: {', '.join(named[:limit])}{more}")
     if replay.warnings is not None:
         lines.append(describe_warnings(replay.warnings))
     return "\n".join(lines)
@@ -495,71 +487,11 @@ def _ego_lines(metrics: Mapping[str, Any]) -> list[str]:
     ego, events = metrics["ego"], [e for e in metrics["collisions"] if EGO in e["agents"]]
     gap, brake, path_m = ego["min_gap"], ego["max_brake"], ego["path_m"]
     share = f" ({ego['progress_m'] / path_m:.0%})" if path_m > 0 else ""
-    hits = [f"{_other_of(e)} at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s)" for e in events]
+    others = [next(id for id in e["agents"] if id != EGO) for e in events]
+    hits = [f"{id} at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s)" for id, e in zip(others, events)]
     return [
         f"ego: progress {ego['progress_m']:.1f} of {path_m:.1f} m along its path{share}",
         "  smallest gap " + ("-" if gap is None else f"{gap['m']:.2f} m to {gap['agent']} at {gap['t_s']:.2f} s"),
         "  hardest brake " + ("-" if brake is None else f"{brake['mps2']:.1f} m/s2 at {brake['t_s']:.2f} s"),
         f"  collisions {'none' if not hits else 'with ' + ', '.join(hits)}",
     ]
-
-
-def _other_of(event: Mapping[str, Any]) -> str:
-    """Return the id of the agent that the ego collides with."""
-    return str(next(id for id in event["agents"] if id != EGO))
-
-
-def _collision_counts(events: Sequence[Mapping[str, Any]]) -> str:
-    """Count collisions by whose they are: "3 collisions, 1 of the replay and 2 of the reconstruction itself"."""
-    total, whose = _counted(len(events), "collision"), Counter(e["belongs_to"] for e in events)
-    parts = [f"{whose[REPLAY]} of the replay", *(f"{n} of the {k} itself" for k, n in whose.items() if k != REPLAY)]
-    return f"{total}, {' and '.join(parts)}" if events else total
-
-
-def _error_line(replay: Replay) -> str:
-    """Cross-track errors of agents on the path of the scenario, and the other errors of those that also keep its times."""
-    m, drivers = replay.metrics, {a.driver for a in replay.agents}
-    on_time = bool(drivers & {*SCENARIO_FOLLOWERS})
-    across, along, speed = "-", "-", "-"
-    if on_time or "reactive" in drivers:
-        across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
-    if on_time:
-        along, speed = f"{m['along_track_rms_m']:.3f} m rms", f"{m['speed_rms_mps']:.3f} m/s rms"
-    return f"cross-track {across} · along-track {along} · speed {speed}"
-
-
-def _model_lines(replay: Replay, limit: int | None) -> list[str]:
-    """Count the agents of each model, and give the reason for the first of those with the dynamic model by choice."""
-    counts = Counter(a.model for a in replay.agents if a.model != "none")
-    if not counts:
-        return []
-    chosen = [a for a in replay.agents if a.model == "dynamic" and replay.model == "auto"]
-    found = _first([f"  {a.id} dynamic: {a.model_reason}" for a in chosen], limit)
-    return ["models: " + ", ".join(f"{count} {model}" for model, count in counts.most_common()), *found]
-
-
-def _left_out_lines(replay: Replay, limit: int | None) -> list[str]:
-    """Say which agents of the scenario were left out, and why; the ego is none of them."""
-    if not replay.left_out:
-        return []
-    count, named = len(replay.left_out), [f"{k} ({why})" for k, why in replay.left_out.items()]
-    total = count + sum(agent.id != EGO for agent in replay.agents)
-    rest = 0 if limit is None else count - limit
-    more = f" and {rest} more" if rest > 0 else ""
-    return [f"{count} of {total} agents left out: {', '.join(named[:limit])}{more}"]
-
-
-def _collision_line(event: Mapping[str, Any]) -> str:
-    known = "" if event["belongs_to"] == REPLAY else f", in the {event['belongs_to']} itself"
-    return f"{' and '.join(event['agents'])} collide at {event['t_s']:.2f} s ({event['relative_speed_mps']:.1f} m/s){known}"
-
-
-def _critical_time(near: Sequence[Mapping[str, Any]], key: str) -> str:
-    found = most_critical(near, key)
-    if found is None:
-        return "-"
-    return f"{found['s']:.2f} s ({' and '.join(found['agents'])} at {found['t_s']:.2f} s)"
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -19,7 +19,6 @@ from log2sim.datatypes import (
     Finding,
     MapFeatures,
     Scenario,
-    Trajectory,
     Waypoints,
     explain_doubt,
 )
@@ -61,29 +60,24 @@ def feature_columns(scenario: Scenario) -> dict[str, Any]:
         "borders": [_columns(border.points_m) for border in features.borders],
         "markings": [
             {
-                **_columns(marking.points_m),
-                "kind": marking.kind,
-                "yellow": marking.color == "yellow",
-                "width_m": round(marking.width_m, 3),
-                "doubtful": marking.confidence < MIN_TRUSTED_CONFIDENCE,
+                **_columns(m.points_m), "kind": m.kind, "yellow": m.color == "yellow", "width_m": round(m.width_m, 3),
+                "doubtful": m.confidence < MIN_TRUSTED_CONFIDENCE,
             }
-            for marking in features.markings
+            for m in features.markings
         ],
         "signals": [
             {
-                "id": signal.id,
-                "at_m": [round(float(v), 2) for v in signal.position_m[:2]],
-                "t_s": [round(float(t), 3) for t in signal.t_s],
-                "state": [str(state) for state in signal.state],
+                "id": s.id, "at_m": [round(float(v), 2) for v in s.position_m[:2]], "t_s": [round(float(t), 3) for t in s.t_s],
+                "state": [str(state) for state in s.state],
             }
-            for signal in scenario.signals
+            for s in scenario.signals
         ],
         "sensors": [
             {k: round(float(sensor[k]), 3) for k in ("x_m", "y_m", "yaw_rad", "fov_rad", "range_m")}
             for sensor in scenario.sensors
         ],
         "notes": list(features.notes),
-    }
+    }  # fmt: skip
 
 
 def _columns(points_m: Array) -> dict[str, list[int]]:
@@ -122,11 +116,9 @@ def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[st
         rows = rows[shown[rows]]
         if len(rows):
             way = forecast.position_m[rows] - table.position_m[found.row[rows], found.tick[rows], None]
-            columns = {
-                "course_rad": np.unwrap(np.angle(forecast.course[rows, -1])),
-                "along_m": forecast.sigma_m[rows, -1, 0],
-                "across_m": forecast.sigma_m[rows, -1, 1],
-            }
+            along, across = forecast.sigma_m[rows, -1].T
+            course = np.unwrap(np.angle(forecast.course[rows, -1]))
+            columns = {"course_rad": course, "along_m": along, "across_m": across}
             out[agent.id] = {
                 "t_s": second_differences(table.t_s[found.tick[rows]], SCALES["t_s"]),
                 "dx_m": [second_differences(column, SCALES["dx_m"]) for column in way.real.T],
@@ -220,14 +212,14 @@ def page_document(
         predicted = predicted_columns(scenario, predict_s)
         for entry in layers["scenario"]:
             entry |= {"predicted": predicted[entry["id"]]} if entry["id"] in predicted else {}
-    entries = [e for layer in layers.values() for e in layer]
-    rows = sum(len(e["t_s"]) for e in entries)
+    rows = sum(len(e["t_s"]) for layer in layers.values() for e in layer)
     if rows > MAX_ROWS:
         raise ConfigError(
             f"{rows} waypoints are more than the {MAX_ROWS} that a page can hold; take fewer agents, "
             f"such as with `log2sim edit --only`"
         )
-    spans = [_span(e) for name in ("scenario", "replay") for e in layers.get(name, ())]
+    shown_entries = [e for name in ("scenario", "replay") for e in layers.get(name, ())]
+    times = [np.cumsum(np.cumsum(e["t_s"])) / SCALES["t_s"] for e in shown_entries]
     collisions, shown = [], list(metrics)
     if replay is not None:
         from log2sim.simulation.metrics.all_metrics import summarize
@@ -239,10 +231,10 @@ def page_document(
     known = m.latitude_deg is not None and m.longitude_deg is not None
     return {
         "name": scenario.name,
-        "begin_s": min([0.0, *(first for first, _ in spans)]),
-        "end_s": max([scenario.duration_s, *(last for _, last in spans)]),
+        "begin_s": min([0.0, *(float(t_s[0]) for t_s in times)]),
+        "end_s": max([scenario.duration_s, *(float(t_s[-1]) for t_s in times)]),
         "origin": (f"{m.latitude_deg:.5f}°, {m.longitude_deg:.5f}°" if known else None),
-        "north": scenario.map.projection is not None,
+        "north": m.projection is not None,
         "layers": layers,
         "features": feature_columns(scenario),
         "background": None if background is None else embed(background),
@@ -251,14 +243,10 @@ def page_document(
         "metrics": [[title, text] for title, text in shown],
         "recording": None,
         "studio": {
-            "t0_ns": scenario.t0_ns,
-            "map_offset_m": list(m.offset_m),
-            "log": scenario.name,
-            "categories": list(CATEGORIES),
-            "paints": {name: list(rgb) for name, rgb in PAINTS.items()},
-            "corrections": [],
+            "t0_ns": scenario.t0_ns, "map_offset_m": list(m.offset_m), "log": scenario.name, "categories": list(CATEGORIES),
+            "paints": {name: list(rgb) for name, rgb in PAINTS.items()}, "corrections": [],
         },
-    }
+    }  # fmt: skip
 
 
 def _warnings(replay: Any) -> dict[str, Any]:
@@ -270,43 +258,31 @@ def _warnings(replay: Any) -> dict[str, Any]:
         return {"title": "", "events": []}
     events = [
         {
-            "agent": w.agent,
-            "driver": w.driver,
-            "t_s": w.begin_s,
-            "spans": [list(span) for span in w.spans_s],
-            "brief": describe_briefly(w),
-            "text": describe_warning(w, warnings),
+            "agent": w.agent, "driver": w.driver, "t_s": w.begin_s, "spans": [list(span) for span in w.spans_s],
+            "brief": describe_briefly(w), "text": describe_warning(w, warnings),
         }
         for w in warnings.events
-    ]
+    ]  # fmt: skip
     return {"title": count_warnings(warnings), "events": events}
 
 
 def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
     """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
     roles, tell_ends = assign_view_roles(scenario), len(ends_of(scenario)) > 1
-    for role in roles.movers:
-        entry = _entry(role.agent, role.agent.waypoints, stationary=False, static=False)
-        mark = {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading}
-        yield {**entry, **_paint(role.agent), **mark, **_trust(role.agent), **_observers(role.agent, tell_ends)}
-    for agent in roles.stationary:
-        entry = _entry(agent, agent.waypoints, stationary=True, static=agent.static)
-        yield {**entry, **_paint(agent), **_trust(agent), **_observers(agent, tell_ends)}
-
-
-def _observers(agent: Agent, tell: bool) -> dict[str, Any]:
-    """Return the spans, s, in which each end observed an agent; nothing for one that does not tell, such as the ego."""
-    spans = {end: [[round(t, 3) for t in span] for span in found] for end, found in agent.observed_by.items() if found}
-    return {"observed_by": spans} if spans and tell else {}
-
-
-def _paint(agent: Agent) -> dict[str, Any]:
-    """Return the color that an agent itself has, and its name with how sure that is; nothing where it is not known."""
-    if agent.color is None:
-        return {}
-    confidence = agent.color.get("confidence")
-    sure = "" if confidence is None else f" ({confidence:.2f})"
-    return {"paint": {"rgb": list(agent.color["rgb"]), "text": f"{agent.color['name']}{sure}"}}
+    marks: list[dict[str, Any]] = [
+        {"ego": True} if role.is_ego else {"color": role.color, "leading": role.leading} for role in roles.movers
+    ]
+    shown = [(role.agent, False, mark) for role, mark in zip(roles.movers, marks)]
+    for agent, stationary, mark in (*shown, *((agent, True, {}) for agent in roles.stationary)):
+        entry = _entry(agent, agent.waypoints, stationary=stationary, static=stationary and agent.static)
+        if agent.color is not None:
+            confidence = agent.color.get("confidence")
+            sure = "" if confidence is None else f" ({confidence:.2f})"
+            entry["paint"] = {"rgb": list(agent.color["rgb"]), "text": f"{agent.color['name']}{sure}"}
+        entry |= mark | _trust(agent)
+        # In which spans, s, each end observed it; nothing where that is not known, as of the ego.
+        spans = {end: [[round(t, 3) for t in s] for s in found] for end, found in agent.observed_by.items() if found}
+        yield entry | ({"observed_by": spans} if spans and tell_ends else {})
 
 
 def _trust(agent: Agent) -> dict[str, Any]:
@@ -358,25 +334,13 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
     }
     if not isinstance(agent, Agent):
         return entry
-    z = second_differences(columns.z_m, SCALES["x_m"])
-    return {**entry, **_tangents(agent.trajectory), "z_m": z, "filled": _filled(columns.observed)}
-
-
-def _tangents(trajectory: Trajectory) -> dict[str, list[int]]:
-    """Return the velocities of the spline at the waypoints and the indices of steps over which it jumps."""
+    way, gap = agent.trajectory, ~(columns.observed[:-1] & columns.observed[1:])
     return {
-        "vx_mps": second_differences(trajectory.velocity_x_mps, SCALES["vx_mps"]),
-        "vy_mps": second_differences(trajectory.velocity_y_mps, SCALES["vy_mps"]),
-        "jumps": np.flatnonzero(trajectory.discontinuous).tolist(),
+        **entry,
+        "vx_mps": second_differences(way.velocity_x_mps, SCALES["vx_mps"]),
+        "vy_mps": second_differences(way.velocity_y_mps, SCALES["vy_mps"]),
+        "jumps": np.flatnonzero(way.discontinuous).tolist(),  # steps over which the spline does
+        "z_m": second_differences(columns.z_m, SCALES["x_m"]),
+        # First and last waypoint of each run of segments that are not observed at both ends, one after the other.
+        "filled": np.flatnonzero(np.diff(gap.astype(np.int8), prepend=0, append=0)).tolist(),
     }
-
-
-def _filled(observed: NDArray[np.bool_]) -> list[int]:
-    """List the first and last waypoint of each run of segments that are not observed at both ends, one after the other."""
-    gap = ~(observed[:-1] & observed[1:])
-    return np.flatnonzero(np.diff(gap.astype(np.int8), prepend=0, append=0)).tolist()
-
-
-def _span(entry: dict[str, Any]) -> tuple[float, float]:
-    t_s = np.cumsum(np.cumsum(entry["t_s"])) / SCALES["t_s"]
-    return float(t_s[0]), float(t_s[-1])

@@ -24,33 +24,10 @@ SUFFIXES = (".html", ".htm")
 MARGIN_BYTES = 10_000  # of a page, for the names and keys around pictures and points
 # Parts of the script in the order of their dependencies.
 SCRIPT_FILES = (
-    "track.js",
-    "features.js",
-    "background.js",
-    "predicted.js",
-    "decoded.js",
-    "theme.js",
-    "ends.js",
-    "warnings.js",
-    "map.js",
-    "scale.js",
-    "points.js",
-    "paint.js",
-    "chart.js",
-    "list.js",
-    "details.js",
-    "controls.js",
-    "state.js",
-    "outlines.js",
-    "pictures.js",
-    "collisions.js",
-    "timeline.js",
-    "lists.js",
-    "main.js",
-    "surface.js",
-    "studio.js",
-    "scripting.js",
-)
+    "track.js", "features.js", "background.js", "predicted.js", "decoded.js", "theme.js", "ends.js", "warnings.js", "map.js",
+    "scale.js", "points.js", "paint.js", "chart.js", "list.js", "details.js", "controls.js", "state.js", "outlines.js",
+    "pictures.js", "collisions.js", "timeline.js", "lists.js", "main.js", "surface.js", "studio.js", "scripting.js",
+)  # fmt: skip
 
 
 def write_page(
@@ -136,12 +113,9 @@ def page_html(document: dict[str, Any]) -> str:
     ) + ("; connect-src 'self'" if "address" in document["studio"] else "")
     text = json.dumps(document, separators=(",", ":"), allow_nan=False)
     parts = {
-        "policy": policy,
-        "title": html.escape(document["name"] or "scenario"),
-        "style": style,
-        "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
-        "script": script,
-    }
+        "policy": policy, "title": html.escape(document["name"] or "scenario"), "style": style,
+        "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"), "script": script,
+    }  # fmt: skip
     # One pass: inserted text is not searched again, so no name in a scenario can be taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _file("page.html"))
 

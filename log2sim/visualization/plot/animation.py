@@ -14,18 +14,8 @@ from matplotlib.colors import to_rgba
 from log2sim.datatypes import Agent, Scenario, Signal
 from log2sim.files.documents import replaced
 from log2sim.geometry import Array
-from log2sim.visualization.plot import drawing, viewport
+from log2sim.visualization.plot import drawing, layers, viewport
 from log2sim.visualization.plot.encoding import FilmFile, Image, write_gif
-from log2sim.visualization.plot.layers import (
-    DOTS,
-    STRIPE_PT,
-    Overlays,
-    SignalLights,
-    box_stripes,
-    is_doubted_at,
-    new_collisions,
-    show_expected,
-)
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, FigureLayout, MovingLabels
 from log2sim.visualization.plot.scene import draw_base
 from log2sim.visualization.plot.selection import FPS, MAX_REAL_TIME_S, PlotOptions, TimeRange
@@ -44,7 +34,7 @@ class AnimatedArtists:
         self,
         layout: FigureLayout,
         roles: AgentRoles,
-        overlays: Overlays,
+        overlays: layers.Overlays,
         speed_up: float = 1.0,
         charts: TimelineCharts | None = None,
         signals: Sequence[Signal] = (),
@@ -52,9 +42,9 @@ class AnimatedArtists:
         self.layout, self.roles, self.overlays, self.speed_up, self.charts = layout, roles, overlays, speed_up, charts
         if charts is not None:
             charts.start()
-        self.signals = SignalLights(layout.ax, signals)
+        self.signals = layers.SignalLights(layout.ax, signals)
         self.labels = MovingLabels(layout.ax, layout.view, roles)
-        self.collision_s, self.collision_xy_m = new_collisions(overlays.replay)
+        self.collision_s, self.collision_xy_m = layers.new_collisions(overlays.replay)
         self.collisions = drawing.draw_collisions(layout.ax, self.collision_xy_m, animated=True)
         driven = {a.id: a for a in overlays.replay.agents} if overlays.replay is not None else {}
         self.replayed = [(driven[r.agent.id], r) for r in roles.movers if r.agent.id in driven]
@@ -62,11 +52,11 @@ class AnimatedArtists:
         self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
         self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
         self.noses = PolyCollection([], linewidths=0, **hidden)
-        self.hatches = LineCollection([], colors=PAPER, linewidths=STRIPE_PT, **hidden)
+        self.hatches = LineCollection([], colors=PAPER, linewidths=layers.STRIPE_PT, **hidden)
         dashes: dict[str, Any] = {"linewidths": 0.8, "linestyles": [(0, (3, 2))]}
         self.truths = PolyCollection([], facecolors="none", edgecolors=INK, **dashes, **hidden)
         self.driven = PolyCollection([], facecolors="none", linewidths=1.2, linestyles=[(0, (1, 1.2))], **hidden)
-        self.predicted_paths = LineCollection([], **hidden, **DOTS)
+        self.predicted_paths = LineCollection([], **hidden, **layers.DOTS)
         self.ellipses = PolyCollection([], linewidths=0.7, **hidden)
         self.collections = [
             self.ellipses, self.tails, self.predicted_paths, self.boxes, self.hatches, self.noses, self.truths, self.driven,
@@ -88,17 +78,19 @@ class AnimatedArtists:
         self.boxes.set_facecolor([to_rgba(role.color, 1.0 if role.leading else 0.6) for role, _ in present])
         self.noses.set_facecolor([paint_of(role.agent, to_rgba(PAPER, 0.85)) for role, _ in present])
         self.noses.set_verts(list(viewport.heading_triangles(np.array(corners))) if corners else [])
-        doubted = [(role.agent, pose) for role, pose in present if is_doubted_at(role.agent, t_s)]
-        self.hatches.set_segments([s for a, p in doubted for s in box_stripes(a, p[:2], p[2], self.layout.view)])
-        self.tails.set_segments([_tail(role.agent, pose, t_s) for role, pose in present])
+        doubted = [(role.agent, pose) for role, pose in present if layers.is_doubted_at(role.agent, t_s)]
+        self.hatches.set_segments([s for a, p in doubted for s in layers.box_stripes(a, p[:2], p[2], self.layout.view)])
+        tails = []
+        for role, pose in present:
+            t = role.agent.waypoints.t_s
+            behind = centers_xy(role.agent)[(t >= t_s - TAIL_S) & (t <= t_s)]
+            tails.append(np.concatenate([behind, [pose[:2]]]))
+        self.tails.set_segments(tails)
         self.tails.set_color([to_rgba(role.color, TAIL_ALPHA) for role, _ in present])
-        if self.overlays.predicted is not None:
-            leading = [
-                (role, self.overlays.predicted.at(role.agent.id, t_s)) for role in self.roles.movers if role.leading
-            ]
+        if (predicted := self.overlays.predicted) is not None:
+            leading = [(role, predicted.at(role.agent.id, t_s)) for role in self.roles.movers if role.leading]
             expected = [(role, found) for role, found in leading if found is not None]
-            show_expected(self.predicted_paths, expected)
-            show_expected(self.ellipses, expected)
+            layers.show_expected(self.predicted_paths, self.ellipses, expected)
         if self.overlays.truth is not None:
             there = [(a, _pose(a, t_s)) for a in self.overlays.truth.agents]
             self.truths.set_verts(
@@ -135,16 +127,8 @@ def _pose(agent: Agent, t_s: float) -> Array | None:
     """Return x, y, yaw, speed at a time; None outside the trajectory."""
     if len(agent.waypoints) == 1 and agent.static:
         return np.array([agent.waypoints.x_m[0], agent.waypoints.y_m[0], agent.waypoints.yaw_rad[0], 0.0])
-    state = agent.at(t_s)
-    values = [state.x_m[0], state.y_m[0], state.yaw_rad[0], state.speed_mps[0]]
-    return np.array(values) if state.valid[0] else None
-
-
-def _tail(agent: Agent, pose: Array, t_s: float) -> Array:
-    """Return the positions (K, 2) of the last `TAIL_S` seconds up to a pose."""
-    t = agent.waypoints.t_s
-    chosen = centers_xy(agent)[(t >= t_s - TAIL_S) & (t <= t_s)]
-    return np.concatenate([chosen, [pose[:2]]])
+    s = agent.at(t_s)
+    return np.concatenate([s.x_m, s.y_m, s.yaw_rad, s.speed_mps]) if s.valid[0] else None
 
 
 WIDTH_PX = {".gif": 960, ".mp4": 1280, ".webm": 1280}  # without a size of the user's
@@ -157,13 +141,8 @@ class FrameTiming:
 
     frames: int
     step_s: float  # of the scenario from frame to frame
-    start_s: float = 0.0  # time of the first frame
-    fps: float = FPS[".gif"]  # frames that are shown a second
-
-    @property
-    def speed_up(self) -> float:
-        """Return how many times faster than real time it plays."""
-        return self.step_s * self.fps
+    start_s: float  # time of the first frame
+    fps: float  # frames that are shown a second
 
 
 def choose_frame_timing(span: TimeRange, options: PlotOptions, suffix: str) -> FrameTiming:
@@ -179,16 +158,15 @@ def choose_frame_timing(span: TimeRange, options: PlotOptions, suffix: str) -> F
 
 
 def write_animation(
-    scenario: Scenario, roles: AgentRoles, film: FilmFile, overlays: Overlays, progress: Progress
+    scenario: Scenario, roles: AgentRoles, film: FilmFile, overlays: layers.Overlays, progress: Progress
 ) -> None:
     """Write an animation frame by frame; none is kept."""
     suffix = film.path.suffix.lower()
-    base = draw_base(scenario, roles, overlays, moving=True)
-    layout = base.layout
-    drawing.draw_tracks(layout.ax, roles, layout.view, base.step_s, alpha=TRACK_ALPHA, faint=True)
+    layout, step_s, charts, _ = draw_base(scenario, roles, overlays, moving=True)
+    drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=TRACK_ALPHA, faint=True)
     layout.set_width_px((overlays.options.size_px or (WIDTH_PX[suffix], 0))[0])
     timing = choose_frame_timing(overlays.span_of(scenario), overlays.options, suffix)
-    artists = AnimatedArtists(layout, roles, overlays, timing.speed_up, base.charts, scenario.signals)
+    artists = AnimatedArtists(layout, roles, overlays, timing.step_s * timing.fps, charts, scenario.signals)
     with replaced(film.path) as temporary:
         write = film.write or partial(write_gif, colors=[role.color for role in roles.movers] + [ALARM])
         write(draw_frames(layout, artists, timing, progress), temporary, timing.fps)

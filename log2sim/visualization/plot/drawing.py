@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
 from log2sim.visualization.plot import viewport
-from log2sim.visualization.plot.style import COLLISION_MARK, INK, MARKERS, PAPER, PARKED_EDGE, PARKED_FACE
+from log2sim.visualization.plot.style import COLLISION_MARK, INK, PAPER, PARKED_EDGE, PARKED_FACE
 from log2sim.visualization.plot.viewport import (
-    MAX_UNCROWDED_MOVERS,
     AgentRole,
     AgentRoles,
     Viewport,
@@ -49,9 +48,8 @@ def draw_background(ax: Axes, picture: Background) -> None:
     """Draw a top-down picture below everything, lightened so that tracks stand out."""
     pale = 0.62 * picture.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
     rgba = np.dstack([np.rint(pale).astype(np.uint8), (picture.alpha * 0.95).astype(np.uint8)])
-    ax.imshow(
-        rgba, extent=picture.extent_m, origin="upper", interpolation="antialiased", zorder=BACKGROUND, aspect="auto"
-    )
+    style: dict[str, Any] = {"origin": "upper", "interpolation": "antialiased", "aspect": "auto"}
+    ax.imshow(rgba, extent=picture.extent_m, zorder=BACKGROUND, **style)
 
 
 def add_polygons(ax: Axes, corners: Iterable[Array], **style: Any) -> None:
@@ -92,11 +90,15 @@ def draw_tracks(
         _lines(ax, same_rank, alpha if leading else alpha * 0.5, leading)
     shown = [role for role in roles.movers if role.leading]
     heads = [(head, role.color) for role in shown for head in viewport.arrows(centers_xy(role.agent), view)]
-    if heads and not faint:
+    if faint:
+        return
+    if heads:
         faces = [color for _, color in heads]
         add_polygons(ax, [h for h, _ in heads], facecolors=faces, edgecolors=PAPER, linewidths=0.5, zorder=MARK)
-    if not faint:
-        _time_marks(ax, roles, view, step_s)
+    for role in shown:
+        t, xy = viewport.time_marks(role.agent, step_s)
+        apart = np.append(True, np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt)[: len(t)]
+        ax.plot(*xy[apart].T, "o", ms=2.7, mfc=PAPER, mec=role.color, mew=0.8, zorder=MARK + 0.1, ls="none")
 
 
 def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: float | None) -> None:
@@ -123,7 +125,7 @@ def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: flo
             add_polygons(ax, corners, facecolors=face, edgecolors=edge, linewidths=0.8, zorder=level)
         if max(agent.size_m[:2]) < 9 * view.m_per_pt:
             face = to_rgba(role.color, alpha)
-            ax.plot(*xy[-1], MARKERS[role.group], ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
+            ax.plot(*xy[-1], role.marker, ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
 
 
 def draw_truth(ax: Axes, truth: Scenario) -> None:
@@ -165,8 +167,11 @@ def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> Non
     observed: list[tuple[Array, str]] = []
     filled: list[tuple[Array, str]] = []
     for role in reversed(roles):
-        for kind, parts in zip((observed, filled), viewport.observed_and_filled(role.agent)):
-            kind.extend((part, role.color) for part in parts)
+        xy, known = centers_xy(role.agent), role.agent.waypoints.observed
+        both = known[:-1] & known[1:]
+        for kind, keep in ((observed, both), (filled, ~both)):
+            edges = np.flatnonzero(np.diff(keep.astype(np.int8), prepend=0, append=0))
+            kind.extend((xy[start : stop + 1], role.color) for start, stop in zip(edges[::2], edges[1::2]))
     ribbon = 1.5 if alpha < 1.0 else 1.0
     width = [ribbon * (2.4 if c == INK else 1.7) for _, c in observed] if leading else [1.0] * len(observed)
     parts, colors = [p for p, _ in observed], [to_rgba(c, alpha) for _, c in observed]
@@ -176,19 +181,3 @@ def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> Non
     add_lines(ax, parts, colors=colors, linewidths=width, zorder=TRACK, capstyle="round")
     gaps, colors = [p for p, _ in filled], [to_rgba(c, alpha) for _, c in filled]
     add_lines(ax, gaps, colors=colors, linewidths=1.3, zorder=TRACK, linestyle=(0, (2.2, 1.8)))
-
-
-def _time_marks(ax: Axes, roles: AgentRoles, view: Viewport, step_s: float) -> None:
-    for role in roles.movers:
-        if not role.leading:
-            continue
-        t, xy = viewport.time_marks(role.agent, step_s)
-        apart = np.append(True, np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt)[: len(t)]
-        ax.plot(
-            xy[apart, 0], xy[apart, 1], "o", ms=2.7, mfc=PAPER, mec=role.color, mew=0.8, zorder=MARK + 0.1, ls="none"
-        )
-
-
-def view_is_crowded(roles: AgentRoles) -> bool:
-    """Tell whether there are too many movers for boxes at time marks."""
-    return len(roles.movers) > MAX_UNCROWDED_MOVERS

@@ -23,7 +23,6 @@ from log2sim.datatypes import (
     Marking,
     Scenario,
     Signal,
-    Span,
     explain_doubt,
 )
 from log2sim.geometry import Array
@@ -71,13 +70,15 @@ def draw_observers(ax: Axes, roles: AgentRoles, view: Viewport) -> None:
 
 def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
     """Return lines (K, 2), m, map frame, along which an end alone observed an agent; `aside_m` to its right."""
-    w, others = agent.waypoints, [e for e in ENDS if e != end]
+    w = agent.waypoints
     if not agent.observed_by.get(end) or len(w) < 2:
         return []
     t_s = np.arange(w.t_s[0], w.t_s[-1] + STEP_S / 2, STEP_S)
-    alone = _within(t_s, agent.observed_by[end])
-    for other in others:
-        alone &= ~_within(t_s, agent.observed_by.get(other, ()))
+    alone = np.ones(len(t_s), dtype=bool)
+    for other in ENDS:
+        spans = agent.observed_by.get(other, ())
+        seen = np.any([t_s < -np.inf, *((t_s >= a - 1e-6) & (t_s <= b + 1e-6) for a, b in spans)], axis=0)
+        alone &= seen if other == end else ~seen
     states = agent.trajectory.at(t_s)
     right = states.yaw_rad - np.pi / 2
     points = np.column_stack([states.x_m + aside_m * np.cos(right), states.y_m + aside_m * np.sin(right)])
@@ -85,54 +86,27 @@ def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
     return [points[run] for run in runs if alone[run[0]] and len(run) > 1]
 
 
-def observer_rows() -> list[tuple[Line2D, str]]:
-    """Return the lines of the legend."""
-    return [(Line2D([0, 1], [0, 1], color=END_COLOR[e], lw=WIDTH_PT), f"observed by the {e} alone") for e in ENDS]
-
-
-def _within(t_s: Array, spans: tuple[Span, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    return np.asarray(np.any([(t_s >= a - 1e-6) & (t_s <= b + 1e-6) for a, b in spans] or [t_s < -np.inf], axis=0))
-
-
 LINE: dict[str, Any] = {"color": WARNING, "lw": 1.2, "ls": (0, (4.0, 2.5)), "marker": "o", "ms": 3.5, "mfc": "none"}
 
 TEXT_PT = -9.0  # how far above the middle of the line its text is
 
 
-class WarnedPlace(NamedTuple):
-    """A warning to draw."""
-
-    ends_m: Array  # (2, 2) centers of the warned vehicle and of the agent
-    text: str
+def warned_events(replay: Any) -> list[Any]:
+    """List the warnings of a replay."""
+    return [] if replay is None or replay.warnings is None else [w for w in replay.warnings.events if w.warned]
 
 
-def warned_places(replay: Any) -> list[WarnedPlace]:
-    """Find where the warned vehicle and the others are in a replay when they are first warned of."""
-    if replay is None or replay.warnings is None:
-        return []
-    places = []
-    for w in replay.warnings.events:
-        if w.warned is not None:
-            pair = [replay.agent(id) for id in (w.driver, w.agent)]
-            ends = [[float(np.interp(w.warned.t_s, a.t_s, c)) for c in (a.x_m, a.y_m)] for a in pair]
-            places.append(WarnedPlace(np.array(ends), f"{w.warned.t_s:.1f} s: {w.warned.distance_m:.1f} m"))
-    return places
-
-
-def draw_warnings(ax: Axes, places: list[WarnedPlace]) -> None:
-    """Draw a line from the warned vehicle to the agent for each warning, with the time and the distance."""
-    for place in places:
-        ax.plot(*place.ends_m.T, zorder=LABEL - 0.2, **LINE)
+def draw_warnings(ax: Axes, replay: Any) -> None:
+    """Draw a line from the warned vehicle to the agent for each warning, where they are first warned, with the time and the distance."""
+    for w in warned_events(replay):
+        t_s, pair = w.warned.t_s, [replay.agent(id) for id in (w.driver, w.agent)]
+        ends_m = np.array([[float(np.interp(t_s, a.t_s, c)) for c in (a.x_m, a.y_m)] for a in pair])
+        ax.plot(*ends_m.T, zorder=LABEL - 0.2, **LINE)
         ax.annotate(
-            place.text, place.ends_m.mean(axis=0), (0.0, TEXT_PT), textcoords="offset points", color=WARNING, fontsize=6.5,
-            fontweight="bold", family=FONT, ha="center", va="center", path_effects=halo(), zorder=LABEL, parse_math=False,
-            annotation_clip=True,
+            f"{t_s:.1f} s: {w.warned.distance_m:.1f} m", ends_m.mean(axis=0), (0.0, TEXT_PT), textcoords="offset points",
+            color=WARNING, fontsize=6.5, fontweight="bold", family=FONT, ha="center", va="center", path_effects=halo(),
+            zorder=LABEL, parse_math=False, annotation_clip=True,
         )  # fmt: skip
-
-
-def warning_row() -> tuple[Line2D, str]:
-    """Return the line of the legend."""
-    return Line2D([0, 1], [0, 1], **LINE), "warning: when, and how far apart"
 
 
 def new_collisions(replay: Any) -> tuple[Array, Array]:
@@ -208,31 +182,21 @@ def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None
         if role.agent.waypoints.t_s[0] <= t <= role.agent.waypoints.t_s[-1]
         if (expected := paths.at(role.agent.id, float(t))) is not None
     ]
-    lines, ellipses = (
-        LineCollection([], zorder=MARK + 0.2, **DOTS),
-        PolyCollection([], linewidths=0.7, zorder=TRACK - 0.4),
-    )
+    lines = LineCollection([], zorder=MARK + 0.2, **DOTS)
+    ellipses = PolyCollection([], linewidths=0.7, zorder=TRACK - 0.4)
+    show_expected(lines, ellipses, shown)
     for artist in (lines, ellipses):
-        show_expected(artist, shown)
         ax.add_collection(artist, autolim=False)
 
 
-def show_expected(artist: LineCollection | PolyCollection, shown: list[tuple[AgentRole, Expected]]) -> None:
-    """Set the paths of a line collection or the ellipses of a polygon collection, in the colors of the agents."""
+def show_expected(lines: LineCollection, ellipses: PolyCollection, shown: list[tuple[AgentRole, Expected]]) -> None:
+    """Set paths and ellipses in the colors of the agents."""
     colors = [role.color for role, _ in shown]
-    if isinstance(artist, LineCollection):
-        artist.set_segments([expected.path_m for _, expected in shown])
-        artist.set_color([to_rgba(color) for color in colors])
-        return
-    artist.set_verts([expected.ellipse_m for _, expected in shown])
-    artist.set_facecolor([to_rgba(color, ELLIPSE_ALPHA) for color in colors])
-    artist.set_edgecolor([to_rgba(color, ELLIPSE_EDGE_ALPHA) for color in colors])
-
-
-def prediction_row(horizon_s: float) -> tuple[Line2D, str]:
-    """Return the line of the legend."""
-    handle = Line2D([0, 1], [0, 1], color=MUTED, lw=1.3, ls=(0, (1.0, 1.3)))
-    return handle, f"predicted for {horizon_s:g} s, 1 sigma"
+    lines.set_segments([expected.path_m for _, expected in shown])
+    lines.set_color([to_rgba(color) for color in colors])
+    ellipses.set_verts([expected.ellipse_m for _, expected in shown])
+    ellipses.set_facecolor([to_rgba(color, ELLIPSE_ALPHA) for color in colors])
+    ellipses.set_edgecolor([to_rgba(color, ELLIPSE_EDGE_ALPHA) for color in colors])
 
 
 @dataclass(frozen=True, eq=False)

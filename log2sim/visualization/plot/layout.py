@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,6 @@ from log2sim.visualization.plot.style import (
     CROWD_COLOR,
     FONT,
     INK,
-    MARKERS,
     MUTED,
     PAPER,
     PARKED_EDGE,
@@ -65,14 +64,6 @@ class MapLabel:
     bold: bool
 
 
-@dataclass(eq=False)
-class Placed:
-    """Labels of a picture."""
-
-    labels: list[MapLabel] = field(default_factory=list)
-    told: set[str] = field(default_factory=set)  # ids of the agents of which the map says all that the legend would
-
-
 def short_label(role: AgentRole) -> str:
     """Return what marks a mover on the map where there is little room."""
     return printable_label(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
@@ -84,11 +75,6 @@ def speed_text(agent: Agent) -> str:
     return f"{speed * 3.6:.0f} km/h" if speed >= STANDSTILL_MPS else "stands"
 
 
-def full_label(role: AgentRole) -> str:
-    """Return id and highest speed of a mover."""
-    return f"{printable_label(role.agent.id, MAX_ID_LETTERS)}{'?' * role.agent.is_doubtful} · {speed_text(role.agent)}"
-
-
 def place_labels(
     roles: AgentRoles,
     view: Viewport,
@@ -96,10 +82,10 @@ def place_labels(
     *,
     static: bool = False,
     sensors: Sequence[Mapping[str, Any]] = (),
-) -> Placed:
+) -> tuple[list[MapLabel], set[str]]:
     """Find places for the labels of movers and doubtful agents, with `static` of all static ones, and for times along the ego's track.
 
-    Labels keep clear of `sensors`, those of a scenario.
+    Labels keep clear of `sensors`, those of a scenario. Also returns the ids of the agents of which the map says all that the legend would.
 
     Short labels of all movers get their places before any is replaced by the full one, so that the long texts of some do not
     take the room of the others.
@@ -108,21 +94,52 @@ def place_labels(
     marks = [(s["x_m"] - mark, s["y_m"] - mark, s["x_m"] + mark, s["y_m"] + mark) for s in sensors]
     room = LabelRoom(view, [*_occupied(roles, view), *marks])
     tracks = {role.agent.id: _points_of(role.agent) for role in roles.movers}
-    placed = Placed()
-    leading = [role for role in roles.movers if role.leading]
-    short = {role.agent.id: _place_short(role, room, tracks) for role in leading}
+    labels, told = list[MapLabel](), set[str]()
+
+    def place_detail(text: str, anchor: Anchor) -> bool:
+        place = room.place(text, DETAIL_PT, [anchor])
+        labels.extend([] if place is None else [MapLabel(text, MUTED, place, DETAIL_PT, bold=False)])
+        return place is not None
+
+    def place_mover(role: AgentRole, text: str) -> Array | None:
+        anchors = itertools.chain(_end_of(role.agent), _along(role.agent))
+        return room.place(text, MOVER_PT, anchors, _belongs_to(role.agent, tracks))
+
+    leading, short_places = [role for role in roles.movers if role.leading], dict[str, Array | None]()
     for role in leading:
-        _place_mover(role, short[role.agent.id], room, placed, tracks)
+        short = short_label(role)
+        place = place_mover(role, short)
+        place = room.place(short, MOVER_PT, _end_of(role.agent)) if place is None else place
+        short_places[role.agent.id] = place
+    for role in leading:  # by the full one if there is room for it
+        id, short = role.agent.id, short_label(role)
+        full, short_place = f"{short} · {speed_text(role.agent)}", short_places[id]
+        if short_place is not None:
+            room.taken.remove(room.bounds(short, MOVER_PT, short_place))
+        if (place := place_mover(role, full)) is not None:
+            labels.append(MapLabel(full, role.color, place, MOVER_PT, bold=True))
+            told.add(id)
+        elif short_place is not None:
+            room.taken.append(room.bounds(short, MOVER_PT, short_place))
+            labels.append(MapLabel(short, role.color, short_place, MOVER_PT, bold=True))
     for agent in roles.stationary:
+        anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
+        name = printable_label(agent.id, MAX_ID_LETTERS)
         if agent.is_doubtful:
-            _place_doubtful(agent, room, placed)
+            reason = printable_label(explain_doubt(agent))
+            if len(reason) <= MAX_REASON_LETTERS and place_detail(f"{name}? {reason}", anchor):
+                told.add(agent.id)
+            else:
+                place_detail(f"{name}?", anchor)
         elif static:
-            anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
-            place = room.place(name := printable_label(agent.id, MAX_ID_LETTERS), DETAIL_PT, [anchor])
-            placed.labels += [] if place is None else [MapLabel(name, MUTED, place, DETAIL_PT, bold=False)]
+            place_detail(name, anchor)
     if roles.movers and roles.movers[0].is_ego:
-        _place_times(roles.movers[0].agent, times_step_s, room, placed)
-    return placed
+        ego = roles.movers[0].agent
+        t, xy = viewport.time_marks(ego, times_step_s)
+        apart = viewport.spaced_apart(xy, centers_xy(ego)[[0, -1]], max(ego.size_m[0] / 2, 24 * view.m_per_pt))
+        for when, at in zip(t[apart], xy[apart]):
+            place_detail(f"{when:g} s", (at, np.full(2, ego.size_m[1] / 2)))
+    return labels, told
 
 
 def draw_labels(ax: Axes, labels: Sequence[MapLabel]) -> None:
@@ -166,9 +183,13 @@ class LabelRoom:
 
     def half_size(self, text: str, size_pt: float) -> Array:
         """Estimate half the width and height of a text (2,), m."""
-        return (
-            np.array([LETTER_WIDTH / 2 * size_pt * len(text) + 1.0, LETTER_HALF_HEIGHT * size_pt]) * self.view.m_per_pt
-        )
+        size = np.array([LETTER_WIDTH / 2 * size_pt * len(text) + 1.0, LETTER_HALF_HEIGHT * size_pt])
+        return size * self.view.m_per_pt
+
+    def bounds(self, text: str, size_pt: float, place: Array) -> Bounds:
+        """Return the bounds of a text about a place."""
+        half = self.half_size(text, size_pt)
+        return (*(place - half), *(place + half))
 
     def is_free(self, place: Array, half: Array) -> bool:
         """Whether a label about a place is in the view and clear of all that is taken."""
@@ -177,36 +198,6 @@ class LabelRoom:
         return bool(inside) and not any(
             low[0] < t[2] and high[0] > t[0] and low[1] < t[3] and high[1] > t[1] for t in self.taken
         )
-
-    def give_back(self, text: str, size_pt: float, place: Array) -> None:
-        """Free the room of a text that was placed."""
-        half = self.half_size(text, size_pt)
-        self.taken.remove((*(place - half), *(place + half)))
-
-
-def _place_short(role: AgentRole, room: LabelRoom, tracks: Mapping[str, Array]) -> Array | None:
-    text = short_label(role)
-    anchors = itertools.chain(_end_of(role.agent), _along(role.agent))
-    place = room.place(text, MOVER_PT, anchors, _belongs_to(role.agent, tracks))
-    return room.place(text, MOVER_PT, _end_of(role.agent)) if place is None else place
-
-
-def _place_mover(
-    role: AgentRole, short_place: Array | None, room: LabelRoom, placed: Placed, tracks: Mapping[str, Array]
-) -> None:
-    """Replace the short label of a mover by the full one if there is room for it."""
-    short, full = short_label(role), full_label(role)
-    if short_place is not None:
-        room.give_back(short, MOVER_PT, short_place)
-    anchors = itertools.chain(_end_of(role.agent), _along(role.agent))
-    place = room.place(full, MOVER_PT, anchors, _belongs_to(role.agent, tracks))
-    if place is not None:
-        placed.labels.append(MapLabel(full, role.color, place, MOVER_PT, bold=True))
-        placed.told.add(role.agent.id)
-    elif short_place is not None:
-        half = room.half_size(short, MOVER_PT)
-        room.taken.append((*(short_place - half), *(short_place + half)))
-        placed.labels.append(MapLabel(short, role.color, short_place, MOVER_PT, bold=True))
 
 
 def _belongs_to(agent: Agent, tracks: Mapping[str, Array]) -> Callable[[Array, Array], bool]:
@@ -233,28 +224,6 @@ def _along(agent: Agent) -> Iterator[Anchor]:
     xy = centers_xy(agent)
     for share in ALONG_TRACK:
         yield xy[round(share * (len(xy) - 1))], np.full(2, agent.size_m[1] / 2)
-
-
-def _place_doubtful(agent: Agent, room: LabelRoom, placed: Placed) -> None:
-    """Write the id of a doubtful stationary agent beside it, with the reason if there is room for it."""
-    anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
-    name, reason = f"{printable_label(agent.id, MAX_ID_LETTERS)}?", printable_label(explain_doubt(agent))
-    for text in (f"{name} {reason}", name):
-        whole = text != name
-        place = None if whole and len(reason) > MAX_REASON_LETTERS else room.place(text, DETAIL_PT, [anchor])
-        if place is not None:
-            placed.labels.append(MapLabel(text, MUTED, place, DETAIL_PT, bold=False))
-            placed.told |= {agent.id} if whole else set()
-            return
-
-
-def _place_times(ego: Agent, step_s: float, room: LabelRoom, placed: Placed) -> None:
-    t, xy = viewport.time_marks(ego, step_s)
-    apart = viewport.spaced_apart(xy, centers_xy(ego)[[0, -1]], max(ego.size_m[0] / 2, 24 * room.view.m_per_pt))
-    for when, at in zip(t[apart], xy[apart]):
-        place = room.place(f"{when:g} s", DETAIL_PT, [(at, np.full(2, ego.size_m[1] / 2))])
-        if place is not None:
-            placed.labels.append(MapLabel(f"{when:g} s", MUTED, place, DETAIL_PT, bold=False))
 
 
 def _occupied(roles: AgentRoles, view: Viewport) -> list[Bounds]:
@@ -310,18 +279,12 @@ class MovingLabels:
             text = self._texts.get(role.agent.id)
             if text is None:
                 continue
-            text.set_text(self._text_of(role, speed_mps))
+            moves = self._named and abs(speed_mps) >= STANDSTILL_MPS
+            text.set_text(short_label(role) + f" · {abs(speed_mps) * 3.6:.0f} km/h" * moves)
             place = self._place(role.agent.id, text.get_text(), corners, room)
             if place is not None:
                 text.set_position((place[0], place[1]))
                 self._ax.draw_artist(text)
-
-    def _text_of(self, role: AgentRole, speed_mps: float) -> str:
-        if not self._named:
-            return short_label(role)
-        name = short_label(role)
-        moves = abs(speed_mps) >= STANDSTILL_MPS
-        return f"{name} · {abs(speed_mps) * 3.6:.0f} km/h" if moves else name
 
     def _place(self, id: str, text: str, corners: Array, room: LabelRoom) -> Array | None:
         """Reserve room for a label, at the side where it was if that is free; None without."""
@@ -415,19 +378,9 @@ def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
     """Write the title and a smaller line below it, flush with the map's left edge."""
     height = layout.figure.get_figheight()
     style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
-    x = LEFT_IN / layout.width_in
-    layout.figure.text(
-        x, 1 - 0.36 / height, printable_label(title, 70), fontsize=13, fontweight="bold", color=INK, **style
-    )
-    layout.figure.text(x, 1 - 0.59 / height, printable_label(subtitle, 130), fontsize=8, color=MUTED, **style)
-
-
-def draw_legend(layout: FigureLayout, rows: list[tuple[Any, str]]) -> None:
-    """Draw the legend in the column beside the map, where it covers nothing."""
-    height = layout.figure.get_figheight()
-    x = 1 - SIDE_IN / layout.width_in
-    place = (x, 1 - TOP_IN / height)
-    fill_legend(layout.figure, rows, place, handlelength=2.0, labelspacing=0.56, handletextpad=0.7)
+    x, title, subtitle = LEFT_IN / layout.width_in, printable_label(title, 70), printable_label(subtitle, 130)
+    layout.figure.text(x, 1 - 0.36 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
+    layout.figure.text(x, 1 - 0.59 / height, subtitle, fontsize=8, color=MUTED, **style)
 
 
 def fill_legend(owner: Axes | Figure, rows: list[tuple[Any, str]], place: tuple[float, float], **style: Any) -> None:
@@ -458,7 +411,7 @@ def legend_rows(
         rows.append((_line("none"), "km/h: speed at this time" if present else "km/h: highest speed of each"))
     for role in sorted(roles.movers, key=_reading_order):
         if role.leading and role.agent.id not in told:
-            marker = "s" if role.is_ego else MARKERS[role.group]
+            marker = "s" if role.is_ego else role.marker
             rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
     rest = sum(not r.leading for r in roles.movers)
     if rest:
@@ -471,9 +424,8 @@ def legend_rows(
     if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in roles.movers):
         rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, interpolated"))
     if any(a.color is not None for a in (*(r.agent for r in roles.movers), *roles.stationary)):
-        rows.append(
-            (_line("none", marker="^", ms=4.6, mfc="#C0392B", mec=MUTED, mew=0.4), "heading, in the vehicle's color")
-        )
+        nose = _line("none", marker="^", ms=4.6, mfc="#C0392B", mec=MUTED, mew=0.4)
+        rows.append((nose, "heading, in the vehicle's color"))
     if truth:
         rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
     if replay:
@@ -495,7 +447,9 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
     column.set(xlim=(0, layout.width_in), ylim=(0, height), xticks=[], yticks=[])
     column.set_zorder(-1)
     for k, face in enumerate((INK, PAPER)):
-        column.add_patch(Polygon(_rectangle(x + k * w / 2, y, w / 2, 0.06), fc=face, ec=INK, lw=0.8, closed=True))
+        left, right, top = x + k * w / 2, x + k * w / 2 + w / 2, y + 0.06
+        corners = [(left, y), (right, y), (right, top), (left, top)]
+        column.add_patch(Polygon(corners, fc=face, ec=INK, lw=0.8, closed=True))
     style: dict[str, Any] = {"family": FONT, "fontsize": 7, "color": INK, "va": "bottom"}
     column.text(x, y + 0.1, "0", ha="center", **style)
     column.text(x + w, y + 0.1, f"{length_m:g} m", ha="center", **style)
@@ -521,7 +475,3 @@ def _name(role: AgentRole) -> str:
 def _line(color: str, **style: Any) -> Line2D:
     edge = {"mec": PAPER, "mew": 0.5} if "mec" not in style else {}
     return Line2D([0, 1], [0, 1], color=color, **{"lw": 0, "mfc": color, **edge, **style})
-
-
-def _rectangle(x: float, y: float, w: float, h: float) -> list[tuple[float, float]]:
-    return [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]

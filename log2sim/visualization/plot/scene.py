@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import ENDS, Scenario
 from log2sim.visualization.plot import drawing, layers
 from log2sim.visualization.plot.layers import (
     Overlays,
     draw_road,
     draw_signals,
     new_collisions,
-    observer_rows,
-    prediction_row,
     road_rows,
     tells_ends,
-    warned_places,
-    warning_row,
 )
 from log2sim.visualization.plot.layout import (
+    SIDE_IN,
+    TOP_IN,
     FigureLayout,
     MapLabel,
     draw_labels,
-    draw_legend,
     draw_scale_and_north,
     fill_legend,
     legend_rows,
@@ -37,9 +34,10 @@ from log2sim.visualization.plot.layout import (
     write_title,
 )
 from log2sim.visualization.plot.selection import PlotOptions, TimeRange
-from log2sim.visualization.plot.style import FONT, MUTED, style_axes
+from log2sim.visualization.plot.style import END_COLOR, FONT, MUTED, style_axes
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import (
+    MAX_UNCROWDED_MOVERS,
     AgentRoles,
     Viewport,
     assign_view_roles,
@@ -52,23 +50,19 @@ from log2sim.visualization.plot.viewport import (
 Rows = list[tuple[Any, str]]  # handles and texts of a legend
 
 
-@dataclass(frozen=True, eq=False)
-class PictureBase:
-    """What stills and animations share."""
+def draw_base(
+    scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, moving: bool = False
+) -> tuple[FigureLayout, float, TimelineCharts | None, tuple[MapLabel, ...]]:
+    """Draw what stills and animations share.
 
-    layout: FigureLayout
-    step_s: float  # between time marks
-    charts: TimelineCharts | None  # of the replay; None without a driven agent
-    labels: tuple[MapLabel, ...] = ()  # of a still picture, not drawn yet
-
-
-def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, moving: bool = False) -> PictureBase:
-    """Draw what stills and animations share."""
+    Returns the layout, the seconds between time marks, charts of a replay with a driven agent, and the labels of a still picture,
+    which are not drawn yet.
+    """
     span = overlays.span_of(scenario)
     view = _view_of(roles, overlays.options)
     step_s = time_step_s(span.duration_s, len(roles.movers), _typical_speed(roles), view.width_m / 500)
     projected = scenario.map.projection is not None
-    timeline = timeline_of(overlays.replay, scenario, roles)
+    timeline = timeline_of(overlays.replay, roles)
     size = overlays.options.size_px
 
     def lay_out(rows: Rows) -> FigureLayout:
@@ -81,13 +75,13 @@ def draw_base(scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, movi
     signals_s = None if moving else span.stop_s
     draw_standing(layout.ax, scenario, roles, layout.view, overlays.background, signals_s=signals_s)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
-    draw_legend(layout, rows)
+    # In the column beside the map, where the legend covers nothing.
+    place = 1 - SIDE_IN / layout.width_in, 1 - TOP_IN / layout.figure.get_figheight()
+    fill_legend(layout.figure, rows, place, handlelength=2.0, labelspacing=0.56, handletextpad=0.7)
     draw_scale_and_north(layout, projected=projected)
     write_title(layout, overlays.title or scenario.name or "scenario", _subtitle(scenario, roles, span))
-    charts = None
-    if timeline is not None:
-        charts = draw_charts(layout, timeline, (span.start_s, span.stop_s), moving=moving)
-    return PictureBase(layout, step_s, charts, labels)
+    charts = None if timeline is None else draw_charts(layout, timeline, (span.start_s, span.stop_s), moving=moving)
+    return layout, step_s, charts, labels
 
 
 def draw_standing(
@@ -116,7 +110,7 @@ def draw_moving(
     """Draw the tracks of agents, pale where truth or replay lie over them; with `ghosts` also boxes along those."""
     overlaid = truth is not None or replay is not None
     drawing.draw_tracks(ax, roles, view, step_s, alpha=0.45 if overlaid else 1.0)
-    crowded = overlaid or not ghosts or drawing.view_is_crowded(roles)
+    crowded = overlaid or not ghosts or len(roles.movers) > MAX_UNCROWDED_MOVERS
     drawing.draw_ends(ax, roles, view, ghosts_step_s=None if crowded else step_s)
     layers.hatch_movers(ax, roles, view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
     if truth is not None:
@@ -145,17 +139,14 @@ def _fit_labels(
     if mark_step_s is None:
         rows = _legend(scenario, roles, overlays, None, leading if names_fit(roles) else set())
         return lay_out(rows), rows, ()
+    static, sensors = overlays.options.label_static, scenario.sensors
     told = leading | {agent.id for agent in roles.stationary}
     layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, told))
-    placed = place_labels(
-        roles, layout.view, mark_step_s, static=overlays.options.label_static, sensors=scenario.sensors
-    )
-    if not told <= placed.told | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
-        layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, placed.told))
-        placed = place_labels(
-            roles, layout.view, mark_step_s, static=overlays.options.label_static, sensors=scenario.sensors
-        )
-    return layout, _legend(scenario, roles, overlays, mark_step_s, placed.told), tuple(placed.labels)
+    labels, said = place_labels(roles, layout.view, mark_step_s, static=static, sensors=sensors)
+    if not told <= said | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
+        layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, said))
+        labels, said = place_labels(roles, layout.view, mark_step_s, static=static, sensors=sensors)
+    return layout, _legend(scenario, roles, overlays, mark_step_s, said), tuple(labels)
 
 
 def _legend(
@@ -170,11 +161,13 @@ def _legend(
     rows = legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
     rows += layers.doubt_rows(roles, told)
     if overlays.predicted is not None and roles.movers:
-        rows.append(prediction_row(overlays.predicted.horizon_s))
+        dots = Line2D([0, 1], [0, 1], color=MUTED, lw=1.3, ls=(0, (1.0, 1.3)))
+        rows.append((dots, f"predicted for {overlays.predicted.horizon_s:g} s, 1 sigma"))
     if tells_ends(scenario) and mark_step_s is not None:
-        rows += observer_rows()
-    if warned_places(overlays.replay) and mark_step_s is not None:
-        rows.append(warning_row())
+        lines = [Line2D([0, 1], [0, 1], color=END_COLOR[end], lw=layers.WIDTH_PT) for end in ENDS]
+        rows += [(line, f"observed by the {end} alone") for line, end in zip(lines, ENDS)]
+    if layers.warned_events(overlays.replay) and mark_step_s is not None:
+        rows.append((Line2D([0, 1], [0, 1], **layers.LINE), "warning: when, and how far apart"))
     return rows + road_rows(scenario)
 
 
@@ -241,14 +234,14 @@ def plot(
     step_s = time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
     draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
-    placed = place_labels(roles, view, step_s, sensors=scenario.sensors)
-    draw_labels(ax, placed.labels)
+    labels, told = place_labels(roles, view, step_s, sensors=scenario.sensors)
+    draw_labels(ax, labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
     if new if legend is None else legend:
         overlays = {"truth": truth is not None, "replay": replay is not None}
         collisions = len(new_collisions(replay)[0])
-        rows = legend_rows(roles, step_s, placed.told, collisions=collisions, outside=0, **overlays)
-        fill_legend(ax, [*rows, *layers.doubt_rows(roles, placed.told), *road_rows(scenario)], (1.01, 1.0))
+        rows = legend_rows(roles, step_s, told, collisions=collisions, outside=0, **overlays)
+        fill_legend(ax, [*rows, *layers.doubt_rows(roles, told), *road_rows(scenario)], (1.01, 1.0))
     return ax
 
 

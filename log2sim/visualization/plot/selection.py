@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -175,13 +174,17 @@ def select_shown(scenario: Scenario, replay: Any, options: PlotOptions) -> tuple
     if replay is None:
         return scenario, None
     collisions = [e for e in replay.metrics.get("collisions", ()) if set(e["agents"]) <= set(options.agents)]
-    warnings = replay.warnings
-    if warnings is not None:
-        events = tuple(e for e in warnings.events if {e.driver, e.agent} <= set(options.agents))
-        warnings = replace(warnings, events=events)
-    agents = tuple(a for a in replay.agents if a.id in options.agents)
-    metrics: Mapping[str, Any] = {**replay.metrics, "collisions": collisions}
-    return scenario, replace(replay, agents=agents, metrics=metrics, warnings=warnings)
+    warned = None if replay.warnings is None else replay.warnings.events
+    warned = warned and [e for e in warned if {e.driver, e.agent} <= set(options.agents)]
+    agents = [a for a in replay.agents if a.id in options.agents]
+    return scenario, _with(replay, agents, collisions, warned)
+
+
+def _with(replay: Any, agents: list[Any], collisions: list[Any], warned: Any) -> Any:
+    """Return a replay with these agents, collisions and warnings."""
+    warnings = replay.warnings and replace(replay.warnings, events=tuple(warned))
+    metrics = {**replay.metrics, "collisions": collisions}
+    return replace(replay, agents=tuple(agents), metrics=metrics, warnings=warnings)
 
 
 def cut_scenario(scenario: Scenario, span: TimeRange) -> Scenario:
@@ -196,19 +199,12 @@ def cut_replay(replay: Any, span: TimeRange, scenario: Scenario) -> Any:
     """Return a replay with what is within a range of the scenario's time."""
     if replay is None or (span.start_s <= 0.0 and span.stop_s >= scenario.duration_s):
         return replay
-    cut = [_cut_states(agent, span) for agent in replay.agents]
-    agents = tuple(agent for agent in cut if agent is not None)
+    agents = [cut for agent in replay.agents if (cut := _cut_states(agent, span)) is not None]
     there = {agent.id for agent in agents}
     events = [e for e in replay.metrics.get("collisions", ()) if span.holds(e["t_s"]) and set(e["agents"]) <= there]
-    warnings = replay.warnings
-    if warnings is not None:
-        kept = tuple(
-            w
-            for w in warnings.events
-            if w.warned is not None and span.holds(w.warned.t_s) and {w.driver, w.agent} <= there
-        )
-        warnings = replace(warnings, events=kept)
-    return replace(replay, agents=agents, metrics={**replay.metrics, "collisions": events}, warnings=warnings)
+    warned = () if replay.warnings is None else (w for w in replay.warnings.events if w.warned is not None)
+    kept = [w for w in warned if span.holds(w.warned.t_s) and {w.driver, w.agent} <= there]
+    return _with(replay, agents, events, kept)
 
 
 def _cut_agent(agent: Agent, span: TimeRange) -> Agent | None:

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from log2sim.datatypes import Scenario
 from log2sim.geometry import Array
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.visualization.plot.layout import (
@@ -61,7 +60,7 @@ class AgentTimeline:
     collisions_s: tuple[float, ...] = ()  # start of its collisions that belong to the replay
 
 
-def timeline_of(replay: Any, scenario: Scenario, roles: AgentRoles) -> AgentTimeline | None:
+def timeline_of(replay: Any, roles: AgentRoles) -> AgentTimeline | None:
     """Choose the ego, else the driven agent farthest from its path; None when all agents are where the scenario has them."""
     if replay is None:
         return None
@@ -69,9 +68,7 @@ def timeline_of(replay: Any, scenario: Scenario, roles: AgentRoles) -> AgentTime
     driven = [a for a in replay.agents if a.id in role_of and a.cross_track_m is not None]
     if not driven:
         return None
-    agent = next((a for a in driven if a.id == "ego"), None) or max(
-        driven, key=lambda a: float(np.max(np.abs(a.cross_track_m)))
-    )
+    agent = max(driven, key=lambda a: (a.id == "ego", float(np.max(np.abs(a.cross_track_m)))))
     role = role_of[agent.id]
     events = [e for e in replay.metrics.get("collisions", ()) if agent.id in e["agents"] and e["belongs_to"] == REPLAY]
     return AgentTimeline(role, agent.driver, _strips(agent, role), tuple(e["t_s"] for e in events))
@@ -120,7 +117,11 @@ class TimelineCharts:
         for ax, chart in zip(self.axes, self.timeline.charts):
             cursor = ax.axvline(0.0, color=INK, lw=0.9, **hidden)
             (dot,) = ax.plot([], [], "o", ms=4, mfc=self.timeline.role.color, mec=PAPER, mew=0.7, zorder=9, **hidden)
-            value = _read_out(ax, "", **hidden)
+            # At the right edge of the figure, level with the name of the chart.
+            value = ax.text(
+                _beside(ax, SIDE_IN + GAP_IN - 0.12), 1.06, "", transform=ax.transAxes, ha="right", va="top", fontsize=7.0,
+                family=FONT, color=INK, parse_math=False, path_effects=halo(), clip_on=False, **hidden,
+            )  # fmt: skip
             self.moving.append((ax, chart, cursor, dot, value))
 
     def show(self, t_s: float) -> None:
@@ -153,10 +154,10 @@ def draw_charts(
         )
         _draw_strip(ax, chart, timeline, span_s, last=k == count - 1, moving=moving)
         axes.append(ax)
-    role = timeline.role
-    name = role.agent.id
+    role, spoken = timeline.role, {"pid": "PID", "policy": "a policy", "reactive": "what is ahead"}
+    driver = spoken.get(timeline.driver, timeline.driver)
     layout.figure.text(
-        LEFT_IN / layout.width_in, (top + HEAD_IN - 0.16) / height, f"{printable_label(name, 40)} in the replay, driven by {_spoken(timeline.driver)}",
+        LEFT_IN / layout.width_in, (top + HEAD_IN - 0.16) / height, f"{printable_label(role.agent.id, 40)} in the replay, driven by {driver}",
         family=FONT, fontsize=8.5, fontweight="bold", color=role.color, parse_math=False, va="baseline",
     )  # fmt: skip
     return TimelineCharts(timeline, tuple(axes))
@@ -184,18 +185,6 @@ def _draw_strip(
     for t in timeline.collisions_s:
         ax.axvline(t, color=ALARM, lw=1.0, zorder=2)
     handles = [ax.plot(line.t_s, line.values, zorder=3, **styles[line.style])[0] for line in chart.lines]
-    _style(ax, last=last)
-    labels = [line.label if moving else _with_largest(line, chart) for line in chart.lines]
-    legend = ax.legend(
-        handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
-        loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
-        prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
-        handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
-    )  # fmt: skip
-    legend.get_title().set_color(INK)
-
-
-def _style(ax: Axes, *, last: bool) -> None:
     style_axes(ax, size_pt=6.5, length_pt=2.0)
     ax.yaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 5, 10]))
     for axis in (ax.xaxis, ax.yaxis):
@@ -203,14 +192,17 @@ def _style(ax: Axes, *, last: bool) -> None:
     ax.tick_params(labelbottom=last)
     if last:
         ax.set_xlabel("time (s)", fontsize=7.5, color=MUTED, family=FONT)
-
-
-def _read_out(ax: Axes, text: str, **style: Any) -> Any:
-    """Write a value at the right edge of the figure, level with the name of the chart."""
-    return ax.text(
-        _beside(ax, SIDE_IN + GAP_IN - 0.12), 1.06, text, transform=ax.transAxes, ha="right", va="top", fontsize=7.0,
-        family=FONT, color=INK, parse_math=False, path_effects=halo(), clip_on=False, **style,
+    labels = [line.label for line in chart.lines]
+    if not moving:
+        largest = [float(line.values[np.argmax(np.abs(line.values))]) for line in chart.lines]
+        labels = [f"{label} · max {_number(value, chart)}" for label, value in zip(labels, largest)]
+    legend = ax.legend(
+        handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
+        loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
+        prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
+        handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
     )  # fmt: skip
+    legend.get_title().set_color(INK)
 
 
 def _beside(ax: Axes, inches: float) -> float:
@@ -230,16 +222,7 @@ def _limits(chart: Chart) -> tuple[float, float]:
     return low - below - pad, high + missing - below + pad
 
 
-def _with_largest(line: TimeCurve, chart: Chart) -> str:
-    largest = float(line.values[np.argmax(np.abs(line.values))])
-    return f"{line.label} · max {_number(largest, chart)}"
-
-
 def _number(value: float, chart: Chart) -> str:
     digits = 3 if chart.min_span < 1.0 else 1
     text = f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")  # no minus before a zero
     return f"{text}{'' if chart.unit == '°' else ' '}{chart.unit}"
-
-
-def _spoken(driver: str) -> str:
-    return {"pid": "PID", "policy": "a policy", "reactive": "what is ahead"}.get(driver, driver)

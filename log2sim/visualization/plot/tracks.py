@@ -10,30 +10,10 @@ import matplotlib
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
-from log2sim.visualization.plot import drawing
+from log2sim.visualization.plot import drawing, layers, selection
 from log2sim.visualization.plot.encoding import FilmFile, choose_film_file
-from log2sim.visualization.plot.layers import (
-    NO_OVERLAYS,
-    Overlays,
-    PredictedPaths,
-    draw_observers,
-    draw_predictions,
-    draw_warnings,
-    tells_ends,
-    warned_places,
-)
 from log2sim.visualization.plot.layout import FigureLayout, draw_labels
 from log2sim.visualization.plot.scene import draw_base, draw_moving
-from log2sim.visualization.plot.selection import (
-    MOVING,
-    NO_OPTIONS,
-    STILL,
-    PlotOptions,
-    choose_span,
-    cut_replay,
-    cut_scenario,
-    select_shown,
-)
 from log2sim.visualization.plot.viewport import AgentRoles, assign_view_roles
 
 
@@ -46,7 +26,7 @@ def plot_tracks(
     background: drawing.Background | None = None,
     predict_s: float | None = None,
     title: str | None = None,
-    options: PlotOptions = NO_OPTIONS,
+    options: selection.PlotOptions = selection.NO_OPTIONS,
     overwrite: bool = False,
     dpi: int = 200,
     progress: Any = lambda stage, done, total: None,
@@ -68,20 +48,15 @@ def plot_tracks(
     options.require_fits(suffix, film.path.name)
     refuse_existing(film.path, overwrite=overwrite)
     whole = scenario
-    scenario, replay = select_shown(scenario, replay, options)
-    span = choose_span(scenario, options)
-    overlays = Overlays(
-        replay=cut_replay(replay, span, scenario),
-        truth=None if truth is None else cut_scenario(truth.aligned_to(scenario), span),
-        background=background,
-        predicted=None if predict_s is None else PredictedPaths(scenario, predict_s),
-        title=title,
-        span=span,
-        options=options,
-    )
-    scenario = cut_scenario(scenario, span)
+    scenario, replay = selection.select_shown(scenario, replay, options)
+    span = selection.choose_span(scenario, options)
+    shown_truth = None if truth is None else selection.cut_scenario(truth.aligned_to(scenario), span)
+    predicted = None if predict_s is None else layers.PredictedPaths(scenario, predict_s)
+    shown_replay = selection.cut_replay(replay, span, scenario)
+    overlays = layers.Overlays(shown_replay, shown_truth, background, predicted, title, span, options)
+    scenario = selection.cut_scenario(scenario, span)
     roles = assign_view_roles(scenario, whole)
-    if suffix in MOVING:
+    if suffix in selection.MOVING:
         from log2sim.visualization.plot.animation import write_animation
 
         write_animation(scenario, roles, film, overlays, progress)
@@ -91,17 +66,17 @@ def plot_tracks(
     return film.path
 
 
-def still(scenario: Scenario, roles: AgentRoles, overlays: Overlays = NO_OVERLAYS) -> FigureLayout:
+def still(scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays = layers.NO_OVERLAYS) -> FigureLayout:
     """Draw a still picture."""
-    base = draw_base(scenario, roles, overlays)
-    layout, ax, replay = base.layout, base.layout.ax, overlays.replay
-    draw_moving(ax, roles, layout.view, base.step_s, truth=overlays.truth, replay=replay, ghosts=True)
-    if tells_ends(scenario):
-        draw_observers(ax, roles, layout.view)
-    draw_warnings(ax, warned_places(replay))
+    layout, step_s, _, labels = draw_base(scenario, roles, overlays)
+    ax, replay = layout.ax, overlays.replay
+    draw_moving(ax, roles, layout.view, step_s, truth=overlays.truth, replay=replay, ghosts=True)
+    if layers.tells_ends(scenario):
+        layers.draw_observers(ax, roles, layout.view)
+    layers.draw_warnings(ax, replay)
     if overlays.predicted is not None:
-        draw_predictions(ax, roles, overlays.predicted)
-    draw_labels(ax, base.labels)
+        layers.draw_predictions(ax, roles, overlays.predicted)
+    draw_labels(ax, labels)
     if overlays.options.size_px is not None:
         layout.set_width_px(overlays.options.size_px[0])
     return layout
@@ -113,21 +88,17 @@ def resolve_picture(requested: Path) -> FilmFile:
     Raises `ConfigError` when no picture ends in its suffix.
     """
     suffix = requested.suffix.lower()
-    if suffix not in STILL + MOVING:
+    if suffix not in selection.STILL + selection.MOVING:
         raise ConfigError(
-            f"{requested}: a picture's name must end in {', '.join(STILL)} (still) or {', '.join(MOVING)} (moving), "
+            f"{requested}: a picture's name must end in {', '.join(selection.STILL)} (still) or {', '.join(selection.MOVING)} (moving), "
             f"not in '{requested.suffix}'"
         )
     return choose_film_file(requested) if suffix in (".mp4", ".webm") else FilmFile(requested)
 
 
 def _save(layout: FigureLayout, path: Path, dpi: float) -> None:
-    suffix = path.suffix.lower()
     # The same scenario gives the same bytes: no random element names, no dates.
-    metadata: dict[str, dict[str, Any]] = {
-        ".svg": {"Date": None},
-        ".pdf": {"CreationDate": None},
-        ".png": {"Software": None},
-    }
+    kind = path.suffix.lower().removeprefix(".")
+    left_out: Any = {{"svg": "Date", "pdf": "CreationDate", "png": "Software"}[kind]: None}
     with replaced(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
-        layout.figure.savefig(temporary, format=suffix[1:], dpi=dpi, metadata=metadata[suffix])
+        layout.figure.savefig(temporary, format=kind, dpi=dpi, metadata=left_out)

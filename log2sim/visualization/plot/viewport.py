@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.geometry import Array, box_corners_bev
-from log2sim.visualization.plot.style import CROWD_COLOR, INK, PALETTE
+from log2sim.visualization.plot.style import CROWD_COLOR, INK, MARKERS, PALETTE
 
 MIN_MOVING_M = 1.0  # an agent is stationary when the bounding box of its trajectory has a shorter diagonal
 
@@ -30,9 +29,9 @@ class AgentRole:
         return self.agent.id == "ego"
 
     @property
-    def group(self) -> str:
-        """Return the group of its category."""
-        return GROUP_OF[self.agent.category]
+    def marker(self) -> str:
+        """Return the marker of its group of categories."""
+        return MARKERS[GROUP_OF[self.agent.category]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class AgentRoles:
     stationary: tuple[Agent, ...]
 
 
-def assign_view_roles(scenario: Scenario, whole: Scenario | None = None, max_leading: int = len(PALETTE)) -> AgentRoles:
+def assign_view_roles(scenario: Scenario, whole: Scenario | None = None) -> AgentRoles:
     """Split agents into movers and static ones; movers by closest approach to the ego, without one by distance driven.
 
     Where `scenario` is a part of a `whole` one, its agents keep their colors of the whole: those of every picture, film and page.
@@ -52,7 +51,7 @@ def assign_view_roles(scenario: Scenario, whole: Scenario | None = None, max_lea
     rank = {agent.id: k for k, agent in enumerate(movers if whole is None else _ranked(whole))}
     roles = [] if scenario.ego is None else [AgentRole(scenario.ego, INK, True)]
     for k, agent in enumerate(movers):
-        leading = k < max_leading
+        leading = k < len(PALETTE)
         color = PALETTE[rank.get(agent.id, k) % len(PALETTE)] if leading else CROWD_COLOR
         roles.append(AgentRole(agent, color, leading))
     return AgentRoles(tuple(roles), tuple(a for a in scenario.others if not is_moving(a)))
@@ -61,8 +60,13 @@ def assign_view_roles(scenario: Scenario, whole: Scenario | None = None, max_lea
 def _ranked(scenario: Scenario) -> list[Agent]:
     """Return the agents that move but the ego, the most important first."""
     ego, moving = scenario.ego, [a for a in scenario.others if is_moving(a)]
-    if ego is not None:
-        key = {a.id: _closest_m(a, ego) for a in moving}
+
+    def some(agent: Agent) -> Array:
+        xy = centers_xy(agent)
+        return np.asarray(xy[np.linspace(0, len(xy) - 1, 24).round().astype(int)])
+
+    if ego is not None:  # by the shortest distance between a few points of both trajectories
+        key = {a.id: float(np.hypot(*(some(a)[:, None] - some(ego)).transpose(2, 0, 1)).min()) for a in moving}
     else:
         key = {a.id: -float(np.ptp(centers_xy(a), axis=0).sum()) for a in moving}
     return sorted(moving, key=lambda a: (key[a.id], a.id))
@@ -76,12 +80,6 @@ def is_moving(agent: Agent) -> bool:
 def centers_xy(agent: Agent) -> Array:
     """Return the box centers (T, 2), m, map frame."""
     return np.column_stack([agent.waypoints.x_m, agent.waypoints.y_m])
-
-
-def _closest_m(agent: Agent, ego: Agent, samples: int = 24) -> float:
-    """Compute the shortest distance, m, between a few points of two trajectories."""
-    a, b = (p[np.linspace(0, len(p) - 1, samples).round().astype(int)] for p in (centers_xy(agent), centers_xy(ego)))
-    return float(np.min(np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1))))
 
 
 def paint_of(agent: Agent, otherwise: Any) -> Any:
@@ -120,19 +118,14 @@ class Viewport:
     def fitted(self, width_pt: float, height_pt: float) -> Viewport:
         """Widen the view about its center so that it fills axes of this size at equal aspect."""
         m_per_pt = max(self.width_m / width_pt, self.height_m / height_pt)
-        cx, cy, w, h = (
-            (self.x0 + self.x1) / 2,
-            (self.y0 + self.y1) / 2,
-            width_pt * m_per_pt / 2,
-            height_pt * m_per_pt / 2,
-        )
+        (cx, w), (cy, h) = ((self.x0 + self.x1) / 2, width_pt), ((self.y0 + self.y1) / 2, height_pt)
+        w, h = w * m_per_pt / 2, h * m_per_pt / 2
         return Viewport(cx - w, cx + w, cy - h, cy + h, m_per_pt)
 
-    def contains(self, xy_m: Array, margin_m: float = 0.0) -> np.ndarray:
+    def contains(self, xy_m: Array) -> NDArray[np.bool_]:
         """Mark (N,) the points (N, 2) inside."""
         x, y = xy_m[:, 0], xy_m[:, 1]
-        inside_x = (x >= self.x0 - margin_m) & (x <= self.x1 + margin_m)
-        return inside_x & (y >= self.y0 - margin_m) & (y <= self.y1 + margin_m)
+        return (x >= self.x0) & (x <= self.x1) & (y >= self.y0) & (y <= self.y1)
 
 
 def choose_viewport(roles: AgentRoles) -> Viewport:
@@ -229,29 +222,15 @@ def stripes(corners: Array, spacing_m: float) -> Array:
     return lines
 
 
-def contiguous_runs(keep: NDArray[np.bool_]) -> Iterator[slice]:
-    """Yield slices over points of a track, one for each run of kept segments `keep` (T - 1,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))
-    for start, stop in zip(edges[::2], edges[1::2]):
-        yield slice(int(start), int(stop) + 1)
-
-
-def observed_and_filled(agent: Agent) -> tuple[list[Array], list[Array]]:
-    """Split a track into polylines of its observed parts and of its filled gaps."""
-    xy, observed = centers_xy(agent), agent.waypoints.observed
-    both = observed[:-1] & observed[1:]
-    return [xy[s] for s in contiguous_runs(both)], [xy[s] for s in contiguous_runs(~both)]
-
-
-def arrows(xy_m: Array, view: Viewport, spacing_pt: float = 110.0, size_pt: float = 4.2) -> list[Array]:
-    """Compute arrowheads (4, 2) along positions (T, 2) in the direction of travel, one every `spacing_pt` points."""
+def arrows(xy_m: Array, view: Viewport) -> list[Array]:
+    """Compute arrowheads (4, 2) along positions (T, 2) in the direction of travel, one every 110 points."""
     steps = np.hypot(*np.diff(xy_m, axis=0).T)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     length = arc[-1] / view.m_per_pt
     if length < 26:
         return []
-    count = min(max(1, round(length / spacing_pt)), MAX_ARROWS)
-    size = size_pt * view.m_per_pt
+    count = min(max(1, round(length / 110.0)), MAX_ARROWS)
+    size = 4.2 * view.m_per_pt
     out = []
     for fraction in (np.arange(count) + 0.5) / count:
         at = fraction * arc[-1]
@@ -273,9 +252,8 @@ def time_marks(agent: Agent, step_s: float) -> tuple[Array, Array]:
     """Return the multiples (K,) of `step_s` within an agent's trajectory and its positions (K, 2) at them."""
     w = agent.waypoints
     t = np.arange(np.ceil(w.t_s[0] / step_s - 1e-9), np.floor(w.t_s[-1] / step_s + 1e-9) + 1) * step_s
-    state = agent.at(t) if len(t) else None
-    xy = np.zeros((0, 2)) if state is None else np.column_stack([state.x_m, state.y_m])
-    return t, xy
+    at = agent.at(t) if len(t) else None
+    return t, np.zeros((0, 2)) if at is None else np.column_stack([at.x_m, at.y_m])
 
 
 def spaced_apart(xy_m: Array, ends_m: Array, apart_m: float) -> NDArray[np.bool_]:

@@ -1,6 +1,4 @@
-"""Scores tracking results against KITTI's labels: CLEAR MOT, sAMOTA/AMOTA/AMOTP over 40 recalls and HOTA, on 3D boxes.
-
-    python tools/evaluate_kitti.py --results DIR --labels DIR [--categories Car,Pedestrian,Cyclist] [--iou 0.25] [--out FILE.json]
+"""Scores of tracks against KITTI's labels: CLEAR MOT, sAMOTA/AMOTA/AMOTP over 40 recalls and HOTA, on 3D boxes.
 
 Notes
 -----
@@ -12,27 +10,21 @@ of its scores; MOTA and the counts are those at the threshold with the highest M
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from kitti.boxes import Boxes, read_tracks
-from kitti.map import Index, Matcher, Scene, make_scene
 
-from log2sim.errors import Log2SimError
-from log2sim.evaluation.metrics.comparison import AgentPairs
+from kitti.boxes import Boxes, Index, Mask, in_areas, is_ignorable, is_small, overlap_3d, same_frame, with_neighbors
+from log2sim.evaluation.metrics.comparison import AgentPairs, assign
 from log2sim.evaluation.metrics.evaluator import hota
 from log2sim.geometry import Array
 
-RECALL_STEPS = 40
+RECALL_STEPS, IOU = 40, 0.25
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """Figures of one category, in percent where the name has no count."""
 
     samota: float
@@ -41,13 +33,10 @@ class Score:
     mota: float
     motp: float
     hota: float
-    det_a: float
-    ass_a: float
     id_switches: int
     fragments: int
     false_positives: int
     false_negatives: int
-    threshold: float
 
 
 @dataclass(frozen=True)
@@ -81,13 +70,95 @@ class Counts:
         return float(np.clip(1 - (self._errors - (1 - recall) * self.truths) / (recall * self.truths), 0, 1))
 
 
-def evaluate(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], category: str, *, iou: float = 0.25) -> Score:
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All sequences of one category, one after the other on one axis of frames, with what of each other overlaps.
+
+    `truth`, `found` are boxes whose `track_id` is an index; `ignorable` (A,) labels that need not be found, `excused` (B,)
+    found boxes that are no error; `row`, `col`, `iou` (P,) are the pairs that overlap at all, by frame, `near` (P,) those that
+    may match. `score` (B,) is the mean over the track.
+    """
+
+    truth: Boxes
+    found: Boxes
+    ignorable: Mask
+    excused: Mask
+    score: Array
+    row: Index
+    col: Index
+    iou: Array
+    near: Mask
+
+
+def make_scene(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], category: str) -> Scene:
+    """Line the sequences up; sequences without results count as missed altogether."""
+    truths, founds, areas, begin = [], [], [], 0
+    for k, name in enumerate(sorted(labels)):
+        label = _shifted(labels[name], begin, k)
+        truths.append(label.take(np.isin(label.category, with_neighbors(category))))
+        areas.append(label.take(label.category == "DontCare"))
+        end = int(label.frame.max(initial=begin - 1)) + 1
+        if name in results:
+            found = _shifted(results[name], begin, k)
+            founds.append(found.take((found.category == category) & (found.frame < end)))
+        begin = end
+    truth, area = Boxes.join(truths), Boxes.join(areas)
+    found = Boxes.join(founds) if founds else truth.take(slice(0, 0))
+    truth, found = _in_order(truth), _in_order(found)
+    ignorable = is_ignorable(truth, category)
+    count = np.bincount(found.track_id)
+    mean = np.bincount(found.track_id, weights=found.score) / np.maximum(count, 1)
+    row, col = same_frame(truth, found, reach_m=True)
+    overlap = overlap_3d(truth.take(row), found.take(col))
+    touching = overlap > 0
+    row, col, overlap = row[touching], col[touching], overlap[touching]
+    return Scene(
+        truth, found, ignorable, is_small(found) | in_areas(found, area), mean[found.track_id] if len(found) else np.zeros(0),
+        row, col, overlap, overlap >= IOU,
+    )  # fmt: skip
+
+
+def _shifted(boxes: Boxes, begin: int, sequence: int) -> Boxes:
+    columns = {**vars(boxes), "frame": boxes.frame + begin, "track_id": boxes.track_id + sequence * 10_000_000}
+    return Boxes(**columns)
+
+
+def _in_order(boxes: Boxes) -> Boxes:
+    boxes = boxes.take(np.lexsort([boxes.track_id, boxes.frame]))
+    _, index = np.unique(boxes.track_id, return_inverse=True)
+    return Boxes(**{**vars(boxes), "track_id": index.astype(np.int64)})
+
+
+class Matcher:
+    """Assignment of found boxes to labels at any threshold; frames whose candidates are the same are solved once."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        frame = scene.truth.frame[scene.row]
+        cuts = np.flatnonzero(np.diff(frame)) + 1
+        self.spans = list(zip(np.r_[0, cuts], np.r_[cuts, len(frame)])) if len(frame) else []
+        self.known: dict[tuple[int, bytes], Index] = {}
+
+    def match(self, threshold: float) -> Index:
+        """Row of the found box of every label (A,), -1 for none: most pairs, then the greatest overlap, frame by frame."""
+        match = np.full(len(self.scene.truth), -1, dtype=np.int64)
+        keep = self.scene.near & (self.scene.score[self.scene.col] >= threshold)
+        for a, b in self.spans:
+            key = (a, keep[a:b].tobytes())
+            if key not in self.known:
+                rows = a + np.flatnonzero(keep[a:b])
+                # One more pair must always be worth more than any overlap.
+                self.known[key] = rows[
+                    assign(self.scene.row[rows], self.scene.col[rows], len(rows) + self.scene.iou[rows])
+                ]
+            chosen = self.known[key]
+            match[self.scene.row[chosen]] = self.scene.col[chosen]
+        return match
+
+
+def evaluate(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], category: str) -> Score:
     """Score one category over all sequences that are labeled."""
-    return score_scene(make_scene(results, labels, category, iou=iou))
-
-
-def score_scene(scene: Scene) -> Score:
-    """All figures of a lined-up scene."""
+    scene = make_scene(results, labels, category)
     matcher = Matcher(scene)
     everything = matcher.match(-np.inf)
     matched = np.flatnonzero(everything >= 0)
@@ -96,23 +167,12 @@ def score_scene(scene: Scene) -> Score:
     counts = [count(scene, matcher.match(t), t) for t, _ in steps]
     best = max(range(len(steps)), key=lambda k: counts[k].mota, default=None)
     threshold = steps[best][0] if best is not None else np.inf
-    at_best = count(scene, matcher.match(threshold), threshold)
-    higher_order = _hota(scene, matcher.match(threshold), threshold)
-    return Score(
-        samota=100 * sum(c.smota(r) for c, (_, r) in zip(counts, steps)) / RECALL_STEPS,
-        amota=100 * sum(c.mota for c in counts) / RECALL_STEPS,
-        amotp=100 * sum(c.motp for c in counts) / RECALL_STEPS,
-        mota=100 * at_best.mota,
-        motp=100 * at_best.motp,
-        hota=100 * higher_order[0],
-        det_a=100 * higher_order[1],
-        ass_a=100 * higher_order[2],
-        id_switches=at_best.id_switches,
-        fragments=at_best.fragments,
-        false_positives=at_best.false_positives,
-        false_negatives=at_best.false_negatives,
-        threshold=float(threshold),
-    )
+    match = matcher.match(threshold)
+    at_best = count(scene, match, threshold)
+    sums = sum(c.smota(r) for c, (_, r) in zip(counts, steps)), sum(c.mota for c in counts), sum(c.motp for c in counts)
+    shares = [*(v / RECALL_STEPS for v in sums), at_best.mota, at_best.motp, _hota(scene, match, threshold)]
+    errors = at_best.id_switches, at_best.fragments, at_best.false_positives, at_best.false_negatives
+    return Score(*(100 * float(v) for v in shares), *errors)
 
 
 def recall_thresholds(scores: Array, truths: int) -> list[tuple[float, float]]:
@@ -177,8 +237,8 @@ def _breaks(scene: Scene, match: Index) -> tuple[int, int]:
     return switches, fragments
 
 
-def _hota(scene: Scene, match: Index, threshold: float) -> tuple[float, float, float]:
-    """HOTA, DetA, AssA over the labels that count and the found boxes that are neither excused nor on others."""
+def _hota(scene: Scene, match: Index, threshold: float) -> float:
+    """HOTA over the labels that count and the found boxes that are neither excused nor on others."""
     there = scene.score >= threshold
     on_ignorable = np.zeros(len(scene.found), dtype=bool)
     on_ignorable[match[scene.ignorable & (match >= 0)]] = True
@@ -196,44 +256,4 @@ def _hota(scene: Scene, match: Index, threshold: float) -> tuple[float, float, f
         1 - scene.iou, scene.iou, np.ones(len(scene.iou), dtype=bool),
     )  # fmt: skip
     result = hota(pairs, truth_there, other_there)
-    return (result.hota, result.det_a, result.ass_a) if result else (0.0, 0.0, 0.0)
-
-
-def table(scores: Mapping[str, Score]) -> str:
-    """The figures as lines of text, one a category."""
-    head = f"{'':<12}{'sAMOTA':>8}{'AMOTA':>8}{'AMOTP':>8}{'MOTA':>8}{'MOTP':>8}{'HOTA':>8}{'IDS':>6}{'FRAG':>6}{'FP':>7}{'FN':>7}"
-    lines = [
-        f"{name:<12}{s.samota:>8.2f}{s.amota:>8.2f}{s.amotp:>8.2f}{s.mota:>8.2f}{s.motp:>8.2f}{s.hota:>8.2f}"
-        f"{s.id_switches:>6}{s.fragments:>6}{s.false_positives:>7}{s.false_negatives:>7}"
-        for name, s in scores.items()
-    ]
-    return "\n".join([head, *lines])
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--results", type=Path, required=True)
-    parser.add_argument("--labels", type=Path, required=True)
-    parser.add_argument("--categories", default="Car,Pedestrian,Cyclist")
-    parser.add_argument("--iou", type=float, default=0.25)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args(arguments)
-    try:
-        results = {p.stem: read_tracks(p) for p in sorted(options.results.glob("*.txt"))}
-        labels = {name: read_tracks(options.labels / f"{name}.txt") for name in results}
-    except Log2SimError as problem:
-        print(f"error: {problem}", file=sys.stderr)
-        return 3
-    if not results:
-        print(f"error: {options.results}: no files NNNN.txt with results", file=sys.stderr)
-        return 3
-    scores = {c: evaluate(results, labels, c, iou=options.iou) for c in options.categories.split(",")}
-    print(table(scores))
-    if options.out:
-        options.out.write_text(json.dumps({c: asdict(s) for c, s in scores.items()}, indent=1), encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return float(result["hota"] or 0.0)
