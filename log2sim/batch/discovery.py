@@ -44,7 +44,9 @@ def find_logs(
     names = plugins.names("log") if format == "auto" else [format]
     readers: dict[str, Reader] = {name: plugins.load("log", name) for name in names}
     if root.is_file():
-        found = _logs_of_file(root, format)
+        name = find_reader(root) if format == "auto" else format
+        reader: Reader = plugins.load("log", name)
+        found = [FoundLog(_text(sequence), root, name, sequence) for sequence in reader.sequences(root)]
     else:
         left_out = None if leave_out is None else leave_out.resolve()
         found = _Search(root, readers, left_out, max_folders).below(root, MAX_LEVELS)
@@ -52,12 +54,6 @@ def find_logs(
         kind = "of any format" if format == "auto" else f"of format '{format}'"
         raise LogError(f"{root}: holds no log {kind}, down to {MAX_LEVELS} folders below it")
     return sorted(found, key=lambda log: (log.id, log.format))
-
-
-def _logs_of_file(root: Path, format: str) -> list[FoundLog]:
-    name = find_reader(root) if format == "auto" else format
-    reader: Reader = plugins.load("log", name)
-    return [FoundLog(_text(sequence), root, name, sequence) for sequence in reader.sequences(root)]
 
 
 class _Search:
@@ -75,12 +71,20 @@ class _Search:
             )
         self._seen.add(folder.resolve())
         held = self._held(folder)
-        itself = next((name for name, sequences in held.items() if _is_one_log(folder, sequences)), None)
-        if itself is not None:
-            return [self._log(folder, itself, held[itself][0])]
+        own_name = folder.resolve().name
+        for name, sequences in held.items():  # a log itself, rather than a folder that holds some
+            if sequences == [own_name] and not (folder / own_name).is_dir():
+                return [self._log(folder, name, own_name)]
         folders, stems = self._entries(folder)
         deeper = [log for child in folders for log in self.below(child, levels - 1)] if levels else []
-        known = {(log.format, name) for log in deeper for name in _names_from(folder, log, stems)}
+        # Names under which a reader may list a log that lies deeper, when it is asked for those of this folder. A file here
+        # that has the name, with any suffix, is a log of its own.
+        known = {
+            (log.format, name)
+            for log in deeper
+            for place in (log.path.relative_to(folder).as_posix(),)
+            for name in (place, f"{place}/{log.sequence}", *({log.sequence} - stems))
+        }
         own = [
             (name, s) for name, sequences in held.items() for s in sequences if (name, s) not in known and s[0] != "."
         ]
@@ -117,21 +121,6 @@ class _Search:
         name = sequence.rpartition("/")[2]
         is_itself = bool(parts) and folder.name == name
         return FoundLog(_text("/".join(parts if is_itself else (*parts, sequence))), folder, format, sequence)
-
-
-def _is_one_log(folder: Path, sequences: list[str]) -> bool:
-    """Return whether a folder is a log, rather than one that holds some."""
-    name = folder.resolve().name
-    return sequences == [name] and not (folder / name).is_dir()
-
-
-def _names_from(folder: Path, log: FoundLog, stems: set[str]) -> list[str]:
-    """Return under which names a reader may list a log that lies deeper, when it is asked for those of a folder above.
-
-    A file of the folder that has the name, with any suffix, is a log of its own.
-    """
-    place = log.path.relative_to(folder).as_posix()
-    return [place, f"{place}/{log.sequence}", *([] if log.sequence in stems else [log.sequence])]
 
 
 def _text(name: str) -> str:

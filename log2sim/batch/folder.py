@@ -116,19 +116,12 @@ IDENTITY = ("name", "log", "format", "sequence")
 
 def done_row(job: Job, report: dict[str, Any], spent: dict[str, Any]) -> Row:
     """Return the row of a log that was reconstructed, with what it took: `seconds`, `cpu_s` and `peak_memory_mib`."""
-    agents = report["agents"]
+    agents, unreadable = report["agents"], sum(stream["count"] for stream in report["unreadable"].values())
     return Row(
-        **_identity(job),
-        status="done",
-        ticks=report["ticks"],
-        duration_s=round(report["duration_s"], 6),
-        agents=agents["total"],
-        static=agents["static"],
-        doubtful=len(agents["doubtful"]),
-        faults=len(report["faults"]),
-        unreadable=sum(stream["count"] for stream in report["unreadable"].values()),
-        **spent,
-    )
+        **_identity(job), status="done", ticks=report["ticks"], duration_s=round(report["duration_s"], 6),
+        agents=agents["total"], static=agents["static"], doubtful=len(agents["doubtful"]), faults=len(report["faults"]),
+        unreadable=unreadable, **spent,
+    )  # fmt: skip
 
 
 def failed_row(job: Job, kind: str, message: str, spent: dict[str, Any] | None = None) -> Row:
@@ -150,18 +143,15 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    kinds = {int: pa.int64(), float: pa.float64(), str: pa.string()}
-    fields = [(name, kinds[_plain_type(field.annotation)]) for name, field in Row.model_fields.items()]
+    def kind_of(annotation: Any) -> pa.DataType:
+        parts = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)  # it may be absent
+        return pa.int64() if int in parts else pa.float64() if float in parts else pa.string()
+
+    fields = [(name, kind_of(field.annotation)) for name, field in Row.model_fields.items()]
     values = {name: [getattr(row, name) for row in rows] for name, _ in fields}
     table = pa.table(values, schema=pa.schema(fields))
     with replaced(path) as temporary:
         parquet.write_table(table, temporary)
-
-
-def _plain_type(annotation: Any) -> type:
-    """Return the type of the values of a field, where it may be absent or is one of several texts."""
-    parts = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-    return next((kind for kind in (int, float) if kind in parts), str)
 
 
 def sum_up(rows: Sequence[Row]) -> dict[str, float]:
@@ -199,14 +189,9 @@ class BatchSettings(BaseModel):
     ) -> BatchSettings:
         """Return the settings of a new batch."""
         return cls(
-            replay=replay,
-            token=secrets.token_hex(TOKEN_BYTES),
-            log2sim_version=__version__,
-            root=str(root.resolve()),
-            format=format,
-            follow_links=follow_links,
-            config=config.to_dict(),
-        )
+            replay=replay, token=secrets.token_hex(TOKEN_BYTES), log2sim_version=__version__, root=str(root.resolve()),
+            format=format, follow_links=follow_links, config=config.to_dict(),
+        )  # fmt: skip
 
     def differences(self, other: BatchSettings) -> list[str]:
         """List the settings in which two batches differ, as "name: ours, theirs"."""

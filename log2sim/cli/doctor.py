@@ -1,4 +1,4 @@
-"""What is installed, what is missing, and whether it works."""
+"""What is installed and missing, set and kept, and the cookbook."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import platform
+import re
 import shutil
 import sys
 import tomllib
@@ -13,13 +14,20 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from packaging.requirements import InvalidRequirement, Requirement
 
 from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
-from log2sim.errors import Log2SimError, install_command
+from log2sim.errors import ConfigError, Log2SimError, install_command
+from log2sim.files.plugins import nearest
 from log2sim.version import __version__
+
+if TYPE_CHECKING:
+    from log2sim.files.cache import DiskCache
+
 
 MIN_PYTHON = (3, 11)
 BROKEN_CODE = 5  # as where an extra is missing: something has to be installed
@@ -227,3 +235,110 @@ def _describe(found: Installation) -> list[str]:
     lines += ["", "extras", *format_rows(states, indent=2)]
     lines += ["", "to add one:", *(f"  {extra.install}" for extra in absent)] if absent else []
     return [*lines, "", "nothing needed is missing" if not found.broken else f"{len(found.broken)} problems"]
+
+
+def config(file: opt.ConfigFile = None, settings: opt.Settings = None) -> None:
+    """Print all settings as TOML.
+
+    Each with its meaning, unit, choices and default; with --config or --set, the values that these give.
+
+    Examples
+    --------
+    log2sim config
+    log2sim config --set smooth.enabled=false
+    """
+    from log2sim.config import Config
+
+    opt.say(Config.load(file, settings or ()).to_toml(comments=True).rstrip())
+
+
+def cache(
+    clear: Annotated[bool, opt.option("Remove all that is kept.", None, "--clear")] = False,
+    max_mb: Annotated[int | None, opt.option(
+        "Size of the cache from now on, for all runs; what was not used for longest is dropped. At first 2048.", "MB",
+        default="as it is", min=0, max=2**30)] = None,
+    as_json: opt.AsJson = False,
+) -> None:  # fmt: skip
+    """Show what is kept of earlier runs, so that nothing is detected and measured twice; limit it or remove it.
+
+    The environment variable LOG2SIM_CACHE moves the folder.
+
+    Examples
+    --------
+    log2sim cache
+    log2sim cache --max-mb 8192
+    """
+    import json
+
+    from log2sim.files.cache import DiskCache, detection_folder
+
+    store = DiskCache(detection_folder())
+    if max_mb is not None:
+        store.set_limit(max_mb)
+    removed = store.clear() if clear else None
+    if as_json:
+        opt.say(json.dumps(summarize_cache(store), indent=2))
+    elif removed is not None:
+        opt.say(f"{store.folder}: {opt.counted(removed, 'part')} removed")
+    else:
+        opt.say("\n".join(describe_cache(summarize_cache(store))))
+
+
+def summarize_cache(store: DiskCache) -> dict[str, Any]:
+    """Return the folder and the size of a cache, the parts of logs by detector, and what the last run took from it."""
+    usage, last = store.usage(), store.last_run
+    detectors = [
+        {"name": group.rpartition(".")[0], "parts": count, "bytes": size}
+        for group, (count, size) in sorted(usage.items(), key=lambda item: (-item[1][0], item[0]))
+    ]
+    found, kept = last.get("found"), last.get("kept")
+    return {
+        "folder": str(store.folder), "max_mb": store.max_mb, "bytes": sum(size for _, size in usage.values()),
+        "parts": sum(count for count, _ in usage.values()), "detectors": detectors,
+        "last_run": {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None,
+    }  # fmt: skip
+
+
+def describe_cache(found: dict[str, Any]) -> list[str]:
+    """Describe a cache in lines for people."""
+    sizes = [f"{entry['bytes'] / 1024**2:.1f}" for entry in (found, *found["detectors"])]
+    rows = [
+        ("folder", found["folder"]),
+        ("size", f"{sizes[0]} of at most {found['max_mb']} MB"),
+        ("parts of logs", str(found["parts"])),
+        *(("", f"{d['parts']} by {d['name']}, {size} MB") for d, size in zip(found["detectors"], sizes[1:])),
+    ]
+    last = found["last_run"]
+    if last is not None:
+        rows.append(("last run", f"{opt.counted(last['found'], 'tick')} known, {last['kept']} kept"))
+    return format_rows(rows)
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each page by its topic; in a wheel they lie in the package, in a checkout in its samples."""
+    package = Path(__file__).parents[1]
+    folder = package / "cookbook" if (package / "cookbook").is_dir() else package.parent / "samples/cookbook"
+    return {page.stem: page.read_text(encoding="utf-8") for page in sorted(folder.glob("*.md"))}
+
+
+def help(
+    topic: Annotated[
+        str | None,
+        typer.Argument(help="Page to show; without one the pages are listed.", autocompletion=lambda: list(pages())),
+    ] = None,
+) -> None:
+    """Show a page of the cookbook: a task, its commands, and what can go wrong.
+
+    Examples
+    --------
+    log2sim help
+    log2sim help doubts
+    """
+    known = pages()
+    if topic is None:
+        opt.say("\n".join(f"{name:<11} {text.partition(chr(10))[0].lstrip('# ')}" for name, text in known.items()))
+        return
+    if topic not in known:
+        raise ConfigError(f"no page '{topic}'{nearest(topic, list(known))}; log2sim help lists them")
+    text = re.sub(r"^!\[.*\n\n?", "", known[topic].rstrip(), flags=re.MULTILINE)
+    opt.say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", text))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from typing import Annotated, Any, NoReturn
 
 import typer
 
+from log2sim.cli import change, doctor, evaluate, exchange, logs, reconstruct, show, simulate, situations
 from log2sim.cli.options import fail, printable, say
 from log2sim.cli.shared import (
     DEBUG,
@@ -64,13 +64,13 @@ def root(
         raise typer.Exit
 
 
-# Each is the function of its own name in the module of its name; "_" stands after what is a word of Python.
-for name in (
-    "reconstruct", "batch", "inspect", "validate", "convert", "detect", "evaluate", "bench", "plot", "view", "studio", "replay",
-    "predict", "edit", "resimulate", "correct", "tag", "find", "vary", "export", "synth", "config", "cache", "doctor",
-    "help", "import_", "test_", "map",
+for command in (
+    reconstruct.reconstruct, reconstruct.batch, logs.inspect, logs.validate, logs.convert, logs.detect, evaluate.evaluate,
+    evaluate.bench, show.plot, show.view, change.studio, simulate.replay, simulate.predict, change.edit, simulate.resimulate,
+    change.correct, situations.tag, situations.find, situations.vary, exchange.export, exchange.synth, doctor.config, doctor.cache,
+    doctor.doctor, doctor.help, exchange.import_, situations.test_, logs.map,
 ):  # fmt: skip
-    add_command(app, getattr(import_module(f"log2sim.cli.{name}"), name))
+    add_command(app, command)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Compare a scenario, or detected boxes, with the ground truth."""
+"""Comparisons with the ground truth: of a scenario or boxes, and of methods and settings."""
 
 from __future__ import annotations
 
@@ -11,9 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from log2sim.cli import options as opt
+from log2sim.cli.progress import progress
+from log2sim.errors import ConfigError, LogError, ScenarioError
+from log2sim.files.outputs import together
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Log, Scenario
+
 
 PROTOCOL = "center"
 MAX_LOGS = 20  # of a batch that are printed; the document has all
@@ -51,15 +55,12 @@ def evaluate(
     log2sim evaluate s.json --truth drive.bag --labels label_02.txt
     log2sim evaluate boxes.json --truth kitti_tracking/ --sequence 0000 --protocol kitti
     """
-    from log2sim.cli.progress import progress
     from log2sim.datatypes import Scenario
-    from log2sim.errors import ConfigError, ScenarioError
     from log2sim.evaluation.detection.boxes import is_boxes_document
     from log2sim.evaluation.metrics.evaluator import evaluate as run
     from log2sim.evaluation.metrics.table import format_table, format_verdict
     from log2sim.evaluation.metrics.truth import load_truth
     from log2sim.files.documents import check_targets, read_json, write_json
-    from log2sim.files.outputs import together
 
     check_targets(out, plot, overwrite=overwrite)
     wanted = list(opt.split_names(categories)) or None
@@ -104,7 +105,6 @@ def evaluate(
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
     """Return the provenance of poses: as stated by what is evaluated, or as requested."""
     from log2sim.config import PosesConfig
-    from log2sim.errors import ConfigError
 
     if requested is None or requested == "auto":
         return {} if made_with is None else {"poses": made_with}
@@ -154,8 +154,6 @@ def _batch_figures(
     """Compare all scenarios of a batch with the labels of their logs."""
     from log2sim.batch.evaluation import evaluate_batch, format_batch_table, format_batch_verdict
     from log2sim.batch.folder import BatchFolder, is_batch
-    from log2sim.cli.progress import progress
-    from log2sim.errors import LogError
     from log2sim.evaluation.metrics.truth import load_truth
 
     if not is_batch(path):
@@ -177,7 +175,6 @@ def _batch_figures(
 
 def _open_truth(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Log:
     """Open the log with the true boxes."""
-    from log2sim.errors import LogError
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import is_log_file, open_log
 
@@ -189,8 +186,6 @@ def _open_truth(path: Path, sequence: str | None, labels: Path | None, provenanc
 def _boxes_figures(
     path: Path, document: Any, options: dict[str, Any], truth: Callable[[], Log], *, quiet: bool, verbose: bool
 ) -> tuple[dict[str, Any], str]:
-    from log2sim.cli.progress import progress
-    from log2sim.errors import LogError
     from log2sim.evaluation.detection.boxes import DetectedBoxes
     from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes, format_table, format_verdict
 
@@ -203,3 +198,60 @@ def _boxes_figures(
     with progress(quiet=quiet) as report_progress:
         result = evaluate_boxes(detected, truth(), chosen, progress=partial(report_progress, "count points"))
     return result, format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
+
+
+def bench(
+    log: opt.LogPath,
+    out: Annotated[Path, opt.write_to("DIR", "Folder for bench.json and bench.png.")],
+    truth: Annotated[Path | None, opt.option(
+        "Ground truth: a scenario file or a log with labels; default: LOG, if it has labels.", "TRUTH")] = None,
+    detector: Annotated[list[str] | None, opt.option(
+        "Detector, see reconstruct; repeat the option to compare several.", "NAME|MODEL.onnx|labels",
+        completes=opt.complete_detectors)] = None,
+    format: opt.Format = "auto",
+    sequence: opt.SequenceName = None,
+    cameras: opt.Cameras = None,
+    range: opt.Range = None,
+    categories: opt.Categories = None,
+    start: opt.Start = None,
+    stop: opt.Stop = None,
+    config: opt.ConfigFile = None,
+    settings: opt.Settings = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Compare methods and settings by error and run time.
+
+    Examples
+    --------
+    log2sim bench samples/crossing -o bench/
+    log2sim bench samples/crossing --detector labels --detector lidar:vehicle -o bench/
+    """
+    from log2sim.evaluation.bench.benchmark import bench as run
+    from log2sim.evaluation.bench.benchmark import bench_document, format_benchmark, write_picture
+    from log2sim.evaluation.bench.scores import ScoreScope
+    from log2sim.evaluation.metrics.truth import truth_at
+    from log2sim.files.documents import check_targets, write_json
+    from log2sim.localization.choice import localize
+    from log2sim.logs.opening import open_log
+
+    check_targets(out / "bench.json", out / "bench.png", overwrite=overwrite)
+    names = None if cameras is None else opt.camera_names(cameras)
+    first = detector[0] if detector else None
+    chosen = opt.load_config(config, settings, detector=first, cameras=names, start_s=start, stop_s=stop)
+    opened = open_log(log, format=format, sequence=sequence)
+    opened, choice = localize(opened, chosen)
+    labeled = opened.labels is not None or (log / "truth.json").is_file()
+    made = {"poses": choice.to_provenance()}
+    used = chosen.cameras or tuple(opened.cameras)
+    known = truth_at(truth or log, used, sequence, provenance=made) if truth is not None or labeled else None
+    scope = ScoreScope(range, opt.split_names(categories) or None)
+    with progress(quiet=quiet) as report_progress:
+        result = run(
+            opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=report_progress
+        )
+    with together():
+        write_json(out / "bench.json", bench_document(result))
+        write_picture(result, out / "bench.png")
+    opt.say(format_benchmark(result), quiet=quiet)
+    opt.report_written(out / "bench.json", out / "bench.png", quiet=quiet)

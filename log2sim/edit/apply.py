@@ -50,14 +50,6 @@ def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]
     return collisions
 
 
-@dataclass(frozen=True)
-class PeakValue:
-    """The largest value of a quantity, and its time."""
-
-    value: float
-    t_s: float
-
-
 def _undrivable(before: Scenario, after: Scenario, changed: Sequence[Agent]) -> Iterator[str]:
     """Yield the agents that their vehicle model cannot keep on the edited path, though it could on that of the source."""
     moving = tuple(a for a in changed if not a.static and GROUP_OF[a.category] != "pedestrian")
@@ -86,33 +78,33 @@ def _infeasible(before: Agent | None, after: Agent) -> Iterator[str]:
         ("acceleration", peak_acceleration, MAX_ACCEL_MPS2, "m/s2"),
         ("curvature", peak_curvature, curvature_limit, "1/m"),
     ):
-        peak = peak_of(after)
-        known = 0.0 if before is None else peak_of(before).value
-        if peak.value > max(limit, known) * RELATIVE_TOLERANCE:
-            yield f"agent '{after.id}': {what} {peak.value:.3g} {unit} at {peak.t_s:.2f} s, limit {limit:g} {unit}"
+        peak, t_s = peak_of(after)
+        known = 0.0 if before is None else peak_of(before)[0]
+        if peak > max(limit, known) * RELATIVE_TOLERANCE:
+            yield f"agent '{after.id}': {what} {peak:.3g} {unit} at {t_s:.2f} s, limit {limit:g} {unit}"
 
 
-def peak_acceleration(agent: Agent) -> PeakValue:
-    """Return the largest acceleration in m/s2, longitudinal and lateral combined, between two waypoints."""
+def peak_acceleration(agent: Agent) -> tuple[float, float]:
+    """Return the largest acceleration in m/s2, longitudinal and lateral combined, between two waypoints, and its time."""
     w = agent.waypoints
     span, speed = np.diff(w.t_s), (w.speed_mps[1:] + w.speed_mps[:-1]) / 2
     _, turn = chords(w)
     return _peak(w.t_s, np.hypot(np.diff(w.speed_mps), speed * turn) / span)
 
 
-def peak_curvature(agent: Agent) -> PeakValue:
-    """Return the largest curvature in 1/m between two waypoints, 0 where the agent stands."""
+def peak_curvature(agent: Agent) -> tuple[float, float]:
+    """Return the largest curvature in 1/m between two waypoints, 0 where the agent stands, and its time."""
     w = agent.waypoints
     chord, turn = chords(w)
     moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
     return _peak(w.t_s, np.divide(np.abs(turn), np.abs(chord), out=np.zeros(len(turn)), where=moves))
 
 
-def _peak(t_s: Array, values: Array) -> PeakValue:
+def _peak(t_s: Array, values: Array) -> tuple[float, float]:
     if len(values) == 0:
-        return PeakValue(0.0, float(t_s[0]))
+        return 0.0, float(t_s[0])
     k = int(np.argmax(values >= values.max() / RELATIVE_TOLERANCE))  # the first of those that are equal up to rounding
-    return PeakValue(float(values[k]), float(t_s[k] + t_s[k + 1]) / 2)
+    return float(values[k]), float(t_s[k] + t_s[k + 1]) / 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +140,15 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     """
     if not edits:
         raise ConfigError("no edits; say what to change, such as a shift of one agent")
-    _check_names(scenario, edits)
+    # Unknown agents are refused, and a second value for the same edit.
+    known, seen = [a.id for a in scenario.agents], set()
+    for step in edits:
+        for name in step.names:
+            if name not in known:
+                raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {_some(known)}")
+            if (step.kind, name) in seen and not isinstance(step, Only | Remove | Add):
+                raise ConfigError(f"{step.kind}: agent '{name}' is named twice; give one value")
+            seen.add((step.kind, name))
     agents: Agents = {a.id: a for a in scenario.agents}
     for step in edits:
         gone = next((name for name in step.names if name not in agents), None)
@@ -157,14 +157,13 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
         agents = step.applied(agents)
         if not agents:
             raise ConfigError(f"{step.kind}: leaves out every agent of '{scenario.name}'; keep at least one")
-    end_s = max(float(a.waypoints.t_s[-1]) for a in agents.values())
-    edited = replace(
-        scenario,
-        agents=tuple(agents.values()),
-        duration_s=max(scenario.duration_s, end_s),
-        provenance={**scenario.provenance, "edits": _history(scenario, edits)},
-        tags=None,
-    )
+    duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in agents.values()))
+    earlier = scenario.provenance.get("edits", [])
+    if not isinstance(earlier, list):
+        raise ScenarioError(f"provenance.edits is {type(earlier).__name__}, expected the list of earlier edits")
+    run = {"source_digest": scenario.digest, "edits": [e.to_dict() for e in edits]}
+    provenance = {**scenario.provenance, "edits": [*earlier, run]}
+    edited = replace(scenario, agents=tuple(agents.values()), duration_s=duration_s, provenance=provenance, tags=None)
     source = {a.id: a for a in scenario.agents}
     changed = [a for a in edited.agents if a is not source.get(a.id)]
     return Edited(edited, find_problems(scenario, edited, changed))
@@ -182,26 +181,6 @@ def find_problems(source: Scenario, changed: Scenario, agents: Sequence[Agent]) 
     return (*_collisions(source, changed, {a.id for a in agents}), *infeasible, *undrivable)
 
 
-def _check_names(scenario: Scenario, edits: Sequence[Edit]) -> None:
-    """Refuse unknown agents, and a second value for the same edit."""
-    known, seen = [a.id for a in scenario.agents], set()
-    for step in edits:
-        for name in step.names:
-            if name not in known:
-                raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {_some(known)}")
-            if (step.kind, name) in seen and not isinstance(step, Only | Remove | Add):
-                raise ConfigError(f"{step.kind}: agent '{name}' is named twice; give one value")
-            seen.add((step.kind, name))
-
-
 def _some(ids: Sequence[str], most: int = 12) -> str:
     rest = len(ids) - most
     return ", ".join(ids[:most]) + (f" and {rest} more" if rest > 0 else "")
-
-
-def _history(scenario: Scenario, edits: Sequence[Edit]) -> list[Any]:
-    """Append these edits to the earlier ones, one entry a run."""
-    earlier = scenario.provenance.get("edits", [])
-    if not isinstance(earlier, list):
-        raise ScenarioError(f"provenance.edits is {type(earlier).__name__}, expected the list of earlier edits")
-    return [*earlier, {"source_digest": scenario.digest, "edits": [e.to_dict() for e in edits]}]

@@ -267,13 +267,11 @@ class _Draft:
         gone = items[int(np.argmin(far))].id
         markings = tuple(m for m in self.features.markings if m.id != gone)
         borders = tuple(b for b in self.features.borders if b.id != gone)
-        lanes = tuple(
-            replace(
-                lane, left=None if lane.left == gone else lane.left, right=None if lane.right == gone else lane.right
-            )
-            for lane in self.features.lanes
-        )
-        self.features = replace(self.features, markings=markings, borders=borders, lanes=lanes)
+        lanes = []
+        for lane in self.features.lanes:
+            left, right = (None if name == gone else name for name in (lane.left, lane.right))
+            lanes.append(replace(lane, left=left, right=right))
+        self.features = replace(self.features, markings=markings, borders=borders, lanes=tuple(lanes))
         return ""
 
 
@@ -551,14 +549,7 @@ def added(
     # Where it stands it keeps the heading with which it came; one that creeps all the time has that of its way.
     moves = pace >= min(STANDSTILL_MPS, pace.max() / 2)
     course = np.interp(t_s, t_s[moves], course[moves])
-    waypoints = Waypoints(
-        t_s,
-        xyz[:, 0],
-        xyz[:, 1],
-        xyz[:, 2],
-        wrap_angle(course),
-        pace,
-        np.zeros(len(t_s), dtype=bool),
-        np.interp(t_s, key_s, sigma),
-    )
+    observed, sigma_m = np.zeros(len(t_s), dtype=bool), np.interp(t_s, key_s, sigma)
+    x, y, z = xyz.T
+    waypoints = Waypoints(t_s, x, y, z, wrap_angle(course), pace, observed, sigma_m)
     return Agent(name, category, (length, width, height), waypoints)

@@ -246,9 +246,8 @@ class CutIn(_AgentEdit):
             raise ConfigError(f"cut_in: needs another agent, and an ego that is there at {end_s:g} s")
         if self.gap_m is not None:
             wanted_m = self.gap_m + (ego.size_m[0] + agent.size_m[0]) / 2
-            times = agent.waypoints.t_s[0] + motion.STEP_S * np.arange(
-                int(np.ptp(agent.waypoints.t_s) / motion.STEP_S) + 1
-            )
+            life_s = agent.waypoints.t_s
+            times = life_s[0] + motion.STEP_S * np.arange(int(np.ptp(life_s) / motion.STEP_S) + 1)
             ahead_m = self._ahead(ego, agent, times, end_s)[0]
             k = int(np.argmin(np.abs(ahead_m - wanted_m)))
             if abs(ahead_m[k] - wanted_m) > 1.0:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, EGO, STANDSTILL_MPS, Scenario
 from log2sim.files.documents import rounded
-from log2sim.geometry import Array
 from log2sim.prediction.prediction import METHODS, Forecast, Predictions
 
 MOTIONS = ("moving", "standing")
@@ -20,12 +19,6 @@ CHI2_95 = 5.991
 """95 % quantile of chi-squared with two degrees of freedom."""
 
 Mask = NDArray[np.bool_]
-
-
-def figure_leads(lead_s: Array) -> list[int]:
-    """Return the indices of the leads that figures are given for: whole seconds and the horizon."""
-    whole = np.isclose(lead_s, np.rint(lead_s))
-    return np.flatnonzero(whole | (np.arange(len(lead_s)) == len(lead_s) - 1)).tolist()
 
 
 def measure_predictions(predictions: Predictions) -> list[dict[str, Any]]:
@@ -79,8 +72,9 @@ def _figures(
 ) -> list[dict[str, Any]]:
     """Compute the figures of errors (K, H) in the frames of the predicted courses; one entry for each lead with any."""
     out = []
-    distance = np.abs(error)
-    for h in figure_leads(predictions.lead_s):
+    distance, lead_s = np.abs(error), predictions.lead_s
+    whole = np.isclose(lead_s, np.rint(lead_s)) | (np.arange(len(lead_s)) == len(lead_s) - 1)
+    for h in np.flatnonzero(whole).tolist():  # whole seconds and the horizon
         there = seen[:, h]
         if not there.any():
             continue
@@ -89,17 +83,14 @@ def _figures(
         known = (sigma > 0).all(axis=1)
         squared = ((off[known] / sigma[known]) ** 2).sum(axis=1)
         upto = seen[there, : h + 1]
-        out.append(
-            {
-                "lead_s": round(float(predictions.lead_s[h]), 3),
-                "ticks": int(there.sum()),
-                "agents": len(np.unique(predictions.row[rows[there]])),
-                "ade_m": rounded(float(distance[there, : h + 1][upto].mean()), 4),
-                "fde_m": rounded(float(distance[there, h].mean()), 4),
-                "nees": rounded(float(squared.mean()) / 2, 4) if known.any() else None,
-                "within_95": rounded(float((squared < CHI2_95).mean()), 4) if known.any() else None,
-            }
-        )
+        ade_m, fde_m = distance[there, : h + 1][upto].mean(), distance[there, h].mean()
+        nees, within = (squared.mean() / 2, (squared < CHI2_95).mean()) if known.any() else (None, None)
+        agents = len(np.unique(predictions.row[rows[there]]))
+        figures = {"ade_m": ade_m, "fde_m": fde_m, "nees": nees, "within_95": within}
+        out.append({
+            "lead_s": round(float(lead_s[h]), 3), "ticks": int(there.sum()), "agents": agents,
+            **{key: None if value is None else rounded(float(value), 4) for key, value in figures.items()},
+        })  # fmt: skip
     return out
 
 
@@ -164,16 +155,11 @@ def _positions(predictions: Predictions, agent: str) -> dict[str, Any]:
     rows = predictions.rows_of(agent)
     methods = {}
     for name, forecast in predictions.forecasts.items():
-        position = forecast.position_m[rows]
-        methods[name] = {
-            "x_m": _listed(position.real),
-            "y_m": _listed(position.imag),
-            "course_rad": _listed(np.angle(forecast.course[rows])),
-            "sigma_along_m": _listed(forecast.sigma_m[rows, :, 0]),
-            "sigma_across_m": _listed(forecast.sigma_m[rows, :, 1]),
-        }
-    return {"id": agent, "t_s": _listed(predictions.table.t_s[predictions.tick[rows]]), "methods": methods}
-
-
-def _listed(values: Array) -> Any:
-    return np.round(values, _DIGITS).tolist()
+        position, sigma = forecast.position_m[rows], forecast.sigma_m[rows]
+        columns = {
+            "x_m": position.real, "y_m": position.imag, "course_rad": np.angle(forecast.course[rows]),
+            "sigma_along_m": sigma[:, :, 0], "sigma_across_m": sigma[:, :, 1],
+        }  # fmt: skip
+        methods[name] = {key: np.round(values, _DIGITS).tolist() for key, values in columns.items()}
+    t_s = np.round(predictions.table.t_s[predictions.tick[rows]], _DIGITS).tolist()
+    return {"id": agent, "t_s": t_s, "methods": methods}

@@ -26,9 +26,8 @@ class MotionTable(AgentTable):
     tick_s: float  # between ticks
     velocity_mps: Complex  # (A, T) slope of the trajectory; NaN where the agent is absent
     sigma_m: Array  # (A, T) one standard deviation of the position
-    observed: NDArray[
-        np.bool_
-    ]  # (A, T) False where the agent is absent or its trajectory fills a gap of the observations
+    # (A, T) False where the agent is absent or its trajectory fills a gap of the observations
+    observed: NDArray[np.bool_]
     # (A, T) rises by one where the log jumps, from where on it is another object; -1 where the agent is absent
     piece: NDArray[np.intp]
 
@@ -74,18 +73,14 @@ def tabulate(agents: Sequence[Agent], t_s: Array, tick_s: float) -> MotionTable:
         t = t_s[there]
         vx, vy = path.velocity(t)
         velocity[k, there] = 0.0 if agent.static else vx + 1j * vy
-        sigma[k, there], observed[k, there] = np.interp(t, w.t_s, w.sigma_xy_m), _is_observed(agent, t)
+        sigma[k, there] = np.interp(t, w.t_s, w.sigma_xy_m)
+        # Observed at an observed waypoint, or between two of them.
+        after = np.clip(np.searchsorted(w.t_s, t - MARGIN_S), 0, len(w) - 1)
+        before = np.clip(np.searchsorted(w.t_s, t + MARGIN_S, side="right") - 1, 0, len(w) - 1)
+        observed[k, there] = w.observed[after] & w.observed[before]
         piece[k, there] = np.searchsorted(path.discontinuity_times(), t + MARGIN_S, side="right")
     columns = table.agents, t_s, table.center_m, table.yaw_rad, table.speed_mps
     return MotionTable(*columns, tick_s, velocity, sigma, observed, piece)
-
-
-def _is_observed(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
-    """Whether times (T,) are at an observed waypoint or between two of them."""
-    w = agent.waypoints
-    after = np.clip(np.searchsorted(w.t_s, t_s - MARGIN_S), 0, len(w) - 1)
-    before = np.clip(np.searchsorted(w.t_s, t_s + MARGIN_S, side="right") - 1, 0, len(w) - 1)
-    return np.asarray(w.observed[after] & w.observed[before])
 
 
 CONSTANTS_S = tuple(itertools.product((0.0, 0.3, 0.6, 1.2), (0.0, 0.3, 0.6, 1.2, 2.4, np.inf)))

@@ -191,11 +191,7 @@ def leads_of(horizon_s: float) -> Array:
 
 
 def predict_scenario(
-    scenario: Scenario,
-    horizon_s: float = 3.0,
-    *,
-    methods: Sequence[str] = tuple(METHODS),
-    lanes: Sequence[Array] | None = None,
+    scenario: Scenario, horizon_s: float = 3.0, *, methods: Sequence[str] = tuple(METHODS)
 ) -> Predictions:
     """Predict where each agent of a scenario will be, at every tick and from its states up to then.
 
@@ -204,10 +200,7 @@ def predict_scenario(
     horizon_s : float, s
         Longest lead.
     methods : sequence of str
-        Of `METHODS`.
-    lanes : sequence of (K, 2) float64, m, or None
-        Middle lines of lanes in their direction of travel, map frame, for the method `path`; None for those of the scenario
-        that are between markings.
+        Of `METHODS`; `path` knows the lanes of the scenario that are between markings.
 
     Raises
     ------
@@ -219,15 +212,10 @@ def predict_scenario(
     Only states up to a tick are used. Those of a reconstruction were smoothed over the whole log, so that they depend a little
     of what came next: predictions by a system that measures while it drives are worse.
     """
-    known = marked_lanes(scenario) if lanes is None else lanes
-    return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, known)
-
-
-def marked_lanes(scenario: Scenario) -> list[Array]:
-    """Return the middle lines (K, 2) of a scenario's lanes between markings; those out of paths know where agents will go."""
-    if scenario.map_features is None:
-        return []
-    return [lane.points_m[:, :2] for lane in scenario.map_features.lanes if lane.inferred_from != "paths"]
+    found = () if scenario.map_features is None else scenario.map_features.lanes
+    # Lanes out of paths would know where agents will go.
+    lanes = [lane.points_m[:, :2] for lane in found if lane.inferred_from != "paths"]
+    return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, lanes)
 
 
 def predict_table(

@@ -230,20 +230,13 @@ def simulated_log(simulation: Simulation, *, notes: Collection[str] = (), masks:
         streams[name] = Stream(name, t_ns[known], partial(_read, simulation, name, known, masks))
     cameras = {name: log.cameras[name] for name in simulation.sensors if name in log.cameras}
     return Log(
-        name=f"{log.name}, simulated",
-        format="simulated",
-        cameras=cameras,
-        lidars={name: log.lidars[name] for name in simulation.sensors if name in log.lidars},
-        streams=streams,
-        ego=driven.ego,
-        ego_vehicle=log.ego_vehicle,
-        map=log.map,
-        labels=labels_of(simulation.scenario, streams[simulation.sensors[0]].t_ns),
-        ground_z_ego_m=log.ground_z_ego_m,
-        reference_camera=log.reference_camera if log.reference_camera in cameras else None,
-        digest=log.digest,
+        name=f"{log.name}, simulated", format="simulated", cameras=cameras,
+        lidars={name: log.lidars[name] for name in simulation.sensors if name in log.lidars}, streams=streams,
+        ego=driven.ego, ego_vehicle=log.ego_vehicle, map=log.map,
+        labels=labels_of(simulation.scenario, streams[simulation.sensors[0]].t_ns), ground_z_ego_m=log.ground_z_ego_m,
+        reference_camera=log.reference_camera if log.reference_camera in cameras else None, digest=log.digest,
         notes=(f"simulated from log '{log.name}', seed {simulation.seed}", *simulation.world.notes, *notes),
-    )
+    )  # fmt: skip
 
 
 def _read(

@@ -408,17 +408,9 @@ class Traffic:
             driven = self._foresight.expect_driven(self._driven, t_s, pose)
             prediction = _select(everyone == self._driven, driven, prediction)
         moment = TrafficState(
-            self.paths,
-            self.idm,
-            self._size,
-            self.reacts,
-            self._driven,
-            tau,
-            self.rate,
-            pose,
-            prediction,
+            self.paths, self.idm, self._size, self.reacts, self._driven, tau, self.rate, pose, prediction,
             self._foresight,
-        )
+        )  # fmt: skip
         taken = np.zeros(len(tau))
         pairs = moment.meeting(*self._pairs(t_s, tau, own))
         for begin in range(0, len(pairs[0]), CHUNK):

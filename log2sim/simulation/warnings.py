@@ -331,18 +331,12 @@ def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
         moment, way_m = drive.moment(agent, float(drive.t_s[found.row[first]])), float(found.way_m[first])
         needed = drive.watch.settings.needed_mps2(moment.ego_speed_mps, way_m)
         event = CollisionWarning(
-            agent=who.id,
-            category=who.category,
-            driver=drive.driver,
-            known=drive.known(agent),
-            warned=moment,
+            agent=who.id, category=who.category, driver=drive.driver, known=drive.known(agent), warned=moment,
             probability=round(float(found.probability[first]), _DIGITS),
-            ttc_s=round(float(found.ttc_s[first]), _DIGITS),
-            way_m=round(way_m, _DIGITS),
-            needed_mps2=None if needed is None else round(needed, _DIGITS),
-            braking_suffices=moment.stopping_m <= way_m,
+            ttc_s=round(float(found.ttc_s[first]), _DIGITS), way_m=round(way_m, _DIGITS),
+            needed_mps2=None if needed is None else round(needed, _DIGITS), braking_suffices=moment.stopping_m <= way_m,
             spans_s=_spans(np.sort(drive.t_s[found.row[rows]])),
-        )
+        )  # fmt: skip
         events.append(event)
     return events
 

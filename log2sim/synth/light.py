@@ -114,17 +114,11 @@ def _in_weather(light: Light, environment: Environment) -> Light:
     sky = np.add(light.sky_color, np.multiply(light.sun_color, 0.5 * light.sun[2]))
     gray = (sky + 2 * sky.mean()) / 3 * (1.0 if fog else 0.8)
     return replace(
-        light,
-        sun_color=_color(np.multiply(light.sun_color, 0.06)),
-        sky_color=_color(gray),
-        horizon=_color(gray * 0.92),
-        zenith=_color(gray * (0.88 if fog else 0.7)),
-        extinction_per_m=extinction,
-        lamps=max(light.lamps, 3.0),
-        wetness=0.3 if fog else 1.0,
-        rain_mm_h=0.0 if fog else environment.rain_mm_h,
+        light, sun_color=_color(np.multiply(light.sun_color, 0.06)), sky_color=_color(gray),
+        horizon=_color(gray * 0.92), zenith=_color(gray * (0.88 if fog else 0.7)), extinction_per_m=extinction,
+        lamps=max(light.lamps, 3.0), wetness=0.3 if fog else 1.0, rain_mm_h=0.0 if fog else environment.rain_mm_h,
         noise=light.noise * 1.3,
-    )
+    )  # fmt: skip
 
 
 def _color(values: NDArray[np.float64]) -> Color:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 
 import cv2
 import numpy as np
@@ -116,11 +117,6 @@ def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: SceneInstant, c
     depth[:] = 1 / buffer.nearness.reshape(behind.shape)[::SAMPLES, ::SAMPLES]
 
 
-def _coarse(fragments: Fragments, width_px: int) -> NDArray[np.int32]:
-    """Index of the pixel that each sample lies in."""
-    return (fragments.v >> SAMPLES_SHIFT) * np.int32(width_px) + (fragments.u >> SAMPLES_SHIFT)
-
-
 def _add(
     view: RenderCamera,
     fine: RenderCamera,
@@ -131,7 +127,8 @@ def _add(
     share: Image,
 ) -> None:
     """Add samples of a body to the light (N, 3) of the pixels and to the shares (N,) of them that bodies cover."""
-    coarse = _coarse(fragments, view.width_px)
+    # The pixel that each sample lies in.
+    coarse = (fragments.v >> SAMPLES_SHIFT) * np.int32(view.width_px) + (fragments.u >> SAMPLES_SHIFT)
     first = int(coarse.min())
     coarse -= np.int32(first)
     count = np.bincount(coarse).astype(np.float32) / SAMPLES**2
@@ -232,22 +229,19 @@ HOUSING_RGB, POLE_RGB = (34, 36, 36), (122, 126, 128)
 
 def signals_of(scene: Scene) -> tuple[Signal, ...]:
     """Return the true states of all traffic lights over a scene."""
-    return tuple(_signal(light, scene.duration_s) for light in scene.traffic_light)
-
-
-def _signal(light: TrafficLight, duration_s: float) -> Signal:
-    length = np.array([seconds for _, seconds in light.program])
-    t, k = light.start_s, 0
-    times: list[float] = []
-    states: list[str] = []
-    while t < duration_s:
-        state, ends = light.program[k][0], t + float(length[k])
-        if ends > 0 and (not states or states[-1] != state):
-            times.append(max(t, 0.0))
-            states.append(state)
-        t, k = ends, (k + 1) % len(light.program)
-    heading = float(wrap_angle(np.deg2rad(light.yaw_deg)))
-    return Signal(light.id, np.array(light.position), heading, np.array(times), np.array(states))
+    out = []
+    for light in scene.traffic_light:
+        t, times, states = light.start_s, list[float](), list[str]()
+        for state, seconds in cycle(light.program):
+            if t >= scene.duration_s:
+                break
+            if t + seconds > 0 and (not states or states[-1] != state):
+                times.append(max(t, 0.0))
+                states.append(state)
+            t += seconds
+        heading = float(wrap_angle(np.deg2rad(light.yaw_deg)))
+        out.append(Signal(light.id, np.array(light.position), heading, np.array(times), np.array(states)))
+    return tuple(out)
 
 
 def bodies_at(scene: Scene, t_s: float) -> list[Body]:
@@ -482,13 +476,9 @@ def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Vis
         if not is_hidden(view, instant.bodies[index], buffer.nearness):
             samples = samples_of(view, instant.bodies[index])
             added[index] = (*buffer.add(samples), nearest_of(samples))
-    for index, (fragments, pixel, first, silhouette) in added.items():
-        out[index] = _visibility(silhouette, fragments.part(buffer.still_seen(pixel, first)))
+    for index, (fragments, pixel, first, whole) in added.items():
+        visible = fragments.part(buffer.still_seen(pixel, first))
+        if len(visible.u):
+            boxes = (np.array([f.u.min(), f.v.min(), f.u.max() + 1, f.v.max() + 1], float) for f in (visible, whole))
+            out[index] = Visibility(len(visible.u), len(whole.u), *boxes)
     return out
-
-
-def _visibility(silhouette: Fragments, visible: Fragments) -> Visibility | None:
-    if len(visible.u) == 0:
-        return None
-    boxes = (np.array([f.u.min(), f.v.min(), f.u.max() + 1, f.v.max() + 1], float) for f in (visible, silhouette))
-    return Visibility(len(visible.u), len(silhouette.u), *boxes)

@@ -92,20 +92,14 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     if observe:
         truth = replace(truth, provenance={**truth.provenance, "seen_ground": seen_ground(moving, cameras, cast)})
     log = Log(
-        name=scene.name,
-        format="synthetic",
-        cameras=cameras,
-        lidars=lidars,
-        streams=streams,
+        name=scene.name, format="synthetic", cameras=cameras, lidars=lidars, streams=streams,
         ego=None if moving.ego is None else _measured_poses(moving.ego, scene, np.random.default_rng([seed, 1])),
         ego_vehicle=EgoVehicle() if scene.ego is None else EgoVehicle(scene.ego.size_m, scene.ego.rear_axle_offset_m),
-        map=truth.map,
-        labels=labels_3d(scene, frames, moving.actors) if observe else None,
+        map=truth.map, labels=labels_3d(scene, frames, moving.actors) if observe else None,
         image_labels=labels_2d(frames, moving.actors) if observe else {},
-        reference_camera=scene.camera[0].name if scene.camera else None,
-        digest=_digest(scene, seed),
+        reference_camera=scene.camera[0].name if scene.camera else None, digest=_digest(scene, seed),
         notes=(f"synthetic, seed {seed}",),
-    )
+    )  # fmt: skip
     return log, truth
 
 
@@ -121,8 +115,15 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
         rng = np.random.default_rng([seed, 2, index, i])
         bodies = [Body.of(actor, moving.seconds(t_ns[i])) for actor in moving.seen_from(camera.mount)]
         bodies += bodies_at(scene, moving.seconds(t_ns[i]))
-        lamps = lamps_on(moving, map_T_cam, int(t_ns[i])) if light.lamps > 0 else ()
-        return render(camera, map_T_cam, SceneInstant(_backdrop(scene, seed), bodies, light, lamps), rng)
+        lamps: list[Lamp] = []
+        if light.lamps > 0:  # street lights around the camera, and the headlights of all that drives
+            lamps += street_lights(scene.road, map_T_cam[:2, 3])
+            for actor in moving.seen_from("map"):
+                if actor.spec.vehicle and actor.path is not None:
+                    pose = actor.at(moving.seconds(t_ns[i])).map_T_agent()[0]
+                    pose[2, 3] = 0.0
+                    lamps += headlights(pose, actor.spec.box_m[0] / 2, actor.spec.box_m[1])
+        return render(camera, map_T_cam, SceneInstant(_backdrop(scene, seed), bodies, light, tuple(lamps)), rng)
 
     out = {}
     for index, spec in enumerate(scene.camera):
@@ -133,17 +134,6 @@ def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -
             )
         out[spec.name] = Stream(spec.name, stamps, partial(read, cameras[spec.name], index, stamps))
     return out
-
-
-def lamps_on(moving: MovingScene, map_T_cam: Array, t_ns: int) -> tuple[Lamp, ...]:
-    """List the headlights of all that drives and the street lights around a camera."""
-    lamps = list(street_lights(moving.scene.road, map_T_cam[:2, 3]))
-    for actor in moving.seen_from("map"):
-        if actor.spec.vehicle and actor.path is not None:
-            pose = actor.at(moving.seconds(t_ns)).map_T_agent()[0]
-            pose[2, 3] = 0.0
-            lamps += headlights(pose, actor.spec.box_m[0] / 2, actor.spec.box_m[1])
-    return tuple(lamps)
 
 
 @lru_cache(maxsize=2)
@@ -194,50 +184,27 @@ def _truth(moving: MovingScene, t_s: Array, visible: NDArray[np.bool_] | None, s
         waypoints, offset_m = _waypoints(t_s, moving.ego.at(t_s), None), moving.ego.offset_m
         agents.append(Agent("ego", "car", moving.ego.spec.box_m, waypoints, rear_axle_offset_m=offset_m))
     for index, actor in enumerate(moving.actors):
-        agents.append(
-            Agent(
-                id=actor.spec.id,
-                category=actor.spec.category,
-                size_m=actor.spec.box_m,
-                waypoints=_waypoints(t_s, actor.at(t_s), None if visible is None else visible[:, index]),
-                static=actor.path is None,
-                rear_axle_offset_m=actor.spec.rear_axle_offset_m,
-                color={"rgb": list(actor.spec.color), "name": name_of(actor.spec.color)},
-            )
-        )
-    origin = scene.origin
-    frame = MapFrame(
-        origin.latitude_deg,
-        origin.longitude_deg,
-        origin.altitude_m,
-        f"+proj=tmerc +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m",
-    )
+        spec, shown = actor.spec, None if visible is None else visible[:, index]
+        agents.append(Agent(
+            spec.id, spec.category, spec.box_m, _waypoints(t_s, actor.at(t_s), shown), static=actor.path is None,
+            rear_axle_offset_m=spec.rear_axle_offset_m, color={"rgb": list(spec.color), "name": name_of(spec.color)},
+        ))  # fmt: skip
+    at = scene.origin
+    place = f"+lat_0={at.latitude_deg!r} +lon_0={at.longitude_deg!r}"
+    projection = f"+proj=tmerc {place} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m"
+    frame = MapFrame(at.latitude_deg, at.longitude_deg, at.altitude_m, projection)
     provenance = {"source": "synthetic", "seed": seed, "scene_digest": _digest(scene, seed)}
     return Scenario(
-        scene.name,
-        scene.start_ns,
-        float(t_s[-1]),
-        tuple(agents),
-        frame,
-        provenance=provenance,
-        map_features=map_features_of(scene),
-        signals=signals_of(scene),
-    )
+        scene.name, scene.start_ns, float(t_s[-1]), tuple(agents), frame, provenance=provenance,
+        map_features=map_features_of(scene), signals=signals_of(scene),
+    )  # fmt: skip
 
 
 def _waypoints(t_s: Array, states: ActorStates, visible: NDArray[np.bool_] | None) -> Waypoints:
-    return Waypoints(
-        # Whole nanoseconds and nanometers: exact enough, and the file stays small.
-        t_s=np.round(t_s, 9),
-        x_m=np.round(states.center_m[:, 0], 9),
-        y_m=np.round(states.center_m[:, 1], 9),
-        z_m=np.round(states.center_m[:, 2], 9),
-        yaw_rad=wrap_angle(np.round(states.yaw_rad, 9)),
-        speed_mps=np.round(states.speed_mps, 9),
-        observed=np.ones(len(t_s), dtype=bool),
-        sigma_xy_m=np.zeros(len(t_s)),
-        visible=visible,
-    )
+    # Whole nanoseconds and nanometers: exact enough, and the file stays small.
+    t, x, y, z, yaw, speed = (np.round(c, 9) for c in (t_s, *states.center_m.T, states.yaw_rad, states.speed_mps))
+    seen, sigma = np.ones(len(t_s), dtype=bool), np.zeros(len(t_s))
+    return Waypoints(t, x, y, z, wrap_angle(yaw), speed, seen, sigma, visible=visible)
 
 
 def _digest(scene: Scene, seed: int) -> str:

@@ -160,7 +160,16 @@ class TrafficRun:
 
 def run_of(scene: traffic.TrafficScene, duration_s: float) -> TrafficRun:
     """Let a scene run: arcs as at time 0, speeds by the intelligent driver model."""
-    ego = None if scene.mount == "roadside" else _own_car(scene)
+    ego = None
+    if scene.mount != "roadside":  # the sensor's own car
+        R, position = scene.sensor.rotation, scene.sensor.position_m
+        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+        pace = float(np.hypot(*scene.sensor.velocity_mps))
+        middle = np.append(position[:2] + CAR_AHEAD_M * np.array([np.cos(yaw), np.sin(yaw)]), 0.0)
+        along = np.cos(yaw - scene.roads[0].yaw_rad)
+        follows = abs(along) > np.cos(MAX_ROAD_ANGLE_RAD)
+        turn = pace * scene.roads[0].curvature_per_m * float(np.sign(along)) if follows else 0.0
+        ego = traffic.TrafficObject("car", middle, yaw, CAR_SIZE_M, (), pace, turn)
     movers = [*scene.objects, *([] if ego is None else [ego])]
     count = int(np.ceil(duration_s / STEP_S)) + 2
     distance = np.zeros((count, len(movers)))
@@ -173,17 +182,6 @@ def run_of(scene: traffic.TrafficScene, duration_s: float) -> TrafficRun:
         rate = _acceleration(places, speed[users], wish[users])
         speed[users] = np.clip(speed[users] + rate * STEP_S, 0.0, np.maximum(wish[users], 0.0))
     return TrafficRun(scene, ego, distance)
-
-
-def _own_car(scene: traffic.TrafficScene) -> traffic.TrafficObject:
-    R, position = scene.sensor.rotation, scene.sensor.position_m
-    yaw = float(np.arctan2(R[1, 0], R[0, 0]))
-    speed = float(np.hypot(*scene.sensor.velocity_mps))
-    middle = np.append(position[:2] + CAR_AHEAD_M * np.array([np.cos(yaw), np.sin(yaw)]), 0.0)
-    along = np.cos(yaw - scene.roads[0].yaw_rad)
-    follows = abs(along) > np.cos(MAX_ROAD_ANGLE_RAD)
-    turn = speed * scene.roads[0].curvature_per_m * float(np.sign(along)) if follows else 0.0
-    return traffic.TrafficObject("car", middle, yaw, CAR_SIZE_M, (), speed, turn)
 
 
 def _moved(
@@ -335,14 +333,9 @@ class _Film:
             if o.category
         ]
         stamps, names, categories, centers, sizes, yaws = zip(*rows) if rows else ((),) * 6
-        return Labels(
-            t_ns=np.array(stamps, np.int64),
-            track_id=np.array(names, dtype="<U16"),
-            category=np.array(categories, dtype="<U16"),
-            center_m=np.array(centers, dtype=np.float64).reshape(-1, 3),
-            size_m=np.array(sizes, dtype=np.float64).reshape(-1, 3),
-            yaw_rad=np.array(yaws, dtype=np.float64),
-        )
+        name, category = (np.array(column, dtype="<U16") for column in (names, categories))
+        center, size, yaw = (np.array(column, dtype=np.float64) for column in (centers, sizes, yaws))
+        return Labels(np.array(stamps, np.int64), name, category, center.reshape(-1, 3), size.reshape(-1, 3), yaw)
 
     def image_labels(self, t_s: Array) -> ImageLabels:
         """Boxes of the road users that the picture shows, at times (F,)."""
@@ -350,16 +343,14 @@ class _Film:
         for t, stamp in zip(t_s, stamps_of(t_s)):
             scene, map_T_cam, instant, seen = self._instant(float(t))
             for k, part in zip(seen, segment(self._camera, map_T_cam, instant)):
-                if part is not None and scene.objects[k].category and _is_clear(part):
+                if part is None or not scene.objects[k].category:
+                    continue
+                big = float((part.box_px[2:] - part.box_px[:2]).min()) >= MIN_LABEL_PX
+                if big and part.visible_px >= MIN_UNOCCLUDED * part.silhouette_px:
                     flat.append((int(stamp), part.box_px, scene.objects[k].category))
         stamps, boxes, categories = zip(*flat) if flat else ((),) * 3
         shown = np.array(boxes, dtype=np.float64).reshape(-1, 4)
         return ImageLabels(np.array(stamps, np.int64), shown, np.array(categories, dtype="<U16"))
-
-
-def _is_clear(part: Visibility) -> bool:
-    big = float((part.box_px[2:] - part.box_px[:2]).min()) >= MIN_LABEL_PX
-    return big and part.visible_px >= MIN_UNOCCLUDED * part.silhouette_px
 
 
 MANIFEST = "traffic.json"

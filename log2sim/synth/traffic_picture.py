@@ -15,7 +15,7 @@ from log2sim.synth.light import Lamp, Light, headlights
 from log2sim.synth.paint import Paint, linear_bgr
 from log2sim.synth.polytope_caster import MESH_OPENNESS
 from log2sim.synth.polytopes import Material, meshes_of
-from log2sim.synth.render import Body, Painter, SceneInstant, Values
+from log2sim.synth.render import Body, SceneInstant, Values
 from log2sim.synth.scene import Road as PaintedRoad
 from log2sim.synth.shapes import Mesh
 from log2sim.synth.terrain import Road
@@ -63,10 +63,6 @@ class Look:
     trousers: NDArray[np.float32]  # (3,)
     skin: NDArray[np.float32]  # (3,)
     hair: NDArray[np.float32]  # (3,)
-
-    def painter(self) -> Painter:
-        """Return the function that colors points of it."""
-        return partial(_paint, self)
 
     def passes(self) -> NDArray[np.float32] | None:
         """Share of samples (K,) that each part lets through, None for a solid one."""
@@ -122,7 +118,11 @@ def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values)
         _front(out, material, points, z, normals)
     leaves = material == Material.LEAVES
     if leaves.any():
-        out.albedo[leaves] *= _mottled(points[leaves])[:, None]
+        # Light and dark patches.
+        x, y, z = points[leaves].T
+        patches = np.sin(7.1 * x + 3.3 * z) * np.sin(6.3 * y - 4.7 * z)
+        fine = np.sin(23.0 * x + 17.0 * y) * np.sin(29.0 * z - 13.0 * y)
+        out.albedo[leaves] *= np.asarray(1.0 + 0.28 * patches + 0.3 * fine, np.float32)[:, None]
     return out
 
 
@@ -137,13 +137,6 @@ def _front(out: Paint, material: NDArray[np.int64], points: Values, z: Values, n
     out.albedo[pane] = (0.1, 0.085, 0.075)
     out.gloss[pane] = 0.25
     out.albedo[wall & (z < 0.7)] *= np.float32(0.7)
-
-
-def _mottled(points: Values) -> Values:
-    """Light and dark patches (P,) of leaves."""
-    patches = np.sin(7.1 * points[:, 0] + 3.3 * points[:, 2]) * np.sin(6.3 * points[:, 1] - 4.7 * points[:, 2])
-    fine = np.sin(23.0 * points[:, 0] + 17.0 * points[:, 1]) * np.sin(29.0 * points[:, 2] - 13.0 * points[:, 1])
-    return np.asarray(1.0 + 0.28 * patches + 0.3 * fine, np.float32)
 
 
 ROAD_REACH_M, MAX_SAGITTA_M = 240.0, 0.02
@@ -171,23 +164,20 @@ class TrafficPainter:
     ) -> tuple[SceneInstant, NDArray[np.int64]]:
         """Take the scene at one time: what a camera may see, and the index of the object that each body is."""
         seen = [k for k, item in enumerate(scene.objects) if item.kind != OWN_CAR and _in_view(item, camera, map_T_cam)]
-        self._make([k for k in seen if k not in self._meshes], scene)
+        new = [k for k in seen if k not in self._meshes]
+        parts, heights = [scene.objects[k].parts for k in new], [scene.objects[k].size_m[2] / 2 for k in new]
+        for k, own, mesh in zip(new, parts, meshes_of(parts, heights)):
+            self._looks[k] = draw_look(scene.objects[k], np.random.default_rng([self._seed, 7, k]))
+            self._meshes[k] = _rounded(mesh, np.array([p.material for p in own]))
         bodies = []
         for k in seen:
             item = scene.objects[k]
             center = item.position_m + np.array([0.0, 0.0, item.size_m[2] / 2])
             pose = transform(rotation_from_rpy(0.0, 0.0, item.yaw_rad), center)
-            bodies.append(Body(self._meshes[k], pose, item.size_m, self._looks[k].painter(), self._looks[k].passes()))
+            look = self._looks[k]
+            bodies.append(Body(self._meshes[k], pose, item.size_m, partial(_paint, look), look.passes()))
         lamps = lamps_of(scene) if light.lamps > 0 else ()
         return SceneInstant(self.backdrop, bodies, light, lamps), np.array(seen, np.int64)
-
-    def _make(self, rows: list[int], scene: TrafficScene) -> None:
-        objects = [scene.objects[k] for k in rows]
-        for k, item, mesh in zip(
-            rows, objects, meshes_of([o.parts for o in objects], [o.size_m[2] / 2 for o in objects])
-        ):
-            self._looks[k] = draw_look(item, np.random.default_rng([self._seed, 7, k]))
-            self._meshes[k] = _rounded(mesh, np.array([p.material for p in item.parts]))
 
 
 def painted_road(road: Road, kerbs: bool) -> PaintedRoad:

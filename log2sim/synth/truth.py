@@ -253,10 +253,7 @@ def _lanes(
             right, left = (None, None) if inside else [_beside(points, s) for s in (sides[lane][1], sides[lane + 1][0])]
             if not forward[lane]:
                 points, ends, right, left = points[::-1], ends[::-1], left, right
-            width, junction = (
-                np.full(len(points), float(np.diff(at)[lane])),
-                f"junction_{number}_{n}" if inside else None,
-            )
+            width, junction = np.full(len(points), np.diff(at)[lane]), f"junction_{number}_{n}" if inside else None
             links: dict[str, Any] = {"predecessors": tuple(ends[0]), "successors": tuple(ends[1]), "junction": junction}
             parts[-1].append(MapLane(names[n], _on_ground(points), width, left=left, right=right, **links))
     out = []
@@ -385,11 +382,8 @@ def labels_2d(
             t_ns += [frame.t_ns] * len(rows)
             boxes.append(frame.box_px[rows])
             categories.append(category[rows])
-        out[name] = ImageLabels(
-            np.array(t_ns, dtype=np.int64),
-            np.concatenate(boxes).reshape(-1, 4),
-            np.concatenate(categories).astype("<U16"),
-        )
+        shown, kinds = np.concatenate(boxes).reshape(-1, 4), np.concatenate(categories).astype("<U16")
+        out[name] = ImageLabels(np.array(t_ns, dtype=np.int64), shown, kinds)
     return out
 
 

@@ -113,23 +113,14 @@ def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> Vehic
     cg_to_rear_m = share["cg_to_rear"] * wheelbase_m
     same = np.ones(len(agents))
     parameters = VehicleParameters(
-        wheelbase_m=wheelbase_m,
-        rear_axle_offset_m=np.array([rear_axle_offset(a) for a in agents], dtype=np.float64),
-        max_steer_rad=share["max_steer_rad"],
-        max_steer_rate_radps=STEER_RATE_RADPS * same,
-        steer_lag_s=STEER_LAG_S * same,
-        max_throttle_mps2=share["max_throttle_mps2"],
-        max_brake_mps2=share["max_brake_mps2"],
-        max_jerk_mps3=MAX_JERK_MPS3 * same,
-        pedal_lag_s=PEDAL_LAG_S * same,
-        cg_to_rear_m=cg_to_rear_m,
-        cg_height_m=share["cg_height"] * height_m,
-        gyration_m2=cg_to_rear_m * (wheelbase_m - cg_to_rear_m),
-        front_stiffness_1prad=share["front_stiffness_1prad"],
-        rear_stiffness_1prad=share["rear_stiffness_1prad"],
-        friction=share["friction"],
-        understeer_s2pm2=0 * same,
-    )
+        wheelbase_m=wheelbase_m, rear_axle_offset_m=np.array([rear_axle_offset(a) for a in agents], dtype=np.float64),
+        max_steer_rad=share["max_steer_rad"], max_steer_rate_radps=STEER_RATE_RADPS * same,
+        steer_lag_s=STEER_LAG_S * same, max_throttle_mps2=share["max_throttle_mps2"],
+        max_brake_mps2=share["max_brake_mps2"], max_jerk_mps3=MAX_JERK_MPS3 * same, pedal_lag_s=PEDAL_LAG_S * same,
+        cg_to_rear_m=cg_to_rear_m, cg_height_m=share["cg_height"] * height_m,
+        gyration_m2=cg_to_rear_m * (wheelbase_m - cg_to_rear_m), front_stiffness_1prad=share["front_stiffness_1prad"],
+        rear_stiffness_1prad=share["rear_stiffness_1prad"], friction=share["friction"], understeer_s2pm2=0 * same,
+    )  # fmt: skip
     if published:
         for i, agent in enumerate(agents):
             if agent.category == "car":

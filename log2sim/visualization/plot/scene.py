@@ -11,14 +11,6 @@ from matplotlib.lines import Line2D
 
 from log2sim.datatypes import ENDS, Scenario
 from log2sim.visualization.plot import drawing, layers
-from log2sim.visualization.plot.layers import (
-    Overlays,
-    draw_road,
-    draw_signals,
-    new_collisions,
-    road_rows,
-    tells_ends,
-)
 from log2sim.visualization.plot.layout import (
     SIDE_IN,
     TOP_IN,
@@ -51,7 +43,7 @@ Rows = list[tuple[Any, str]]  # handles and texts of a legend
 
 
 def draw_base(
-    scenario: Scenario, roles: AgentRoles, overlays: Overlays, *, moving: bool = False
+    scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays, *, moving: bool = False
 ) -> tuple[FigureLayout, float, TimelineCharts | None, tuple[MapLabel, ...]]:
     """Draw what stills and animations share.
 
@@ -90,9 +82,9 @@ def draw_standing(
     """Draw what stands: the ground, the road with its traffic lights at a time, if any, and the agents that never move."""
     if background is not None:
         drawing.draw_background(ax, background)
-    draw_road(ax, scenario, view, over_picture=background is not None)
+    layers.draw_road(ax, scenario, view, over_picture=background is not None)
     if signals_s is not None:
-        draw_signals(ax, scenario.signals, signals_s)
+        layers.draw_signals(ax, scenario.signals, signals_s)
     drawing.draw_stationary(ax, roles.stationary, view)
     layers.hatch_stationary(ax, roles, view, drawing.STATIONARY + 0.1)
 
@@ -117,7 +109,7 @@ def draw_moving(
         drawing.draw_truth(ax, truth)
     if replay is not None:
         drawing.draw_replay(ax, replay, roles)
-        drawing.draw_collisions(ax, new_collisions(replay)[1])
+        drawing.draw_collisions(ax, layers.new_collisions(replay)[1])
 
 
 def _view_of(roles: AgentRoles, options: PlotOptions) -> Viewport:
@@ -130,7 +122,7 @@ def _view_of(roles: AgentRoles, options: PlotOptions) -> Viewport:
 def _fit_labels(
     scenario: Scenario,
     roles: AgentRoles,
-    overlays: Overlays,
+    overlays: layers.Overlays,
     lay_out: Callable[[Rows], FigureLayout],
     mark_step_s: float | None,
 ) -> tuple[FigureLayout, Rows, tuple[MapLabel, ...]]:
@@ -150,25 +142,25 @@ def _fit_labels(
 
 
 def _legend(
-    scenario: Scenario, roles: AgentRoles, overlays: Overlays, mark_step_s: float | None, told: set[str]
+    scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays, mark_step_s: float | None, told: set[str]
 ) -> Rows:
     """List the rows of the legend; `told` agents are labeled on the map, and `mark_step_s` is None in animations."""
     view = _view_of(roles, overlays.options)
     agents = [r.agent for r in roles.movers] + list(roles.stationary)
     outside = sum(not view.contains(centers_xy(a)).any() for a in agents)
     shown = {"truth": overlays.truth is not None, "replay": overlays.replay is not None}
-    collisions = len(new_collisions(overlays.replay)[0])
+    collisions = len(layers.new_collisions(overlays.replay)[0])
     rows = legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
     rows += layers.doubt_rows(roles, told)
     if overlays.predicted is not None and roles.movers:
         dots = Line2D([0, 1], [0, 1], color=MUTED, lw=1.3, ls=(0, (1.0, 1.3)))
         rows.append((dots, f"predicted for {overlays.predicted.horizon_s:g} s, 1 sigma"))
-    if tells_ends(scenario) and mark_step_s is not None:
+    if layers.tells_ends(scenario) and mark_step_s is not None:
         lines = [Line2D([0, 1], [0, 1], color=END_COLOR[end], lw=layers.WIDTH_PT) for end in ENDS]
         rows += [(line, f"observed by the {end} alone") for line, end in zip(lines, ENDS)]
     if layers.warned_events(overlays.replay) and mark_step_s is not None:
         rows.append((Line2D([0, 1], [0, 1], **layers.LINE), "warning: when, and how far apart"))
-    return rows + road_rows(scenario)
+    return rows + layers.road_rows(scenario)
 
 
 def _subtitle(scenario: Scenario, roles: AgentRoles, span: TimeRange) -> str:
@@ -239,9 +231,9 @@ def plot(
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
     if new if legend is None else legend:
         overlays = {"truth": truth is not None, "replay": replay is not None}
-        collisions = len(new_collisions(replay)[0])
+        collisions = len(layers.new_collisions(replay)[0])
         rows = legend_rows(roles, step_s, told, collisions=collisions, outside=0, **overlays)
-        fill_legend(ax, [*rows, *layers.doubt_rows(roles, told), *road_rows(scenario)], (1.01, 1.0))
+        fill_legend(ax, [*rows, *layers.doubt_rows(roles, told), *layers.road_rows(scenario)], (1.01, 1.0))
     return ax
 
 

@@ -1,15 +1,23 @@
-"""Edit a scenario."""
+"""Scenarios changed: edited, corrected by hand, on a page too."""
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from log2sim.cli import options as opt
+from log2sim.cli.progress import progress
+from log2sim.errors import ConfigError
+from log2sim.files.outputs import claim
 
 if TYPE_CHECKING:
     from log2sim.datatypes import Scenario
+
 
 Changes = list[str] | None
 
@@ -57,7 +65,6 @@ def edit(
     from log2sim.datatypes import Scenario, count_agents, list_doubtful
     from log2sim.edit import edits as kinds
     from log2sim.edit.apply import edit as run
-    from log2sim.errors import ConfigError
     from log2sim.files.documents import check_targets
 
     check_targets(out, overwrite=overwrite)
@@ -126,8 +133,6 @@ def ids_of(scenario: Scenario, entries: Iterable[str]) -> Iterator[str]:
 
 def _numbers(option: str, entries: Changes) -> Iterator[tuple[str, float]]:
     """Yield agent and number of each entry such as "car-1=1.5"."""
-    from log2sim.errors import ConfigError
-
     for entry in entries or ():
         agent, _, value = entry.rpartition("=")  # an id may hold an equals sign, a number does not
         try:
@@ -137,3 +142,132 @@ def _numbers(option: str, entries: Changes) -> Iterator[tuple[str, float]]:
         if not agent:
             raise ConfigError(f"{option} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
         yield agent, number
+
+
+def correct(
+    scenario: opt.ScenarioPath,
+    corrections: Annotated[
+        Path, typer.Argument(metavar="CORRECTIONS", help="File of corrections, see schemas/corrections-1.json.")
+    ],
+    out: Annotated[Path, opt.write_to("FILE", "Scenario file to write.")],
+    log: Annotated[
+        Path | None, opt.option("Log of the scenario, whose LiDAR points in the corrected boxes are counted.", "LOG")
+    ] = None,
+    sequence: opt.SequenceName = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+) -> None:
+    """Apply corrections that a person made: merged, split, moved and deleted agents, categories, fronts, sizes, colors, lines.
+
+    A key pose is a further measurement with its own sigma: it moves a trajectory as far as the sigmas of both say. Corrections that
+    no longer find their agent are told and left out, and so are collisions and motion that no vehicle can do, where corrections
+    lead to them. Tags are found anew; with the log, points of what was corrected are counted anew.
+
+    Examples
+    --------
+    log2sim correct s.json corrections.json -o corrected.json
+    log2sim correct s.json corrections.json --log samples/crossing -o corrected.json
+    """
+    from log2sim.datatypes import Scenario
+    from log2sim.edit.apply import find_problems
+    from log2sim.edit.corrections import correct as run
+    from log2sim.edit.corrections import load_corrections
+    from log2sim.files.documents import check_targets
+
+    check_targets(out, overwrite=overwrite)
+    document = load_corrections(corrections)
+    source = Scenario.load(scenario)
+    result = run(source, document)
+    corrected, known = result.scenario, {a.id: a for a in source.agents}
+    changed = [a for a in corrected.agents if a is not known.get(a.id)]
+    lines = [*result.unmatched, *find_problems(source, corrected, changed)]
+    if log is not None:
+        corrected, unseen = _with_points(corrected, {a.id for a in changed}, log, sequence)
+        lines += unseen
+    if source.tags is not None:
+        from log2sim.scenarios import tag
+
+        corrected = tag(corrected)
+    corrected.save(out)
+    opt.say_all("warning", lines, quiet=quiet)
+    done = len(document["corrections"]) - len(result.unmatched)
+    lost = f", {len(result.unmatched)} without its agent" if result.unmatched else ""
+    opt.say(f"{out}: {opt.counted(done, 'correction')} applied{lost}", quiet=quiet)
+
+
+def _with_points(scenario: Scenario, changed: set[str], log: Path, sequence: str | None) -> tuple[Scenario, list[str]]:
+    """Return the scenario with the LiDAR points of the changed agents, and a line for each of them that has none."""
+    import numpy as np
+
+    from log2sim.evaluation.metrics.truth import count_points
+    from log2sim.localization.choice import localize_like
+    from log2sim.logs.opening import open_log
+    from log2sim.visualization.recording import require_overlap
+
+    opened = localize_like(open_log(log, sequence=sequence), scenario.provenance)
+    require_overlap(opened, scenario)
+    part = replace(scenario, agents=tuple(a for a in scenario.others if a.id in changed))
+    points = {a.id: a.waypoints.lidar_points for a in count_points(part, opened).agents}
+    seen = {name: float(np.median(found)) for name, found in points.items() if found is not None}
+    agents = tuple(
+        replace(a, quality={**a.quality, "points_median": seen[a.id]}) if a.id in seen else a for a in scenario.agents
+    )
+    none = [name for name, found in points.items() if found is not None and not found.any()]
+    return replace(scenario, agents=agents), [f"{name}: the LiDAR has no point in its box" for name in none]
+
+
+def studio(
+    scenario: opt.ScenarioPath,
+    log: opt.PageLog = None,
+    corrections: Annotated[Path | None, opt.option(
+        "File of corrections to write, and to go on with where it is there.", "FILE.json",
+        default="beside the scenario")] = None,
+    cameras: opt.Cameras = None,
+    max_mb: Annotated[float, opt.option("Size of the page, in millions of bytes.", "MB", default="40")] = 40.0,
+    port: Annotated[int, typer.Option(
+        metavar="N", min=0, max=65535, help="Port of this computer.", show_default="a free one")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    sequence: opt.SequenceName = None,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Correct a scenario on a page: the doubtful agents first, merging, moving, turning, sizes, categories; with undo.
+
+    The page is served to this computer alone, until Ctrl-C. Every correction is kept in a file at once, which `log2sim correct` and
+    `reconstruct --corrections` apply.
+
+    Examples
+    --------
+    log2sim studio s.json --log samples/crossing
+    log2sim studio s.json --corrections mine.json --no-browser
+    """
+    from log2sim.cli.show import map_of, open_recorded, shows_ground
+    from log2sim.datatypes import Scenario
+    from log2sim.visualization.studio import Studio
+
+    path = corrections or scenario.with_name(f"{scenario.stem}.corrections.json")
+    claim(path, overwrite=False)  # two studios on one file would overwrite each other's corrections
+    loaded = Scenario.load(scenario)
+    layers: dict[str, Any] = {}
+    with progress(quiet=quiet) as report_progress:
+        if log is not None:
+            recorded = open_recorded(
+                log, loaded, sequence, round(max_mb * 1e6), opt.camera_names(cameras), report_progress
+            )
+            layers["recorded"] = recorded
+            if shows_ground(recorded.log):
+                layers["background"] = map_of(recorded.log, loaded, report_progress)
+        try:
+            served = Studio(loaded, path, port=port, **layers)
+        except OSError as error:
+            raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
+        served.page()  # its pictures take long to gather: not while a browser waits
+    opt.say_all("warning", served.result.unmatched, quiet=quiet)
+    try:
+        opt.say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")
+        if browser:
+            webbrowser.open(served.address)
+        served.serve()
+    except KeyboardInterrupt:
+        count = len(served.document["corrections"])
+        words = f"{path}: {count} correction{'s' * (count != 1)}"
+        opt.say(f"{words}; log2sim correct {scenario} {path} --out corrected.json applies them" if count else words)

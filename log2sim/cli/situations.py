@@ -1,0 +1,400 @@
+"""Situations in scenarios: tagged, found, varied, and policies tested in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from log2sim.cli import options as opt
+from log2sim.cli.progress import progress
+from log2sim.cli.shared import format_rows
+from log2sim.errors import ConfigError
+from log2sim.files.outputs import replaced_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from log2sim.scenarios.index import Index, Row
+
+    MapFiles = Callable[[Callable[[str], Any], Sequence[str]], Iterator[Any]]
+    from log2sim.geometry import Array
+    from log2sim.scenarios.failure import Outcome
+
+
+def tag(
+    scenario: opt.ScenarioPath,
+    out: Annotated[Path | None, opt.write_to("FILE", "Scenario file to write, with the tags in it.")] = None,
+    criticality: Annotated[Path | None, opt.option(
+        "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
+        "FILE.csv")] = None,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+) -> None:  # fmt: skip
+    """Find lane changes, cut-ins, overtaking, near misses and more, of the ego and of all others.
+
+    Each tag has a probability, out of the standard deviations and the confidence of the agents, and quantities in SI units. Lanes that
+    were driven in are listed with --verbose.
+
+    Examples
+    --------
+    log2sim tag s.json -o tagged.json
+    """
+    from log2sim.datatypes import TAGS, Scenario
+    from log2sim.files.documents import check_targets
+    from log2sim.scenarios import criticality_table, tag, write_criticality
+
+    check_targets(out, criticality, overwrite=overwrite)
+    tagged = tag(Scenario.load(scenario))
+    shown = [g for g in tagged.tags or () if verbose or g.tag != "in_lane"]
+    head = ("tag", "agent", "other", "from s", "at s", "to s", "p", "")
+    rows = [
+        (g.tag, g.agent, g.other or g.lane or "", f"{g.start_s:.1f}", f"{g.t_s:.1f}", f"{g.end_s:.1f}", f"{g.probability:.2f}",
+         ", ".join(f"{k} {v:.3g}" for k, v in g.quantities.items()))
+        for g in shown
+    ]  # fmt: skip
+    for line in format_rows([head, *rows]):
+        opt.say(line, quiet=quiet)
+    counts = {name: sum(g.tag == name for g in shown) for name in TAGS}
+    opt.say(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag", quiet=quiet)
+    if out is not None:
+        tagged.save(out)
+    if criticality is not None:
+        write_criticality(criticality, criticality_table(tagged))
+    opt.report_written(out, criticality, quiet=quiet)
+
+
+MAX_LISTED = 40
+
+
+def find(
+    path: Annotated[Path, typer.Argument(
+        metavar="FOLDER", help="Folder with scenarios, such as that of batch, or one scenario.json.")],
+    condition: Annotated[str, typer.Argument(
+        metavar="CONDITION",
+        help="Such as 'cut_in and ttc_s < 2 and ego.speed_mps > 10'; without one, all tags are counted.")] = "",
+    out: Annotated[Path | None, opt.write_to("FILE.html", "Page of the hits to write, with pictures.")] = None,
+    table: Annotated[Path | None, opt.option("Parquet file of the hits to write.", "FILE.parquet")] = None,
+    open_: Annotated[int | None, opt.option(
+        "Open the moment of this hit in the page of log2sim view.", "N", "--open", min=1)] = None,
+    probability: opt.LeastProbability = 0.3,
+    fields: Annotated[bool, opt.option("List the fields of these scenarios' tags.", None, "--fields")] = False,
+    fresh: Annotated[bool, opt.option(
+        "Read all scenarios again, not only those that are new or changed.", None, "--fresh")] = False,
+    jobs: Annotated[int | None, opt.option("Processes that tag.", "N", min=1, default="one for each core")] = None,
+    scheduler: Annotated[str | None, opt.option(
+        "Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
+    as_json: opt.AsJson = False,
+    overwrite: opt.Overwrite = False,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Find situations in many scenarios by a condition on their tags.
+
+    FOLDER/tags.parquet keeps the tags. A condition has tags, fields, numbers and texts with and, or, not, < <= > >= == !=, in and
+    arithmetic; ego, agent and other have speed_mps, acceleration_mps2, confidence and category. A second tag is true where it shares
+    a road user and a time with the first: 'cut_in and hard_braking.deceleration_mps2 > 5'.
+
+    Tags: in_lane, lane_change, turning, u_turn, starting, stopping, standing, standing_at_light, standing_at_crosswalk, hard_braking,
+    following, approaching, cut_in, cut_out, merging, overtaking, crossing_path, turning_across, oncoming_in_lane, stepping_out, near_miss.
+
+    Examples
+    --------
+    log2sim find results/ "cut_in and ttc_s < 2 and ego.speed_mps > 10" -o hits.html
+    """
+    from log2sim.files.documents import check_targets
+    from log2sim.scenarios.hits import say_hit, say_quantities, write_hits
+    from log2sim.scenarios.index import open_index, write_table
+    from log2sim.scenarios.query import ask
+
+    check_targets(out, table, overwrite=overwrite)
+    quiet = quiet or as_json
+    opt.require_own_workers(jobs, scheduler)
+    with progress(quiet=quiet) as report_progress:
+        index = open_index(
+            path, fresh=fresh, jobs=jobs, map_files=_on_workers(scheduler) if scheduler else None,
+            progress=lambda done, total: report_progress("scenarios", done, total),
+        )  # fmt: skip
+    opt.say_all("left out", index.problems, quiet=quiet)
+    if fields or not condition:
+        for line in format_rows(_overview(index, fields=fields)):
+            opt.say(line)
+        return
+    found = ask(index, condition, min_probability=probability)
+    if as_json:
+        import json
+
+        opt.say(json.dumps(list(found.rows), ensure_ascii=False))
+    for k, row in enumerate(found.rows[:MAX_LISTED]):
+        opt.say(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}", quiet=quiet)
+    more = len(found.rows) - MAX_LISTED
+    if more > 0:
+        opt.say(f"and {more} more; --out and --table have all", quiet=quiet)
+    opt.say(f"{opt.counted(len(found.rows), 'hit')} in {opt.counted(index.scenarios, 'scenario')}", quiet=quiet)
+    for line in found.closest:
+        opt.say(line, quiet=quiet)
+    if out is not None:
+        write_hits(out, index, condition, found.rows)
+    if table is not None:
+        write_table(table, found.rows)
+    opt.report_written(out, table, quiet=quiet)
+    if open_ is not None:
+        if open_ > len(found.rows):
+            raise ConfigError(f"--open {open_}: there are {opt.counted(len(found.rows), 'hit')}")
+        opt.say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet)
+
+
+def _on_workers(scheduler: str) -> MapFiles:
+    """Return a function that maps over files on the workers of a scheduler."""
+    from log2sim.batch.run import workers_of
+
+    def run(work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
+        with workers_of(scheduler) as workers:
+            yield from map_on_workers(workers.client, work, names)
+
+    return run
+
+
+def map_on_workers(client: Any, work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
+    """Yield what a function makes of files on the workers of a client, in any order; each result is freed once it was taken."""
+    from distributed import as_completed
+
+    for future in as_completed(client.map(work, [str(Path(n).resolve()) for n in names], pure=False)):
+        yield future.result()
+
+
+def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
+    """Count tags, or list fields with their ranges."""
+    import pyarrow.compute as pc
+
+    from log2sim.datatypes import TAGS
+
+    if not fields:
+        counts = {entry["values"]: entry["counts"] for entry in pc.value_counts(index.table["tag"]).to_pylist()}
+        return [("tag", "count", ""), *((name, str(counts[name]), TAGS[name]) for name in TAGS if name in counts)]
+    rows = [("field", "known", "from to")]
+    for name in index.table.column_names:
+        column = index.table[name]
+        known = len(column) - column.null_count
+        span = pc.min_max(column).as_py() if known and str(column.type) == "double" else None
+        rows.append((name, str(known), f"{span['min']:.4g} {span['max']:.4g}" if span else ""))
+    return rows
+
+
+def _opened(index: Index, row: Row, number: int, out: Path | None) -> str:
+    """Write the page of a hit's scenario, open it in a browser at the moment, and return its address."""
+    import tempfile
+    import webbrowser
+    from urllib.parse import quote
+
+    from log2sim.datatypes import Scenario
+    from log2sim.visualization.page.writer import write_page
+
+    page = (
+        out.with_name(f"{out.stem}-{number}.html")
+        if out is not None
+        else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{number}.html"
+    )
+    write_page(Scenario.load(index.folder / row["file"]), page, overwrite=True)
+    address = f"{page.resolve().as_uri()}#t={row['t_s']:.2f}&agent={quote(row['agent'])}"
+    webbrowser.open(address)
+    return address
+
+
+def vary(
+    path: opt.ScenarioFolder,
+    condition: opt.Condition,
+    out: Annotated[Path, opt.write_to("DIR", "Folder for the concrete scenarios, their table and the distribution.")],
+    count: Annotated[int, opt.option("Concrete scenarios to draw.", "N", min=1, max=100_000)] = 64,
+    sampler: Annotated[str, opt.choose("--sampler", "sobol|lhs|random", "How parameters are drawn.")] = "sobol",
+    seed: Annotated[int, opt.option("Seed of the draw.", min=0)] = 0,
+    probability: opt.LeastProbability = 0.3,
+    keep: Annotated[bool, opt.option("Write those, too, that something speaks against.", None, "--keep")] = False,
+    openscenario: Annotated[
+        bool, opt.option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")
+    ] = False,
+    overwrite: opt.OverwriteFolder = False,
+    quiet: opt.Quiet = False,
+) -> None:
+    """Vary a situation: fit the distribution of its parameters over all that are found, and draw concrete scenarios.
+
+    The most usual hit is the base: its agents keep their paths and drive them faster or slower, earlier or later. DIR/logical.json has the
+    distribution, DIR/variations.parquet a row for each draw with what speaks against it, DIR/N/scenario.json the concrete scenarios.
+
+    Examples
+    --------
+    log2sim vary results/ "cut_in and other == 'ego'" -o variations/ --count 256 --openscenario
+    """
+    from log2sim.datatypes import Scenario
+    from log2sim.files.documents import refuse_folder, write_json
+    from log2sim.scenarios.index import open_index, write_rows
+    from log2sim.scenarios.logical import Base, choose_base, concrete, fit, write_openscenario
+    from log2sim.scenarios.query import ask
+
+    refuse_folder(out, overwrite=overwrite, holding="logical.json", kind="folder of variations")
+    index = open_index(path)
+    rows = ask(index, condition, min_probability=probability).rows
+    logical = fit(rows)
+    chosen = choose_base(logical, rows)
+    base = Base.of(Scenario.load(index.folder / chosen["file"]), chosen)
+    values = logical.sample(count, sampler, seed)
+    table, kept = [], []
+    with replaced_folder(out, overwrite=overwrite) as folder:
+        for k, (made, problems) in enumerate(concrete(base, logical, values)):
+            written = keep or not problems
+            if written:
+                made.save(folder / f"{k + 1:05}" / "scenario.json")
+                kept.append(k)
+            file = f"{k + 1:05}/scenario.json" if written else None
+            table.append({"file": file, **dict(zip(logical.names, values[k].tolist())), "problem": "; ".join(problems)})
+        write_rows(folder / "variations.parquet", table)
+        about = {
+            "tag": chosen["tag"],
+            "condition": condition,
+            "base": {k: chosen[k] for k in ("file", "agent", "t_s")},
+            "seed": seed,
+        }
+        write_json(folder / "logical.json", {**about, "sampler": sampler, **logical.to_dict()})
+        if openscenario:
+            write_openscenario(base, [base.timings(logical, values[k]) for k in kept], folder / "openscenario")
+    described = logical.to_dict()["parameters"]
+    head = ("parameter", "found from", "to", "5 %", "median", "95 %")
+    shown = [
+        (
+            name,
+            f"{p['least']:.4g}",
+            f"{p['greatest']:.4g}",
+            *(f"{p['quantiles'][q]:.4g}" for q in ("0.05", "0.5", "0.95")),
+        )
+        for name, p in described.items()
+    ]
+    for line in format_rows([head, *shown]):
+        opt.say(line, quiet=quiet)
+    opt.say(
+        f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "
+        f"in {chosen['file']} at {chosen['t_s']:.1f} s",
+        quiet=quiet,
+    )
+    refused = [row["problem"] for row in table if row["problem"]]
+    if refused:
+        opt.say(
+            f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}", quiet=quiet
+        )
+
+
+def test_(
+    policy: Annotated[str, typer.Argument(metavar="POLICY", help="Policy for the ego, as replay --ego takes it.")],
+    path: opt.ScenarioFolder,
+    condition: opt.Condition,
+    out: Annotated[Path, opt.write_to("DIR", "Folder for the report and the worst runs.")],
+    runs: Annotated[int, opt.option("Runs in all.", "N", min=40, max=100_000)] = 400,
+    limit: Annotated[list[str] | None, opt.option(
+        "A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE")] = None,
+    agents: Annotated[str, opt.choose("--agents", "scenario|reactive", "Behavior of the other agent.")] = "scenario",
+    latency: Annotated[str, opt.option(
+        "How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")] = "0",
+    noise: Annotated[float, opt.option(
+        "Standard deviation of where it sees them, m, on each axis.", "M", min=0.0, max=10.0)] = 0.0,
+    worst: Annotated[int, opt.option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
+    seed: Annotated[int, opt.option("Seed of all draws.", min=0)] = 0,
+    jobs: Annotated[int | None, opt.option("Processes.", "N", min=1, default="one for each core")] = None,
+    overwrite: opt.OverwriteFolder = False,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """Test a policy in variations of a situation: where it fails, how critical, how likely.
+
+    The situation is varied as by vary; runs are drawn ever nearer to where the policy fails, and the probability of failure over the
+    distribution of all hits is estimated with its interval of 95 %. A policy that raises fails, and the report has its traceback.
+
+    Examples
+    --------
+    log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o test/ --limit min_ttc_s=0.5
+    log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o late/ --latency 0.3:0.05 --noise 0.2
+    """
+    from dataclasses import asdict
+    from functools import partial
+
+    import numpy as np
+
+    from log2sim.datatypes import Scenario
+    from log2sim.files.documents import refuse_folder, write_json
+    from log2sim.files.processes import default_jobs, map_in_processes
+    from log2sim.scenarios.failure import (
+        LIMITS,
+        describe,
+        drive,
+        judge_run,
+        report_page,
+        say_estimate,
+        search,
+        with_ego,
+    )
+    from log2sim.scenarios.index import open_index, write_rows
+    from log2sim.scenarios.logical import Base, choose_base, fit
+    from log2sim.scenarios.query import ask
+    from log2sim.simulation.metrics.all_metrics import parse_limits
+    from log2sim.simulation.policy import load_policy
+    from log2sim.simulation.sensing import DelayedPolicy, parse_sensing
+    from log2sim.visualization.page.writer import write_page
+
+    refuse_folder(out, overwrite=overwrite, holding="test.json", kind="folder of a test")
+    limits, driver = parse_limits(limit or (), list(LIMITS)), load_policy(policy)
+    sensing = parse_sensing(latency, noise)
+    if sensing:
+        driver = DelayedPolicy(driver, sensing)
+    index = open_index(path)
+    rows = ask(index, condition).rows
+    logical = fit(rows)
+    chosen = choose_base(logical, rows)
+    base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
+    outcomes: list[Outcome] = []
+    values: list[Array] = []
+    work = partial(judge_run, base, logical, driver, limits, agents)
+    with progress(quiet=quiet) as report_progress:
+
+        def margins(scores: Array) -> Array:
+            drawn = logical.from_scores(scores)
+            values.extend(drawn)
+            for outcome in map_in_processes(work, list(drawn), jobs or default_jobs()):
+                outcomes.append(outcome)
+                report_progress("runs", len(outcomes), runs)
+            return np.array([o.margin for o in outcomes[-len(drawn) :]])
+
+        found = search(margins, len(logical.names), runs, np.random.default_rng(seed))
+    if all(o.problem for o in outcomes):
+        raise ConfigError(f"policy '{policy}': raises in every run: {outcomes[0].problem.strip().splitlines()[-1]}")
+    table = np.array(values)
+    with replaced_folder(out, overwrite=overwrite) as folder:
+        links = {}
+        for k in [k for k in np.argsort(found.margins).tolist() if not outcomes[k].problem][:worst]:
+            made, done = drive(base, logical, driver, agents, table[k])
+            name = f"run-{k + 1:05}"
+            made.save(folder / name / "scenario.json")
+            done.save(folder / name / "replay.json")
+            write_page(made, folder / name / "view.html", replay=done)
+            links[k] = f"{name}/view.html"
+        title = f"{policy} in variations of {condition}"
+        (folder / "report.html").write_text(
+            report_page(title, logical, table, outcomes, found.estimate, links), encoding="utf-8"
+        )
+        write_json(
+            folder / "test.json", {**describe(policy, condition, logical, found, outcomes), "sensing": asdict(sensing)}
+        )
+        figures = sorted({key for o in outcomes for key in o.values})
+        write_rows(
+            folder / "runs.parquet",
+            [
+                {**dict(zip(logical.names, table[k].tolist())), "margin": float(o.margin), **{f: o.values.get(f) for f in figures}, "problem": o.problem}
+                for k, o in enumerate(outcomes)
+            ],
+        )  # fmt: skip
+    failures = int((found.margins <= 0).sum())
+    opt.say(
+        f"{opt.counted(failures, 'failure')} in {opt.counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}",
+        quiet=quiet,
+    )
+    errors = sum(bool(o.problem) for o in outcomes)
+    if errors:
+        opt.say(f"the policy raised in {opt.counted(errors, 'run')}; the report has the traceback", quiet=quiet)
+    opt.say(f"{out / 'report.html'}: written", quiet=quiet)
