@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from entry import commands_in, run_named
 from fits import late_fusion
 from ground_worlds import World, empty_scenario, world_log
 from localization_worlds import BEND, HOUSES, LIDAR, drive
+from mutants import MUTANTS
 from profile_ticks import Measured, Times, figures, show
 from worlds import tiny_toml
 
@@ -24,6 +27,7 @@ from log2sim.road.ground_map import GroundMap
 
 pytestmark = pytest.mark.slow
 
+PAPERS = ("zou2021", "two_stream")
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
 
@@ -44,6 +48,26 @@ def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFix
         with pytest.raises(SystemExit, match="0"):
             run_named(folder, [name, "--help"])
         assert "usage" in capsys.readouterr().out.lower()
+
+
+def test_documents_give_options_that_the_tools_have() -> None:
+    pytest.importorskip("torch")
+    root, folders = TOOLS.parent, {"bench": "benchmarks", "fit": "fits"}
+    pages = [*root.glob("*.md"), root / "log2sim/README.md", *root.glob("samples/cookbook/*.md")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages).replace("\\\n", " ")
+    for tool, name, rest in re.findall(r"tools/(\w+)\.py(?: (\w+))?([^`\n#]*)", text):
+        inner = f"{folders[tool]}.{name}" if tool in folders else f"lidar_training.{name}" if name in PAPERS else tool
+        asked = {option.replace("-", "_").removeprefix("no_") for option in re.findall(r" --([a-z-]+)", rest)}
+        if asked and name != "NAME":
+            known = set(inspect.signature(importlib.import_module(inner).main).parameters)
+            assert asked <= known or not known - {"arguments", "argv"}, (tool, name, rest)
+
+
+def test_every_mutant_changes_what_is_there_once() -> None:
+    for name, file, old, new, tests in MUTANTS:
+        assert (TOOLS.parent / "log2sim" / file).read_text(encoding="utf-8").count(old) == 1, name
+        assert new != old
+        assert all((TOOLS.parent / f"tests/test_{of}.py").is_file() for of in tests.split()), name
 
 
 def test_every_tool_can_be_imported() -> None:

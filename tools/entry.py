@@ -19,14 +19,15 @@ SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 def run(main: Callable[..., Any], doc: str | None, arguments: list[str] | None = None, name: str = "") -> Any:
     """Run a `main` with the arguments of the command line: parameters with a default are options, the docstring is the help.
 
-    It ends the process with what `main` returns.
+    It ends the process, with the number that `main` returns if it does.
     """
     if next(iter(main.__code__.co_varnames), "") in ("arguments", "argv"):
-        sys.exit(main(arguments) or 0)
+        sys.exit(main(arguments))
 
     @wraps(main)
     def command(**values: Any) -> None:
-        sys.exit(main(**values) or 0)
+        code = main(**values)
+        sys.exit(code if isinstance(code, int) else 0)
 
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     # Paragraphs stay as they are.

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +19,7 @@ from color_training.pictures import draw_shape, draw_view, draw_world
 from entry import parser_of
 from lidar_training import fitting
 from lidar_training.export import describe, export_checked
-from lidar_training.fitting import FitPlan
+from lidar_training.fitting import FitPlan, draw_once
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -33,23 +35,16 @@ PARTS = {"train": 0, "tune": 1, "report": 2}  # parts of the seed: other shapes,
 
 def draw(out: Path, part: str, number: int, worlds: int, views: int, seed: int) -> Path:
     """Draw pictures of worlds into a file, which is kept."""
-    path = out / f"{part}-{seed}-{number:03d}.npz"
-    if path.exists():
-        return path
-    rng, begun = np.random.default_rng([seed, PARTS[part], number]), time.process_time()
-    shapes = [draw_shape(rng) for _ in range(SHAPES_PER_FILE)]
-    pictures, names, labs, lights = [], [], [], []
-    for _ in range(worlds):
-        world = draw_world(rng)
-        pictures.append([draw_view(world, shapes[int(rng.integers(len(shapes)))], rng) for _ in range(views)])
-        names.append(COLOR_NAMES.index(world.name))
-        labs.append(world.lab)
-        lights.append(world.light)
-    temporary = path.with_suffix(".part.npz")
-    np.savez(temporary, picture=np.array(pictures), name=np.array(names), lab=np.array(labs), light=np.array(lights))
-    temporary.replace(path)
-    print(f"{path.name}: {(time.process_time() - begun) / (worlds * views) * 1e3:.1f} ms of CPU a picture", flush=True)
-    return path
+
+    def rows() -> Iterator[dict[str, Any]]:
+        rng = np.random.default_rng([seed, PARTS[part], number])
+        shapes = [draw_shape(rng) for _ in range(SHAPES_PER_FILE)]
+        for _ in range(worlds):
+            world = draw_world(rng)
+            pictures = [draw_view(world, shapes[int(rng.integers(len(shapes)))], rng) for _ in range(views)]
+            yield {"picture": pictures, "name": COLOR_NAMES.index(world.name), "lab": world.lab, "light": world.light}
+
+    return draw_once(out / f"{part}-{seed}-{number:03d}.npz", rows())
 
 
 class Names(nn.Module):

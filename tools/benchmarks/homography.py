@@ -204,31 +204,12 @@ def asked(peer: Peer, threshold: float, xy: Array, uv: Array) -> Array:
     return np.asarray(inverse)
 
 
-@dataclass
-class Score:
-    """Medians over ticks and probes: seconds a tick, errors near and far, jitter far, all in m."""
-
-    seconds: list[float]
-    near: list[float]
-    far: list[float]
-    jitter: list[float]
-
-    @classmethod
-    def empty(cls) -> Score:
-        return cls([], [], [], [])
-
-    def add(self, found: Array, stream: Stream, seconds: float) -> None:
-        """`found` (T, 3, 3) `ground_H_image` of each tick; a tick without one counts as infinitely wrong."""
-        with np.errstate(all="ignore"):
-            for values, ranges in ((self.near, NEAR_M), (self.far, FAR_M)):
-                values.append(float(np.median(np.nan_to_num(errors_m(found, stream, ranges), nan=np.inf))))
-            moved = np.linalg.norm(np.diff(mapped(found, mapped(camera(), probes(FAR_M))), axis=0), axis=-1)
-        self.jitter.append(float(np.nanmedian(moved)) if np.isfinite(moved).any() else float("nan"))
-        self.seconds.append(seconds / len(stream.image_H_ground))
-
-    def cell(self) -> str:
-        near, far = np.median(self.near), np.median(self.far)
-        return " / ".join("fails" if not np.isfinite(v) or v > 99 else f"{v:.3f}" for v in (near, far))
+def scores_of(found: Array, stream: Stream) -> tuple[float, float, float]:
+    """Medians over ticks and probes of `found` (T, 3, 3) `ground_H_image`: errors near and far, jitter far, m; a tick without one is infinitely wrong."""
+    with np.errstate(all="ignore"):
+        near, far = (float(np.median(np.nan_to_num(errors_m(found, stream, r), nan=np.inf))) for r in (NEAR_M, FAR_M))
+        moved = np.linalg.norm(np.diff(mapped(found, mapped(camera(), probes(FAR_M))), axis=0), axis=-1)
+    return near, far, float(np.nanmedian(moved)) if np.isfinite(moved).any() else float("nan")
 
 
 def ours(stream: Stream, method: str, repeats: int, **options: Any) -> tuple[Array, float]:
@@ -242,14 +223,14 @@ def ours(stream: Stream, method: str, repeats: int, **options: Any) -> tuple[Arr
     return each, seconds
 
 
-def measure(case: Case, seeds: int, repeats: int, thresholds: dict[str, tuple[float, float]]) -> dict[str, Score]:
-    """Scores of all methods on one case."""
-    out: dict[str, Score] = {}
+def measure(case: Case, seeds: int, repeats: int, thresholds: dict[str, tuple[float, float]]) -> dict[str, Array]:
+    """Seconds a tick and scores (4,) of all methods on one case, medians over streams."""
+    out: dict[str, list[tuple[float, ...]]] = {}
     for seed in range(seeds):
         stream = make_stream(case, seed)
         for name, (found, seconds) in answers(stream, case, repeats, thresholds).items():
-            out.setdefault(name, Score.empty()).add(found, stream, seconds)
-    return out
+            out.setdefault(name, []).append((seconds / len(stream.image_H_ground), *scores_of(found, stream)))
+    return {name: np.median(rows, axis=0) for name, rows in out.items()}
 
 
 def answers(
@@ -310,11 +291,10 @@ def table(cases: dict[str, Case], seeds: int, repeats: int, thresholds: dict[str
     scores = {name: measure(case, seeds, repeats, thresholds) for name, case in cases.items()}
     timed_case = list(cases)[min(1, len(cases) - 1)]
     rows = []
-    for method in scores[timed_case]:
-        score = scores[timed_case][method]
-        seconds, jitter = np.median(score.seconds), np.median(score.jitter)
-        cells = ["" if not np.isfinite(seconds) else f"{seconds * 1e3:.3f}", f"{jitter:.3f}"]
-        rows.append([method, *cells, *(scores[c][method].cell() for c in cases)])
+    for method, (seconds, _, _, jitter) in scores[timed_case].items():
+        errors = [scores[name][method][1:3] for name in cases]
+        cells = [" / ".join("fails" if not np.isfinite(v) or v > 99 else f"{v:.3f}" for v in pair) for pair in errors]
+        rows.append([method, f"{seconds * 1e3:.3f}" if np.isfinite(seconds) else "", f"{jitter:.3f}", *cells])
     return markdown(["method", f"ms a frame ({timed_case})", f"jitter far, m ({timed_case})", *cases], rows)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,43 +54,44 @@ def negative_stamps() -> Outcome:
     return same(later(-int(sound().scenario.t0_ns) - 100_000_000), 1e-9)
 
 
-@case("stamps: every record twice", "repetitions left out and noted, the same scenario")
-def repeated_stamps() -> Outcome:
-    def repeat(folder: Path) -> None:
-        for file in (folder / "front/index.csv", folder / "top/index.csv", folder / "ego/poses.csv"):
-            head, *rows = file.read_text().splitlines()
-            file.write_text("\n".join([head, *(r for row in rows for r in (row, row))]) + "\n")
+INDICES = ("front/index.csv", "top/index.csv", "ego/poses.csv")
 
-    with folder_of(repeat) as folder:
+
+def with_lines(folder: Path, change: Callable[[list[str]], list[str]], names: tuple[str, ...] = INDICES) -> None:
+    """Change the lines of some tables below their heads."""
+    for name in names:
+        head, *rows = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join([head, *change(rows)]) + "\n")
+
+
+def put_in_order(change: Callable[[list[str]], list[str]], words: tuple[str, ...] = ("",)) -> Outcome:
+    """The log gives the same scenario with its lines changed, and a note with one of some words."""
+    with folder_of(lambda folder: with_lines(folder, change)) as folder:
         log = open_log(folder)
         outcome = same(reconstruct(log, LABELS), 1e-9)
-    noted = sum("repeat" in n or "same stamp" in n or "twice" in n or "duplicate" in n for n in log.notes)
+    noted = sum(any(word in note for word in words) for note in log.notes)
     return replace(outcome, ok=outcome.ok and noted > 0, found=f"{outcome.found}, {noted} notes")
+
+
+@case("stamps: every record twice", "repetitions left out and noted, the same scenario")
+def repeated_stamps() -> Outcome:
+    return put_in_order(
+        lambda rows: [r for row in rows for r in (row, row)], ("repeat", "same stamp", "twice", "duplicate")
+    )
 
 
 @case("stamps: in reverse order", "put in order and noted, the same scenario")
 def reversed_stamps() -> Outcome:
-    def reverse(folder: Path) -> None:
-        for file in (folder / "front/index.csv", folder / "top/index.csv", folder / "ego/poses.csv"):
-            head, *rows = file.read_text().splitlines()
-            file.write_text("\n".join([head, *reversed(rows)]) + "\n")
-
-    with folder_of(reverse) as folder:
-        log = open_log(folder)
-        outcome = same(reconstruct(log, LABELS), 1e-9)
-    return replace(outcome, ok=outcome.ok and len(log.notes) > 0, found=f"{outcome.found}, {len(log.notes)} notes")
+    return put_in_order(lambda rows: rows[::-1])
 
 
 @case("stamps: a frame 1 us after another", "one tick each, nobody lost")
 def microsecond_frame() -> Outcome:
-    def double(folder: Path) -> None:
-        file = folder / "front/index.csv"
-        lines = file.read_text().splitlines()
-        t_ns, image = lines[3].split(",", 1)
-        lines.insert(4, f"{int(t_ns) + 1000},{image}")
-        file.write_text("\n".join(lines) + "\n")
+    def double(rows: list[str]) -> list[str]:
+        t_ns, image = rows[2].split(",", 1)
+        return [*rows[:3], f"{int(t_ns) + 1000},{image}", *rows[3:]]
 
-    result = result_of(double)
+    result = result_of(lambda folder: with_lines(folder, double, INDICES[:1]))
     ok, found = known_and_finite(result, 3)
     increasing = all((np.diff(a.waypoints.t_s) > 0).all() for a in result.scenario.agents)
     return Outcome(ok and increasing and result.report["ticks"] == sound().report["ticks"] + 1, found)
@@ -97,12 +99,8 @@ def microsecond_frame() -> Outcome:
 
 @case("stamps: two frames a sweep", "nobody lost")
 def slow_lidar() -> Outcome:
-    def thin(folder: Path) -> None:
-        file = folder / "top/index.csv"
-        head, *rows = file.read_text().splitlines()
-        file.write_text("\n".join([head, *rows[::2]]) + "\n")
-
-    return Outcome(*known_and_finite(result_of(thin), 3))
+    result = result_of(lambda folder: with_lines(folder, lambda rows: rows[::2], INDICES[1:2]))
+    return Outcome(*known_and_finite(result, 3))
 
 
 # --- records
@@ -135,13 +133,19 @@ def empty_sweep() -> Outcome:
     return Outcome(ok and count == 1, f"{found}, {count} unreadable")
 
 
+def cut_pictures(which: slice) -> Result:
+    """Reconstruct the log with pictures that end in their middle."""
+
+    def cut(folder: Path) -> None:
+        for file in sorted((folder / "front").glob("*.jpg"))[which]:
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+    return result_of(cut, decode_images=True)
+
+
 @case("image: one cut in half", "counted, the others do")
 def cut_image() -> Outcome:
-    def cut(folder: Path) -> None:
-        file = sorted((folder / "front").glob("*.jpg"))[1]
-        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
-    result = result_of(cut, decode_images=True)
+    result = cut_pictures(slice(1, 2))
     ok, found = known_and_finite(result, 2)
     count = result.report["unreadable"].get("front", {}).get("count", 0)
     return Outcome(ok and count == 1, f"{found}, {count} unreadable")
@@ -149,12 +153,8 @@ def cut_image() -> Outcome:
 
 @case("image: all cut in half", "refused, naming the stream")
 def cut_images() -> Outcome:
-    def cut(folder: Path) -> None:
-        for file in (folder / "front").glob("*.jpg"):
-            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-
     try:
-        result_of(cut, decode_images=True)
+        cut_pictures(slice(None))
     except LogError as error:
         return Outcome("stream 'front'" in str(error), "refused: stream 'front'")
     return Outcome(False, "accepted")

@@ -1,12 +1,13 @@
-"""Fitting of a network: seeded steps, averaged weights, checkpoints from which it goes on."""
+"""Fitting of a network: data drawn once, seeded steps, averaged weights, checkpoints from which it goes on."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,18 @@ REPORT_STEPS = 50
 LAST_RATE = 1e-5
 
 StepLoss = Callable[[nn.Module, np.random.Generator, int], tuple[Tensor, dict[str, float]]]
+
+
+def draw_once(path: Path, rows: Iterable[Mapping[str, Any]]) -> Path:
+    """Write what is drawn, one array a key, into a file that is kept: if it is there, nothing is drawn."""
+    if path.exists():
+        return path
+    begun, kept = time.process_time(), list(rows)
+    temporary = path.with_suffix(".part.npz")
+    np.savez(temporary, **{key: np.array([row[key] for row in kept]) for key in kept[0]})
+    temporary.replace(path)
+    print(f"{path.name}: {(time.process_time() - begun) / len(kept) * 1e3:.1f} ms of CPU a row", flush=True)
+    return path
 
 
 @dataclass(frozen=True)

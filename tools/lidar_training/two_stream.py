@@ -392,56 +392,37 @@ def crops(features: Tensor, boxes: Tensor) -> Tensor:
     return sampled[0].permute(1, 0, 2).flatten(1)
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Inputs of one pair as tensors, with as many anchors as a step takes."""
-
-    bev: Tensor
-    image: Tensor
-    bev_boxes: Tensor
-    image_boxes: Tensor
-    kind: Tensor
-    label: Tensor
-    goal: Tensor
-
-    @classmethod
-    def of(cls, inputs: Inputs, rng: np.random.Generator | None = None) -> Batch:
-        """Take all anchors, or all positive and some others."""
-        rows = np.arange(len(inputs.kind))
-        if rng is not None and len(rows) > MAX_ANCHORS:
-            positive = np.flatnonzero(inputs.label == POSITIVE)
-            others = np.flatnonzero(inputs.label == NEGATIVE)
-            count = min(len(others), max(MAX_ANCHORS - len(positive), 0))
-            rows = np.concatenate([positive, rng.choice(others, count, replace=False)])
-        columns = (inputs.bev_boxes, inputs.image_boxes, inputs.kind, inputs.label, inputs.goal)
-        return cls(
-            torch.from_numpy(inputs.bev[None]), torch.from_numpy(inputs.image[None]),
-            *(torch.from_numpy(c[rows]) for c in columns),
-        )  # fmt: skip
-
-    def run(self, network: nn.Module) -> tuple[Tensor, Tensor]:
-        """Return logits (N,) and box codes (N, 7) for the class of each anchor."""
-        logits, codes = network(self.bev, self.image, self.bev_boxes, self.image_boxes)
-        rows = torch.arange(len(self.kind))
-        return logits[rows, self.kind], codes[rows, self.kind]
+Batch = tuple[Tensor, ...]
 
 
-def loss_of_anchors(logits: Tensor, codes: Tensor, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+def batch_of(inputs: Inputs, rng: np.random.Generator | None = None) -> Batch:
+    """Map, picture, boxes in both, kinds, labels and goals as tensors, of all anchors, or all positive and some others."""
+    rows = np.arange(len(inputs.kind))
+    if rng is not None and len(rows) > MAX_ANCHORS:
+        positive, others = np.flatnonzero(inputs.label == POSITIVE), np.flatnonzero(inputs.label == NEGATIVE)
+        count = min(len(others), max(MAX_ANCHORS - len(positive), 0))
+        rows = np.concatenate([positive, rng.choice(others, count, replace=False)])
+    columns = (inputs.bev_boxes, inputs.image_boxes, inputs.kind, inputs.label, inputs.goal)
+    return tuple(map(torch.from_numpy, (inputs.bev[None], inputs.image[None], *(c[rows] for c in columns))))
+
+
+def loss_of_anchors(network: nn.Module, batch: Batch) -> tuple[Tensor, dict[str, float]]:
     """Focal loss of the scores and Smooth L1 of the boxes, not weighted against each other.
 
     The paper divides the focal loss by the number of boxes, which makes it vanish beside the other where nearly all anchors
     are empty; both are divided by the number of positive ones, as RetinaNet does (Lin et al., ICCV 2017). Its alpha counts
     for objects, 1 - alpha for the rest, as there.
     """
-    positive = (batch.label == POSITIVE).float()
-    judged = (batch.label >= NEGATIVE).float()
+    *inputs, kind, label, goal = batch
+    logits, codes = (values[torch.arange(len(kind)), kind] for values in network(*inputs))
+    positive, judged = (label == POSITIVE).float(), (label >= NEGATIVE).float()
     count = positive.sum().clamp(min=1)
-    own = torch.where(batch.label == POSITIVE, logits, -logits)
-    weight = torch.where(batch.label == POSITIVE, ALPHA, 1 - ALPHA)
+    own = torch.where(label == POSITIVE, logits, -logits)
+    weight = torch.where(label == POSITIVE, ALPHA, 1 - ALPHA)
     focal = -weight * torch.sigmoid(-own) ** GAMMA * F.logsigmoid(own)
     parts = {
         "class": (focal * judged).sum() / count,
-        "box": (F.smooth_l1_loss(codes, batch.goal, reduction="none").sum(dim=1) * positive).sum() / count,
+        "box": (F.smooth_l1_loss(codes, goal, reduction="none").sum(dim=1) * positive).sum() / count,
     }
     return parts["class"] + parts["box"], {name: float(value.detach()) for name, value in parts.items()}
 
@@ -555,8 +536,7 @@ def train(pairs: list[Pair], out: Path, *, steps: int, seed: int) -> Path:
 
     def step(n: torch.nn.Module, rng: np.random.Generator, _: int) -> Any:
         pair = pairs[int(rng.integers(len(pairs)))]
-        batch = Batch.of(inputs_of(pair, mirrored=bool(rng.random() < 0.5)), rng)
-        return loss_of_anchors(*batch.run(n), batch)
+        return loss_of_anchors(n, batch_of(inputs_of(pair, mirrored=bool(rng.random() < 0.5)), rng))
 
     network.load_state_dict(fit(network, step, FitPlan(steps, seed, PEAK_RATE, out / "checkpoint.pt")))
     export_two_stream(network, out / "two_stream.onnx")

@@ -1,0 +1,1 @@
+"""What the network that finds paint on roads is trained with."""
