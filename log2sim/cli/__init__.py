@@ -1,4 +1,4 @@
-"""The command line, one module a command."""
+"""The command line, one module for the commands of a task."""
 
 from __future__ import annotations
 

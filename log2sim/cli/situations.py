@@ -249,27 +249,18 @@ def vary(
             file = f"{k + 1:05}/scenario.json" if written else None
             table.append({"file": file, **dict(zip(logical.names, values[k].tolist())), "problem": "; ".join(problems)})
         write_rows(folder / "variations.parquet", table)
-        about = {
-            "tag": chosen["tag"],
-            "condition": condition,
-            "base": {k: chosen[k] for k in ("file", "agent", "t_s")},
-            "seed": seed,
-        }
-        write_json(folder / "logical.json", {**about, "sampler": sampler, **logical.to_dict()})
+        place = {k: chosen[k] for k in ("file", "agent", "t_s")}
+        about = {"tag": chosen["tag"], "condition": condition, "base": place, "seed": seed, "sampler": sampler}
+        write_json(folder / "logical.json", {**about, **logical.to_dict()})
         if openscenario:
             write_openscenario(base, [base.timings(logical, values[k]) for k in kept], folder / "openscenario")
     described = logical.to_dict()["parameters"]
     head = ("parameter", "found from", "to", "5 %", "median", "95 %")
-    shown = [
-        (
-            name,
-            f"{p['least']:.4g}",
-            f"{p['greatest']:.4g}",
-            *(f"{p['quantiles'][q]:.4g}" for q in ("0.05", "0.5", "0.95")),
-        )
-        for name, p in described.items()
-    ]
-    for line in format_rows([head, *shown]):
+    shown = [head]
+    for name, p in described.items():
+        figures = (p["least"], p["greatest"], *(p["quantiles"][q] for q in ("0.05", "0.5", "0.95")))
+        shown.append((name, *(f"{figure:.4g}" for figure in figures)))
+    for line in format_rows(shown):
         opt.say(line, quiet=quiet)
     opt.say(
         f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "

@@ -440,12 +440,8 @@ def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         out += [("road", "; ".join([*parts, *shapes]))] if parts or shapes else []
     colors, signals = result.get("colors"), result.get("signals")
     if colors is not None and colors["vehicles"]:
-        out.append(
-            (
-                "colors",
-                f"{colors['right']} of {colors['named']} right, {colors['with_color']} of {colors['vehicles']} vehicles have one",
-            )
-        )
+        right = f"{colors['right']} of {colors['named']} right"
+        out.append(("colors", f"{right}, {colors['with_color']} of {colors['vehicles']} vehicles have one"))
     if signals is not None:
         right = f", state right {whole_percent(signals['state_right'])} of the time" if signals["found"] else ""
         out.append(("signals", f"{signals['found']} of {signals['true']} found, {signals['false']} false{right}"))

@@ -167,16 +167,9 @@ class SurfelGrid:
         """Add points (N, 3), m, that are less than 30 km from the origin."""
         level = np.clip(np.ceil(np.log2(radius_m / (RADIUS_PER_CELL * CELL_M))), 0, LEVELS - 1).astype(np.int64)
         known = np.isfinite(intensity)
+        one, known_intensity = np.ones(len(points)), np.where(known, intensity, 0.0)
         sums = np.column_stack(
-            [
-                np.ones(len(points)),
-                points,
-                normal,
-                normal.any(axis=1),
-                radius_m,
-                np.where(known, intensity, 0.0),
-                known.astype(np.float64),
-            ]
+            [one, points, normal, normal.any(axis=1), radius_m, known_intensity, known.astype(float)]
         )
         self._pending.append(_summed(_keys(points, level), sums))
         if sum(len(k) for k, _ in self._pending) > self.PENDING_ROWS:

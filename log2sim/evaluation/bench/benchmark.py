@@ -467,23 +467,17 @@ def _panel_document(panel: Panel) -> dict[str, Any]:
         "error": {"figure": panel.error, "label": panel.label, "unit": panel.unit},
         "points": [
             {
-                "setting": p.setting,
-                "present": p.present,
-                "on_front": on_front,
-                "ms_per_tick": round(p.ms_per_tick, 4),
-                "error": rounded_tree(p.error),
-                "error_interval": _interval(p),
-                "figures": rounded_tree(p.figures),
+                "setting": p.setting, "present": p.present, "on_front": on_front, "ms_per_tick": round(p.ms_per_tick, 4),
+                "error": rounded_tree(p.error), "error_interval": _interval(p), "figures": rounded_tree(p.figures),
             }
             for p, on_front in zip(panel.points, panel.on_front, strict=True)
         ],
         "supports": {
-            "setting": recommendation.supported,
-            "present": recommendation.present,
+            "setting": recommendation.supported, "present": recommendation.present,
             "agrees": None if recommendation.supported is None else recommendation.agrees,
             "reason": recommendation.reason,
         },
-    }
+    }  # fmt: skip
 
 
 def _interval(point: settings.Point) -> list[float] | None:

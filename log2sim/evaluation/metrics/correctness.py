@@ -238,18 +238,12 @@ def _agent_rows(j: JudgedAgents, truth: StateTable) -> list[dict[str, Any]]:
     for k in np.flatnonzero(v.judged.any(axis=1)):
         ticks = v.judged[k]
         there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
-        rows.append(
-            {
-                "id": j.states.agents[k].id,
-                "category": str(j.states.category[k]),
-                "ticks": int(ticks.sum()),
-                "wrong_ticks": int((j.wrong[k] & ticks).sum()),
-                **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
-                "taken_for": {truth.agents[i].id if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
-                "confidence": float(j.confidence[k]),
-                "doubted": bool(j.reasons[k]),
-                "doubts": list(j.reasons[k]),
-                "mean_range_m": float(j.states.range_m[k, ticks].mean()),
-            }
-        )
+        rows.append({
+            "id": j.states.agents[k].id, "category": str(j.states.category[k]), "ticks": int(ticks.sum()),
+            "wrong_ticks": int((j.wrong[k] & ticks).sum()),
+            **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
+            "taken_for": {truth.agents[i].id if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
+            "confidence": float(j.confidence[k]), "doubted": bool(j.reasons[k]), "doubts": list(j.reasons[k]),
+            "mean_range_m": float(j.states.range_m[k, ticks].mean()),
+        })  # fmt: skip
     return rows

@@ -97,24 +97,16 @@ def agent_rows(c: comparison.Comparison) -> list[dict[str, Any]]:
         ids, ticks = np.unique(mine.other, return_counts=True)
         size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
         headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
-        rows.append(
-            {
-                "id": truth.agents[i].id,
-                "category": str(truth.category[i]),
-                "ticks": int(counted[i].sum()),
-                "matched": len(mine.other),
-                **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
-                "matched_ids": {other.agents[j].id: int(n) for j, n in zip(ids, ticks)},
-                "id_switches": int(switched[i].sum()),
-                "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
-                "position_rmse_m": verdicts.root_mean_square(mine.position_m),
-                "yaw_median_deg": verdicts.median(np.degrees(headed)),
-                "speed_rmse_mps": verdicts.root_mean_square(mine.speed_mps),
-                "length_error_m": float(size[0]),
-                "width_error_m": float(size[1]),
-                "height_error_m": float(size[2]),
-            }
-        )
+        rows.append({
+            "id": truth.agents[i].id, "category": str(truth.category[i]), "ticks": int(counted[i].sum()),
+            "matched": len(mine.other), **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
+            "matched_ids": {other.agents[j].id: int(n) for j, n in zip(ids, ticks)},
+            "id_switches": int(switched[i].sum()), "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
+            "position_rmse_m": verdicts.root_mean_square(mine.position_m),
+            "yaw_median_deg": verdicts.median(np.degrees(headed)),
+            "speed_rmse_mps": verdicts.root_mean_square(mine.speed_mps),
+            **{f"{side}_error_m": float(v) for side, v in zip(("length", "width", "height"), size)},
+        })  # fmt: skip
     return rows
 
 
@@ -448,17 +440,12 @@ def _figures(
         **hota(c.pairs, counted, hit | false),
         "coverage": comparison.coverage(c, truth_selected),
         "counts": {
-            "truth_agents": int(agents.sum()),
-            "truth_agents_found": int((agents & found).sum()),
-            "truth_ticks": truth_ticks,
-            "matched_ticks": matched,
-            "missed_ticks": truth_ticks - matched,
-            "false_ticks": wrong,
-            "ignored_ticks": int((c.ignored & other_selected).sum()),
-            "reconstructed_agents": int(ours.sum()),
-            "false_agents": int((ours & ~real).sum()),
+            "truth_agents": int(agents.sum()), "truth_agents_found": int((agents & found).sum()),
+            "truth_ticks": truth_ticks, "matched_ticks": matched, "missed_ticks": truth_ticks - matched,
+            "false_ticks": wrong, "ignored_ticks": int((c.ignored & other_selected).sum()),
+            "reconstructed_agents": int(ours.sum()), "false_agents": int((ours & ~real).sum()),
         },
-    }
+    }  # fmt: skip
 
 
 def _while_observed(agent: Agent) -> Agent:

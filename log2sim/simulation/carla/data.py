@@ -161,22 +161,15 @@ def _agent(agent: Agent, turn: int, span_s: tuple[float, float]) -> dict[str, An
     exact, pid = _trajectories(agent, trajectory, drives=moves and wheeled)
     limits = parameters_for([agent]) if wheeled else None
     return {
-        "id": agent.id,
-        "category": agent.category,
-        "size_m": [round(v, 3) for v in agent.size_m],
-        "color": None if agent.color is None else list(agent.color["rgb"]),
-        "static": agent.static,
-        "doubts": [doubt.to_dict() for doubt in agent.doubts],
-        "assets": nearest_assets(agent, turn=turn),
-        "begin_s": life_s[0],
-        "end_s": life_s[1],
+        "id": agent.id, "category": agent.category, "size_m": [round(v, 3) for v in agent.size_m],
+        "color": None if agent.color is None else list(agent.color["rgb"]), "static": agent.static,
+        "doubts": [doubt.to_dict() for doubt in agent.doubts], "assets": nearest_assets(agent, turn=turn),
+        "begin_s": life_s[0], "end_s": life_s[1],
         "discontinuities_s": [float(t) for t in trajectory.discontinuity_times()],
         "drive": None if not moves else "vehicle" if wheeled else "walker" if agent.category == "pedestrian" else None,
         "max_throttle_mps2": None if limits is None else float(limits.max_throttle_mps2[0]),
-        "max_brake_mps2": None if limits is None else float(limits.max_brake_mps2[0]),
-        "exact": exact,
-        "pid": pid,
-    }
+        "max_brake_mps2": None if limits is None else float(limits.max_brake_mps2[0]), "exact": exact, "pid": pid,
+    }  # fmt: skip
 
 
 def _trajectories(

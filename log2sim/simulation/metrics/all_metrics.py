@@ -161,13 +161,8 @@ def _derivative(values: Array, order: int, window_s: float, spacing_s: float) ->
     half = min(max(round(window_s / spacing_s / 2), MIN_ROWS // 2), longest // 2)
     weights = _weights(half, order, spacing_s)
     values = values - values[0]  # far map offsets would cost digits
-    return np.concatenate(
-        [
-            weights[:half] @ values[: 2 * half + 1],
-            np.correlate(values, weights[half], mode="valid"),
-            weights[half + 1 :] @ values[-2 * half - 1 :],
-        ]
-    )
+    begin, end = weights[:half] @ values[: 2 * half + 1], weights[half + 1 :] @ values[-2 * half - 1 :]
+    return np.concatenate([begin, np.correlate(values, weights[half], mode="valid"), end])
 
 
 @lru_cache(maxsize=64)

@@ -360,17 +360,12 @@ def collisions(
         for begin_row, end_row in _merged_contacts(contact, SAME_CONTACT_S / spacing_s(t_s)):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
             own = (own_s[0] <= end + SCENARIO_WINDOW_S) & (own_s[1] >= begin - SCENARIO_WINDOW_S)
-            events.append(
-                {
-                    "agents": [ids[a], ids[b]],
-                    "t_s": round(float(begin), 6),
-                    "until_s": round(float(end), 6),
-                    "relative_speed_mps": round(_relative_speed(velocity, begin_row, a, b), 3),
-                    "belongs_to": source_kind if own.any() else REPLAY,
-                    "in_log": bool(own.any()),
-                    "from_start": bool(begin_row == together),
-                }
-            )
+            events.append({
+                "agents": [ids[a], ids[b]], "t_s": round(float(begin), 6), "until_s": round(float(end), 6),
+                "relative_speed_mps": round(_relative_speed(velocity, begin_row, a, b), 3),
+                "belongs_to": source_kind if own.any() else REPLAY, "in_log": bool(own.any()),
+                "from_start": bool(begin_row == together),
+            })  # fmt: skip
     return sorted(events, key=lambda e: (e["t_s"], e["agents"]))
 
 
