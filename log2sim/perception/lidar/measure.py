@@ -519,7 +519,8 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
             own, more = (place[index].astype(np.float64) for index in (seed, rest))
             added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
             seed, rest = np.union1d(seed, rest[added]), np.delete(rest, added)
-        # A side that goes on past the longest vehicle is a wall's.
-        if np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0).max() <= longest_m:
+        # Sides that go on past the longest and widest vehicle are a wall's.
+        sides_m = np.sort(np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0))
+        if (sides_m <= MAX_SIZE_M[category][1::-1]).all():
             free[seed], members[k] = False, seed
     return [cloud.obstacles[index] for index in members]
