@@ -264,8 +264,8 @@ def logit(p: Array) -> Array:
     return log_odds_of(np.clip(p, MIN_SCORE, MAX_SCORE))
 
 
-# A box that ends nearer to the image border may be cut by it: detectors place edges to some pixels and percent of a box's side.
-BORDER_PX, BORDER_SHARE = 3.0, 0.02
+# A box that ends nearer to the image border may be cut by it.
+BORDER_PX = 3.0
 # Vehicles that may be longer show flanks at such flat angles that rays are far apart on them.
 MIN_LONG_M = 10.0
 NEAR_END_QUANTILE = 0.05
@@ -274,9 +274,8 @@ MIN_EXTENT_M = 0.1
 
 
 def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
-    near_px = np.maximum(BORDER_PX, BORDER_SHARE * (box_px[:, 2:] - box_px[:, :2]))
-    far_px = np.array([camera.width_px, camera.height_px]) - box_px[:, 2:]
-    return np.asarray((box_px[:, :2] < near_px).any(axis=1) | (far_px < near_px).any(axis=1))
+    border = np.array([camera.width_px, camera.height_px]) - BORDER_PX
+    return np.asarray((box_px[:, :2] < BORDER_PX).any(axis=1) | (box_px[:, 2:] > border).any(axis=1))
 
 
 def _free_points(
