@@ -505,14 +505,14 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
     edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
     free = np.ones(len(xyz), dtype=bool)
     free[found.point] = False
-    members = [found.point[own][a:b] for a, b in pairwise(edges)]
+    members, place = [found.point[own][a:b] for a, b in pairwise(edges)], xyz[:, :2] - cloud.sensor[:2]
     for k, category in enumerate(boxes.category):
         longest_m, seed = MAX_SIZE_M[category][0], members[k]
         if longest_m < MIN_LONG_M or len(seed) < MIN_CLUSTER_POINTS:
             continue
         # The boxes of a detector that sees little of a long flank at a time end before it does.
         near = free & (np.abs(xyz[:, :2] - center[k, :2].astype(xyz.dtype)).max(axis=1) < longest_m)
-        rest, place = np.flatnonzero(near), xyz[:, :2] - cloud.sensor[:2]
+        rest = np.flatnonzero(near)
         yaw_rad = corrected_yaw(place[seed].astype(np.float64), float(boxes.yaw_rad[k]))
         for _ in range(2):  # along the flank, then round the corner
             own, more = (place[index].astype(np.float64) for index in (seed, rest))
