@@ -94,13 +94,13 @@ def draft_scenario(
 def conclude(
     run: Run,
     observations: Observations,
-    measurements: Sequence[Sequence[Measurements]],
+    measurements: Sequence[Measurements],
     homographies: Mapping[str, CameraHomography],
     described: tuple[Scenario, Sequence[Decision], Mapping[str, Any]],
 ) -> Result:
     """Join the plan and what became of it to the report of a finished run, and write what each stage did into its scenario.
 
-    `measurements`: by end and tick. `described`: what `describe` returns.
+    `measurements`: by tick. `described`: what `describe` returns.
     """
     log, config, schedule, clock, cache = run.log, run.config, run.schedule, run.clock, run.detectors.cache
     scenario, decisions, figures = described
@@ -114,7 +114,7 @@ def conclude(
     planned = (d for d in run.plan.decisions if d.stage not in DESCRIBING)
     stages = (*(found[d.stage](d) if d.stage in found else d for d in planned), *decisions)
     scenario = replace(scenario, stages=tuple(stage.to_dict() for stage in stages))
-    from_lidar = [rows.source == "lidar" for end in measurements for rows in end]
+    from_lidar = [rows.source == "lidar" for rows in measurements]
     report = {
         "report_version": 1,
         "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
