@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
-from log2sim.geometry import NS_PER_S, Array, rectangle_iou, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import oriented_covariance, rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.boxes import suppress
@@ -31,7 +31,6 @@ from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
 from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
-from log2sim.tracking.stitch import choose_pairs
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
 # Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
@@ -152,7 +151,7 @@ def match_by_overlap(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     i, j = _touching(a, b)
     iou = rectangle_iou(a.take(i).rectangles, b.take(j).rectangles)
     allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[i] == b.boxes.category[j])
-    return choose_pairs(i[allowed], j[allowed], 1 - iou[allowed])
+    return _best(i, j, 1 - iou, allowed)
 
 
 def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -170,7 +169,14 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
     overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
     allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
-    return choose_pairs(i[allowed], j[allowed], np.minimum(squared, CHI2_2DOF_99)[allowed])
+    return _best(i, j, np.minimum(squared, CHI2_2DOF_99), allowed)
+
+
+def _best(i: NDArray[np.intp], j: NDArray[np.intp], cost: Array, allowed: NDArray[np.bool_]) -> Pairs:
+    """Choose pairs (P,) one to one, as many as possible and of these the cheapest, among those that are allowed."""
+    i, j = i[allowed], j[allowed]
+    chosen = choose_pairs(i, j, cost[allowed])
+    return i[chosen], j[chosen]
 
 
 def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -535,8 +541,7 @@ def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     passed_s = np.maximum((b.t_ns[:, None] - a.t_ns) / NS_PER_S, 1.0 / NS_PER_S)
     distance = np.hypot(away[..., 0], away[..., 1])
     allowed = (distance <= MAX_SPEED_MPS * passed_s) & (b.category[:, None] == a.category)
-    first, second = np.nonzero(allowed)
-    i, j = choose_pairs(first, second, distance[allowed])
+    i, j = _best(*np.indices(allowed.shape), distance, allowed)
     local = rotate(away[i, j], -b.yaw_rad[i])
     speed = local[:, 0] / passed_s[i, j]
     moves = (np.abs(speed) >= MIN_SPEED_MPS) & (np.abs(local[:, 1]) <= MAX_ACROSS_SHARE * np.abs(local[:, 0]))
