@@ -10,6 +10,7 @@ import pytest
 from log2sim.evaluation.metrics.comparison import associate, mota, near_pairs, switches
 from log2sim.evaluation.metrics.correctness import normalized_errors, reliability
 from log2sim.evaluation.metrics.evaluator import hota
+from log2sim.geometry import choose_pairs
 
 
 def random_tracks(seed, truths=8, others=9, ticks=40, arena_m=14.0):
