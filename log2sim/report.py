@@ -15,6 +15,7 @@ from log2sim.datatypes import Agent, Finding, Log, Measurements, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.files.documents import rounded
 from log2sim.files.stages import StageClock
+from log2sim.files.version import __version__
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, undistort
 from log2sim.localization.choice import GIVEN, PoseChoice
 from log2sim.logs.checks import explain_missing_poses
@@ -24,7 +25,6 @@ from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage
-from log2sim.version import __version__
 
 Progress = Callable[[str, int, int], None]
 
