@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 from log2sim.geometry.transforms import Array
 
+# Gates of squared Mahalanobis distances, by degrees of freedom and probability: 99 % and 99.9 %.
+CHI2_2DOF_99 = 9.21
+CHI2_2DOF_999 = 13.8
+CHI2_4DOF_999 = 18.5
 NEVER = 1e6
 """Cost of no pair above which as many pairs as possible are chosen, where those of pairs are much smaller."""
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
-from log2sim.geometry import NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
+from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import oriented_covariance, rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.boxes import suppress
@@ -30,7 +30,6 @@ from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_de
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
-from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
 # Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.

@@ -9,16 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Measurements, Track
-from log2sim.geometry import NS_PER_S, Array, choose_pairs
-from log2sim.geometry.assignment import NEVER
-from log2sim.tracking.forward import (
-    ACCELERATION_MPS2,
-    CHI2_4DOF_999,
-    first_velocity,
-    measurement_noise,
-    predict,
-    update,
-)
+from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs
+from log2sim.tracking.forward import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 
 # People run at up to 3 m/s in traffic; the speed is measured over this time, in which noise moves a center little.
 MAX_PEDESTRIAN_SPEED_MPS = 3.0
@@ -195,7 +187,7 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     last, first = ends.last[a], ends.first[b]
     offset_m = np.hypot(*(last - first)[:, :2].T)
     same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M)
-    cost = np.where(same_place, offset_m, NEVER)
+    cost = np.where(same_place, offset_m, np.inf)
     half = gap_s[:, None] / 2
     midpoint_offset_m = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
     # Beyond this distance no allowed uncertainty passes the gate.
@@ -213,7 +205,7 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     good = certain & (squared <= CHI2_4DOF_999)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
     cost[near[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
-    possible = cost < NEVER
+    possible = np.isfinite(cost)
     return a[possible], b[possible], cost[possible]
 
 
