@@ -540,7 +540,8 @@ def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     passed_s = np.maximum((b.t_ns[:, None] - a.t_ns) / NS_PER_S, 1.0 / NS_PER_S)
     distance = np.hypot(away[..., 0], away[..., 1])
     allowed = (distance <= MAX_SPEED_MPS * passed_s) & (b.category[:, None] == a.category)
-    i, j = _best(*np.indices(allowed.shape), distance, allowed)
+    first, second = np.indices(allowed.shape)
+    i, j = _best(first, second, distance, allowed)
     local = rotate(away[i, j], -b.yaw_rad[i])
     speed = local[:, 0] / passed_s[i, j]
     moves = (np.abs(speed) >= MIN_SPEED_MPS) & (np.abs(local[:, 1]) <= MAX_ACROSS_SHARE * np.abs(local[:, 0]))
