@@ -48,7 +48,8 @@ def describe(
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario; with what the stages did, and figures of the report.
 
     `observations`: what the first pass found of the records. `for_map`: poses by which the ground is drawn, None for those of the
-    log. `earlier`: where maps of earlier runs are known. `jobs`: with more than one, vehicles and lights are looked at in a process of their own while the ground is drawn.
+    log. `earlier`: where maps of earlier runs are known. `jobs`: with more than one, vehicles and lights are looked at in a process of
+    their own while the ground is drawn.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if for_map is None else replace_poses(log, for_map)
