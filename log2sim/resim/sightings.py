@@ -8,7 +8,7 @@ their shape, surfels show more.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from log2sim.resim.surfels import Surfels, joined
 # Turned by 20 degrees a person shows a third of a width that was hidden. From 1.5 times as far the gaps are half as wide again.
 MIN_TURN_COS, MAX_FARTHER = np.cos(np.deg2rad(20.0)), 1.5
 AROUND_M = 0.35  # around the box, rays that passed the agent tell its outline
+OUTLINE_CELLS = 3.0  # twice as many as rays are apart in a sighting from that far
 PASSED, ENDED, HIDDEN, LOST = range(4)
 
 
@@ -97,11 +98,13 @@ def sighting(
     length = np.where(on, range_m, away)[:, None]
     point = (view_m + length * offset[near]).astype(np.float32)
     seen = Sighting(t_s, view_m, point, state, intensity[near], cell_rad)
+    at = seen.angles(offset[near])
     if not back.all():
-        at = seen.angles(offset[near])
         neighbor = cKDTree(at[back]).query(at[~back])[1]
         state[~back] = np.where(on[back][neighbor], LOST, PASSED)
-    return seen
+    # Beyond the next rays, no outline is told.
+    beside = np.isfinite(cKDTree(at[on]).query(at, distance_upper_bound=OUTLINE_CELLS)[0]) | (state == HIDDEN)
+    return replace(seen, point_m=point[beside], state=state[beside], intensity=intensity[near][beside])
 
 
 def frame_at(agent: Agent, t_s: float) -> tuple[Array, Array]:
