@@ -209,7 +209,7 @@ def test_a_missing_extra_exits_with_5_and_names_it(
     ran = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--quiet")
     assert ran.code == 5
     assert f"needs the extra 'coco': {install_command('coco')}" in ran.line
-    assert names(tmp_path) == []
+    assert set(names(tmp_path)) <= {"cache"}  # which keeps what was found out before
 
 
 def test_nothing_to_reconstruct_exits_with_4(log_folder: Path, tmp_path: Path) -> None:
