@@ -116,16 +116,15 @@ def draw_footprints(
     return mask
 
 
-def covered(
-    boxes: Sequence[Boxes], raster: Raster, rows: NDArray[np.int64], columns: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Tell which cells (N,) of a raster are under boxes; takes the time of the part that they are in, however large the raster is."""
-    if not len(rows):
+def covered(boxes: Sequence[Boxes], raster: Raster, cell: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which cells (N,), counted row by row, are under boxes; takes the time of the part that they are in, however large the raster."""
+    if not len(cell):
         return np.zeros(0, dtype=bool)
+    rows, columns = np.divmod(cell, raster.shape[1])
     corner = (int(rows.min()), int(columns.min()))
     shape = (int(rows.max()) - corner[0] + 1, int(columns.max()) - corner[1] + 1)
     mask = draw_footprints(boxes, raster, corner, shape)
-    return np.asarray(mask[rows - corner[0], columns - corner[1]] > 0)
+    return np.asarray(mask.ravel().take((rows - corner[0]) * shape[1] + columns - corner[1]) > 0)
 
 
 def draw_outlines(boxes: Boxes, camera: Camera, map_T_cam: Array) -> NDArray[np.uint8]:
