@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -49,17 +50,20 @@ def track(
     max_gap_s: float,
     min_life_s: float,
     whole_boxes: bool = False,
+    flow_mps: Array | None = None,
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, sorted by their first tick.
 
     `t_ns`: (T,). `birth_score`: lowest score that can start a track. `max_gap_s`: longest occlusion that is bridged, s.
     `whole_boxes`: whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the
-    motion. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
+    motion. `flow_mps`: (T, 2): velocity of the ego, as others may drive. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     everything = Measurements.join(measurements)
     first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
-    for ticks, rows in track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes):
+    for ticks, rows in track_forward(
+        measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps
+    ):
         found = everything.take(first_row[ticks] + rows)
         tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
     return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes), t_ns, min_life_s)
@@ -86,18 +90,21 @@ POSE_SIGMA_M = 0.1
 MAX_SHARED_TICKS = 1
 
 
-def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
+def track_ends(
+    ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig, flow_mps: Array | None = None
+) -> list[Track]:
     """Track the measurements of each end on their own and merge the tracks.
 
-    `ends`: of each end, by tick; those of a single one are tracked and no more. `t_ns`: (T,). `config`: as for `track`; what
+    `ends`: of each end, by tick; those of a single one are tracked and no more. `t_ns`: (T,). `config`, `flow_mps`: as for `track`; what
     both ends have of an object counts as its life.
     """
-    birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
+    max_gap_s, min_life_s = config.max_gap_s, config.min_life_s
+    follow = partial(track, t_ns=t_ns, birth_score=config.birth_score, max_gap_s=max_gap_s, flow_mps=flow_mps)
     if len(ends) == 1:
-        return track(ends[0], t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=min_life_s)
+        return follow(ends[0], min_life_s=min_life_s)
     tracks: list[Track] = []
     for measurements in ends:
-        found = track(measurements, t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=0.0)
+        found = follow(measurements, min_life_s=0.0)
         tracks = merge_tracks(tracks, found) if tracks else found
     return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s), t_ns, min_life_s)
 

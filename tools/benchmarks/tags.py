@@ -1,9 +1,10 @@
 """Precision and recall of tags in worlds whose maneuvers are known in closed form.
 
-    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=SCENE.toml]
+    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=LOG/truth.json]
 
 `--write` writes the random traffic as scenarios, for `log2sim find` and `vary`. `--pair` compares the tags of what was reconstructed of a
-rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other.
+rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other. "where seen" leaves out
+what is missed of agents that no sensor shows meanwhile; a scene file (`=SCENE.toml`) knows nothing of that.
 
 Random traffic on straight and bent roads with three lanes, on both sides of the road, at 2 to 20 Hz, with and without a map, and
 junctions with turns, crossings and people who step out between parked cars. The truth comes from the stations and lanes of the
@@ -86,7 +87,7 @@ def quintic(u: np.ndarray) -> np.ndarray:
 
 
 def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_right: bool = True, lanes: bool = False,
-            noise_m: float = 0.0, duration_s: float = 14.0, count: int = 10) -> World:  # fmt: skip
+            noise_m: float = 0.0, duration_s: float = 14.0, count: int = 10, braking: float = 0.25) -> World:  # fmt: skip
     """Make random traffic with lane changes and hard braking on a road with three lanes in one direction."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration_s + FINE_S / 2, FINE_S)
@@ -99,7 +100,7 @@ def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_ri
         base = rng.uniform(18.0, 30.0) + 2.0 * lane
         accel = np.zeros(len(t))
         brakes = []
-        if rng.random() < 0.25:
+        if rng.random() < braking:
             at, hard = rng.uniform(2.0, duration_s - 4.0), rng.uniform(4.2, 7.0)
             # It builds up and decays within 0.4 s, as brakes do, and lasts for a second and more.
             lasts = rng.uniform(1.2, 1.8)
@@ -510,7 +511,7 @@ def describe(tag: Tag) -> str:
 
 
 def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
-    """List the tags that a reconstruction shares with its truth, has alone, and lacks, by kind, with why those are missed.
+    """List the tags that a reconstruction shares with its truth, has alone, and lacks of agents seen and unseen, by kind, with why.
 
     What begins or ends within `EDGE_S` of either end of the reconstruction counts neither way: whether it is whole there is decided by
     centimeters.
@@ -540,7 +541,15 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
             and all(apart_m(*pair, times) < 3.0 for pair in ((g.agent, e.agent), (g.other, e.other)))
         )
 
+    def unseen(e: Tag) -> list[str]:
+        """List who is shown by no sensor from the begin to the end of a tag."""
+        ways = {id: agents[1][id].waypoints for id in (e.agent, e.other) if id}
+        during = {id: (w.t_s >= e.start_s - EDGE_S) & (w.t_s <= e.end_s + EDGE_S) for id, w in ways.items()}
+        return [id for id, w in ways.items() if w.visible is not None and not w.visible[during[id]].any()]
+
     def reason(e: Tag) -> str:
+        if unseen(e):
+            return f"not seen: {', '.join(unseen(e))}"
         doubted = [g for g in ours if same(g, e)]
         if doubted:
             sure = [agents[0][id].confidence for id in (doubted[0].agent, doubted[0].other) if id]
@@ -553,7 +562,7 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
         ]
         return f"not reconstructed: {', '.join(gone)}" if gone else "other motion"
 
-    out: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
+    out: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], [], []])
     left = list(theirs)
     for g in (g for g in ours if g.probability >= LEAST):
         found = next((e for e in left if same(g, e)), None)
@@ -564,7 +573,7 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
             left.remove(found)
     for e in left:
         if e.probability >= LEAST and min(e.t_s, last_s - e.t_s, last_s - e.end_s) >= EDGE_S:
-            out[e.tag][2].append(f"{describe(e)}: {reason(e)}")
+            out[e.tag][3 if unseen(e) else 2].append(f"{describe(e)}: {reason(e)}")
     return out
 
 
@@ -576,15 +585,17 @@ def main(
     drawn = [*variants(worlds, noise, first), *scripted(scripts, noise, first)]
     for k, world in enumerate(drawn if write is not None else ()):
         world.scenario.save(write / f"{k:04}" / "scenario.json")
-    sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
-    for made, scene in (map(Path, text.split("=", 1)) for text in pair):
-        for tag, lists in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
+    sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], [], []])
+    for made, of in (map(Path, text.split("=", 1)) for text in pair):
+        truth = Scenario.load(of) if of.suffix == ".json" else synthesize(load_scene(of), observe=False)[1]
+        for tag, lists in compare(Scenario.load(made), truth).items():
             sums[tag] = [[*a, *(f"{made.name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
     rows, lines = [], []
-    for tag, (true, invented, missed) in sorted(sums.items()):
-        counts = len(true), len(invented), len(missed)
-        rows.append([f"{tag}, reconstructed", *map(str, counts), *shares(*counts), ""])
-        lines += [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed]
+    for tag, (true, invented, missed, unseen) in sorted(sums.items()):
+        for where, lacks in (("reconstructed", missed + unseen), ("where seen", missed)):
+            counts = len(true), len(invented), len(lacks)
+            rows.append([f"{tag}, {where}", *map(str, counts), *shares(*counts), ""])
+        lines += [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed + unseen]
     begin = time.process_time()
     found = [find_tags(w.scenario) for w in drawn]
     spent = time.process_time() - begin
