@@ -165,7 +165,8 @@ def ego_velocity(log: Log, schedule: Schedule) -> Array:
         return np.zeros((len(schedule), 2))
     map_T_ego, valid = log.ego.at(schedule.t_ns)
     xy = np.where(valid[:, None], map_T_ego[:, :2, 3], np.nan)
-    return np.nan_to_num(np.gradient(xy, (schedule.t_ns - schedule.t_ns[0]) / NS_PER_S, axis=0))
+    t_s = (schedule.t_ns - schedule.t_ns[0]) / NS_PER_S
+    return np.asarray(np.nan_to_num(np.gradient(xy, t_s, axis=0)), dtype=np.float64)
 
 
 def with_observers(candidate: AgentCandidate, agent: Agent, timeline: Timeline) -> Agent:

@@ -1,9 +1,10 @@
 """Precision and recall of tags in worlds whose maneuvers are known in closed form.
 
-    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=LOG/truth.json]
+    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=LOG/truth.json] [--motorway SEED]
 
 `--write` writes the random traffic as scenarios, for `log2sim find` and `vary`. `--pair` compares the tags of what was reconstructed of a
-rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other. "where seen" leaves out
+rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other. `--motorway` renders
+the random traffic of a seed around a car with a LiDAR and reconstructs it first, by `lidar:vehicle`. "where seen" leaves out
 what is missed of agents that no sensor shows meanwhile; a scene file (`=SCENE.toml`) knows nothing of that.
 
 Random traffic on straight and bent roads with three lanes, on both sides of the road, at 2 to 20 Hz, with and without a map, and
@@ -14,6 +15,7 @@ vehicles on their road alone. Events whose quantities are within a tenth of the 
 from __future__ import annotations
 
 import itertools
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -23,12 +25,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import markdown
+from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Agent, AgentTable, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios.tagging import find_tags
 from log2sim.scenarios.traffic import UNSEEN_S
-from log2sim.synth.scene import load_scene
-from log2sim.synth.synthesis import synthesize
+from log2sim.synth.scene import Scene, load_scene, scene_from_table
+from log2sim.synth.synthesis import synthesize, write_synthetic
 
 LANE_M, LANES = 3.5, 3
 CAR, PERSON = (4.4, 1.8, 1.5), (0.6, 0.6, 1.7)
@@ -129,6 +132,41 @@ def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_ri
     scenario = Scenario(name, 0, duration_s, agents, map_features=features)
     tags = ("cut_in", "cut_out", "overtaking", "hard_braking", *(("lane_change",) if lanes else ()))
     return World(scenario, list(_road_events(vehicles, t, lanes=lanes)), tags)
+
+
+def motorway(seed: int) -> Scene:
+    """Make a scene of random traffic for 8 s around a car with a LiDAR: its rate, the bend and the side follow from the seed."""
+    rates, bends = (10.0, 10.0, 5.0, 20.0, 2.0, 10.0, 5.0, 2.0), (0.0, 1 / 400, 0.0, 0.0, 0.0, WINDING, 1 / 400, 0.0)
+    kind = seed % len(rates)
+    bend, right = bends[kind], kind in (0, 3, 4, 5, 6)
+    # A scene's vehicles brake with up to 3 m/s2.
+    world = traffic(seed, rate_hz=20.0, bend_1pm=bend, keeps_right=right, duration_s=8.0, count=14, braking=0.0)
+
+    def driver(agent: Agent, axle_m: float) -> dict[str, object]:
+        w = agent.waypoints
+        way = (w.x_m - axle_m * np.cos(w.yaw_rad), w.y_m - axle_m * np.sin(w.yaw_rad), w.speed_mps)
+        return {"size_m": CAR, "waypoints": np.column_stack(way)[::10].round(3).tolist(), "rounding_m": 12.0}
+
+    ego, *others = world.scenario.agents
+    s = np.arange(-200.0, 700.0, 10.0)
+    middle = np.column_stack(_on_road(s, np.full(len(s), LANE_M if right else -LANE_M), bend))
+    return scene_from_table({
+        "name": f"motorway {seed}", "duration_s": 8.0, "traffic": "right" if right else "left", "ego": driver(ego, 1.4),
+        "agent": [{"id": a.id, "category": "car", **driver(a, 0.3 * CAR[0])} for a in others],
+        "road": [{"line": middle.round(2).tolist(), "width_m": LANES * LANE_M + 1.5, "lanes": LANES, "lanes_back": 0, "side_inset_m": 0.75,
+                  "sidewalk_m": 0.0}],
+        "lidar": [{"name": "roof", "position_m": [1.2, 0.0, 1.9], "elevation_deg": [-16.0, 4.0], "channels": 40, "rate_hz": rates[kind],
+                   "offset_s": 0.08, "range_m": 100.0}],
+    })  # fmt: skip
+
+
+def reconstructed(seed: int, folder: Path) -> tuple[Scenario, Scenario]:
+    """Render a motorway below a folder, unless it is there, and return what is reconstructed of it and its truth."""
+    log = folder / f"motorway_{seed}"
+    if not log.exists():
+        write_synthetic(motorway(seed), log, seed=seed)
+    made = reconstruct(open_log(log), Config.load(detect={"name": "lidar:vehicle"})).scenario
+    return made, Scenario.load(log / "truth.json")
 
 
 def _touch(a: Vehicle, b: Vehicle) -> bool:
@@ -578,17 +616,27 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
 
 
 def main(
-    worlds: int = 48, noise: float = 0.0, write: Path | None = None, pair: list[str] = [], wrong: bool = False
+    worlds: int = 48,
+    noise: float = 0.0,
+    write: Path | None = None,
+    pair: list[str] = [],
+    motorway: list[int] = [],
+    wrong: bool = False,
 ) -> None:
-    """Print a table of random worlds and of a quarter as many of each scripted scene, whose places have noise, m; `wrong` lists what was."""
+    """Print a table of random worlds and of a quarter as many of each scripted scene, whose places have noise, m; `wrong` lists what was wrong."""
     drawn = [*variants(worlds, noise), *scripted(worlds // 4, noise)]
     for k, world in enumerate(drawn if write is not None else ()):
         world.scenario.save(write / f"{k:04}" / "scenario.json")
     sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], [], []])
+    pairs = []
     for made, of in (map(Path, text.split("=", 1)) for text in pair):
         truth = Scenario.load(of) if of.suffix == ".json" else synthesize(load_scene(of), observe=False)[1]
-        for tag, lists in compare(Scenario.load(made), truth).items():
-            sums[tag] = [[*a, *(f"{made.name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
+        pairs.append((made.name, Scenario.load(made), truth))
+    with tempfile.TemporaryDirectory() as temporary:
+        pairs += [(f"motorway {seed}", *reconstructed(seed, write or Path(temporary))) for seed in motorway]
+    for name, made, truth in pairs:
+        for tag, lists in compare(made, truth).items():
+            sums[tag] = [[*a, *(f"{name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
     rows, lines = [], []
     for tag, (true, invented, missed, unseen) in sorted(sums.items()):
         for where, lacks in (("reconstructed", missed + unseen), ("where seen", missed)):
