@@ -31,14 +31,14 @@ from log2sim.localization.given_poses import list_faults
 from log2sim.localization.mounts import check_calibration
 from log2sim.localization.roadside import register_road
 from log2sim.perception.first_pass import Observations, observe
-from log2sim.perception.fusion import fuse_by_end
+from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import fit_homographies, place_by_homography
 from log2sim.perception.run_detectors import GivenDetector, create_detectors, sort_detectors
 from log2sim.perception.sync import schedule_of
 from log2sim.plan import choose_detector, make_plan, select_sensors
 from log2sim.report import Progress, Result, Run, conclude, draft_scenario
 from log2sim.road.describe import describe
-from log2sim.tracking.tracker import mark_unrecorded, track_ends
+from log2sim.tracking.tracker import mark_unrecorded, track
 
 
 def reconstruct(
@@ -130,9 +130,20 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         homographies = fit_homographies(log, observations, plan, config.topdown, rng=np.random.default_rng(config.seed))
         placed = place_by_homography(log, observations, homographies)
     with clock.stage("fuse"):
-        by_end = fuse_by_end(placed, plan)
+        fused = fuse(placed, across=plan.fuses)
     with clock.stage("track", run.progress):
+<<<<<<< HEAD
         tracks = track_ends(by_end, schedule.t_ns, config.track, ego_velocity(log, schedule))
+=======
+        limits = config.track
+        tracks = track(
+            fused,
+            schedule.t_ns,
+            birth_score=limits.birth_score,
+            max_gap_s=limits.max_gap_s,
+            min_life_s=limits.min_life_s,
+        )
+>>>>>>> main
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
         obstacles = observations.obstacles
@@ -155,4 +166,4 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, jobs=run.jobs, clock=clock,
         progress=run.progress,
     )  # fmt: skip
-    return conclude(run, observations, by_end, homographies, described)
+    return conclude(run, observations, fused, homographies, described)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from log2sim.geometry import apply_homography, rotation_from_rpy
+from log2sim.geometry import CHI2_2DOF_99, apply_homography, rotation_from_rpy
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
 from log2sim.perception.homography.fit import HomographyFit
@@ -22,7 +22,6 @@ from log2sim.perception.homography.normalized import (
     squared_errors,
 )
 from log2sim.perception.homography.ransac import draw_samples, solve_samples
-from log2sim.tracking.forward import CHI2_2DOF_99
 
 K = np.array([[2050.0, 0.0, 960.0], [0.0, 2050.0, 640.0], [0.0, 0.0, 1.0]])
 HEIGHT_M = 2.1

@@ -16,6 +16,7 @@ from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
+from log2sim.geometry.assignment import NEVER, choose_pairs
 from log2sim.tracking.forward import (
     CENTER_SIGMA_M,
     ForwardTracker,
@@ -25,7 +26,7 @@ from log2sim.tracking.forward import (
     track_forward,
     update,
 )
-from log2sim.tracking.stitch import FORBIDDEN, choose_pairs, decide_category, stitch
+from log2sim.tracking.stitch import decide_category, stitch
 from log2sim.tracking.tracker import min_hits, track
 
 PERIOD_S = 0.1
@@ -409,9 +410,10 @@ def test_joins_of_groups_are_as_good_as_those_of_all_together(costs):
     """As many joins as possible, and of those the cheapest: as over a table of all pairs."""
     pairs = np.array(list(costs), dtype=np.intp).reshape(-1, 2)
     cost = np.array(list(costs.values()), dtype=float)
-    first, second = choose_pairs(pairs[:, 0], pairs[:, 1], cost)
-    table = np.full((8, 8), FORBIDDEN)
+    chosen = choose_pairs(pairs[:, 0], pairs[:, 1], cost)
+    first, second = pairs[chosen].T
+    table = np.full((8, 8), NEVER)
     table[pairs[:, 0], pairs[:, 1]] = cost
     i, j = linear_sum_assignment(table)
-    assert len(set(first.tolist())) == len(set(second.tolist())) == len(first) == np.sum(table[i, j] < FORBIDDEN)
-    assert table[first, second].sum() == table[i, j][table[i, j] < FORBIDDEN].sum()
+    assert len(set(first.tolist())) == len(set(second.tolist())) == len(first) == np.sum(table[i, j] < NEVER)
+    assert table[first, second].sum() == table[i, j][table[i, j] < NEVER].sum()

@@ -7,6 +7,7 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
+from log2sim.geometry.assignment import CHI2_2DOF_99, CHI2_2DOF_999, CHI2_4DOF_999, choose_pairs
 from log2sim.geometry.boxes import (
     ProjectedBoxes,
     box_corners,
@@ -48,6 +49,7 @@ from log2sim.geometry.transforms import (
     Array,
     apply,
     cos_sin,
+    fit_windows,
     inverse,
     nearest_index,
     nearest_rotation,
@@ -65,9 +67,9 @@ from log2sim.geometry.transforms import (
 )
 
 __all__ = [
-    "DISTORTION_LENGTHS", "MIN_DEPTH_M", "NS_PER_S", "Array", "Camera", "Mount", "PoseTrack", "ProjectedBoxes",
-    "RollingShutter", "apply", "apply_homography", "box_corners", "box_corners_bev", "box_iou", "box_lines", "cos_sin",
-    "cross_slab", "distort", "fold_radius", "ground_homography", "homography_jacobian", "inverse", "line_time_s",
+    "CHI2_2DOF_99", "CHI2_2DOF_999", "CHI2_4DOF_999", "DISTORTION_LENGTHS", "MIN_DEPTH_M", "NS_PER_S", "Array", "Camera", "Mount", "PoseTrack", "ProjectedBoxes",
+    "RollingShutter", "apply", "apply_homography", "box_corners", "box_corners_bev", "box_iou", "box_lines", "choose_pairs",
+    "cos_sin", "cross_slab", "distort", "fit_windows", "fold_radius", "ground_homography", "homography_jacobian", "inverse", "line_time_s",
     "nearest_index", "nearest_rotation", "outline", "overlap_of_smaller", "period_of", "points_in_box", "project",
     "project_boxes", "project_moving", "quaternion_from_rotation", "rectangle_iou", "rectangle_overlap",
     "rectangles_overlap", "rotation_from_quaternion", "rotation_from_rpy", "separating_axes", "shift_poses", "slerp",

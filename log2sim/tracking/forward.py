@@ -9,18 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, GROUPS, Measurements
-from log2sim.geometry import NS_PER_S, Array, period_of
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, RELATED_GROUPS, Measurements
+from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, period_of
 
-# By degrees of freedom and probability: 99 % and 99.9 %.
-CHI2_2DOF_99 = 9.21
-CHI2_2DOF_999 = 13.8
-CHI2_4DOF_999 = 18.5
-
-
-# Standard deviations of the initial velocity and of the change of the velocity in 1 s, by group. A bicycle without a rider
-# stands, but for those whose rider the detector missed.
-FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0, "bicycle": 1.0}
+# Standard deviation of the change of the velocity in 1 s, by group.
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
 # Of the vehicles and riders that move so many drive about as fast as the ego, and as many towards it as fast: about its velocity and
 # about that turned round theirs spreads as it does about standstill. Where the ego is slow, all three are one.
@@ -105,7 +97,6 @@ def first_velocity(axis_rad: Array, groups: NDArray[Any]) -> Array:
 NOT_ALLOWED = 1e6
 # A rider is taken for a pedestrian now and then and the other way round; it costs as much as 2.4 sigma.
 OTHER_GROUP_COST = 6.0
-RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
 # A bicycle without a rider stands while riders pass it; one whose rider a detection missed costs as much as 2 sigma. Of bicycles
 # that look so nearly all are parked.
 RIDERLESS_COST, RIDERLESS_STANDING_PRIOR = 4.0, 0.95
@@ -132,7 +123,7 @@ _INDEX = {category: _NAMES.index(group) for category, group in GROUP_OF.items()}
 _ACCELERATION = np.array([ACCELERATION_MPS2[g] for g in _NAMES])
 _ON_ROAD = np.isin(_NAMES, ON_ROAD)
 _GROUP_COST = np.array([
-    [0.0 if a == b else OTHER_GROUP_COST if (a, b) in RELATED else NOT_ALLOWED for b in _NAMES] for a in _NAMES
+    [0.0 if a == b else OTHER_GROUP_COST if (a, b) in RELATED_GROUPS else NOT_ALLOWED for b in _NAMES] for a in _NAMES
 ])  # fmt: skip
 
 Index = NDArray[np.intp]

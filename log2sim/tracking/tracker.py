@@ -1,24 +1,21 @@
-"""Tracking in the map frame: forward assignment, stitching, one category a track, and tracks of vehicle and road joined.
-
-Each end tracks on its own clock and with its own gaps. Before tracks are compared, a measurement is moved to the time of the
-other by the velocity of its own track, as "time compensation late fusion" does with detections (Yu et al., "DAIR-V2X", CVPR
-2022, section 5).
-"""
+"""Tracking in the map frame: forward assignment, stitching, one category a track."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+<<<<<<< HEAD
 from functools import partial
 from typing import Any
+=======
+>>>>>>> main
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.config import TrackConfig
-from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
+from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
-from log2sim.tracking.forward import CHI2_2DOF_99, RELATED, measurement_noise, track_forward
+from log2sim.tracking.forward import track_forward
 from log2sim.tracking.stitch import decide_category, stitch
 
 SWEEPS = ""
@@ -66,11 +63,7 @@ def track(
     ):
         found = everything.take(first_row[ticks] + rows)
         tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
-    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes), t_ns, min_life_s)
-
-
-def _long_enough(tracks: Sequence[Track], t_ns: NDArray[np.int64], min_life_s: float) -> list[Track]:
-    """Return the tracks with enough measurements, sorted by their first tick."""
+    tracks = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
     kept = [t for t in tracks if len(t) >= min_hits(t_ns, min_life_s)]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
@@ -84,6 +77,7 @@ def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
 
 # Velocities are those of lines through the measurements within this time of each.
 VELOCITY_WINDOW_S = 0.5
+<<<<<<< HEAD
 # Standard deviation of where the road's sensors are after registration, m.
 POSE_SIGMA_M = 0.1
 # Tracks of one object may both be seen at so many of the ticks at which another track of it is, by a mistake of either tracker.
@@ -172,6 +166,8 @@ def _reach(m: Measurements, n: Measurements) -> float:
     """Return how far apart the centers of one object can be, m: half of both boxes, or what the errors allow without boxes."""
     lengths = np.concatenate([m.box_size_m[:, 0], n.box_size_m[:, 0]])
     return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else np.inf
+=======
+>>>>>>> main
 
 
 def velocities(track_: Track) -> Array:
@@ -184,57 +180,3 @@ def velocities(track_: Track) -> Array:
         if t @ t > 0:
             out[k] = t @ xy[begin:end] / (t @ t)
     return out
-
-
-def _merge(tracks: Sequence[Track], velocity: Sequence[Array]) -> Track:
-    """Merge tracks of one object; at ticks where several have a measurement, these become one."""
-    if len(tracks) == 1:
-        return tracks[0]
-    rows, moving = Measurements.join([t.measurements for t in tracks]), np.concatenate(velocity)
-    tick = np.concatenate([t.tick for t in tracks])
-    # At a tick the one with most points comes first.
-    order = np.lexsort((-rows.points, tick))
-    tick, rows, moving = tick[order], rows.take(order), moving[order]
-    first = np.flatnonzero(np.diff(tick, prepend=tick[:1] - 1))
-    second = first + 1
-    pair = np.flatnonzero((second < len(tick)) & (tick[np.minimum(second, len(tick) - 1)] == tick[first]))
-    merged = merge_rows(rows.take(first[pair]), rows.take(second[pair]), moving[second[pair]])
-    out = rows.take(first)
-    columns: dict[str, Any] = {}
-    for name in ("center_m", "covariance", "score", "points", "seen_by"):
-        columns[name] = getattr(out, name).copy()
-        columns[name][pair] = getattr(merged, name)
-    others = list(out.others or (None,) * len(out))
-    for k, view in zip(pair.tolist(), merged.others):
-        others[k] = view
-    out = replace(out, **columns, others=tuple(others))
-    return Track(decide_category(out), tick[first], out)
-
-
-def merge_rows(a: Measurements, b: Measurements, velocity_b: Array) -> Measurements:
-    """Merge measurements (P,) of two ends row by row, moved to the times of the first: centers by inverse covariance.
-
-    Scores are independent evidence. What else was seen is that of the first, beside which the view of the second is kept.
-    """
-    late_s = ((a.t_ns - b.t_ns) / NS_PER_S)[:, None]
-    moved = b.center_m[:, :2] + late_s * velocity_b
-    ca, cb = a.covariance, b.covariance
-    gain = ca @ np.linalg.inv(ca + cb)
-    xy = a.center_m[:, :2] + (gain @ (moved - a.center_m[:, :2])[..., None])[..., 0]
-    return replace(
-        a,
-        center_m=np.column_stack([xy, a.center_m[:, 2]]),
-        covariance=ca - gain @ ca,
-        score=1 - (1 - a.score) * (1 - b.score),
-        points=a.points + b.points,
-        seen_by=a.seen_by | b.seen_by,
-        others=tuple(_other_view(b, k, -float(late_s[k, 0])) for k in range(len(b))),
-    )
-
-
-def _other_view(m: Measurements, k: int, late_s: float) -> OtherView | None:
-    """Return what measurement `k` shows, as the second view of one that is so much earlier; None without points."""
-    if not len(m.cluster[k]):
-        return None
-    t_s = m.cluster[k][:, 3:4] if m.cluster[k].shape[1] > 3 else np.zeros((len(m.cluster[k]), 1))
-    return OtherView(m.sensor_m[k], m.ends_visible[k], np.column_stack([m.cluster[k][:, :3], t_s + late_s]))

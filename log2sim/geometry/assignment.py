@@ -1,0 +1,49 @@
+"""Which of two sets belong together: pairs one to one, at the least cost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from log2sim.geometry.transforms import Array
+
+# Gates of squared Mahalanobis distances, by degrees of freedom and probability: 99 % and 99.9 %.
+CHI2_2DOF_99 = 9.21
+CHI2_2DOF_999 = 13.8
+CHI2_4DOF_999 = 18.5
+NEVER = 1e6
+"""Cost of no pair above which as many pairs as possible are chosen, where those of pairs are much smaller."""
+
+
+def choose_pairs(
+    first: NDArray[np.signedinteger[Any]], second: NDArray[np.signedinteger[Any]], cost: Array, none: float = NEVER
+) -> NDArray[np.intp]:
+    """Choose among possible pairs (P,), each once, those (K,) of the best assignment; `none` is what it costs to leave one out.
+
+    What no chain of possible pairs connects does not compete: each group of the others is assigned on its own, so that a long
+    log with many tracks takes no table of all pairs. Pairs that are alone, nearly all in a sparse scene, take no solver.
+    """
+    usable = np.flatnonzero(cost < none)
+    row, column = (np.unique(side[usable], return_inverse=True)[1] for side in (first, second))
+    alone = (np.bincount(row)[row] == 1) & (np.bincount(column)[column] == 1)
+    if alone.all():
+        return usable
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    contested, row, column = usable[~alone], row[~alone], column[~alone]
+    count = int(max(row.max(), column.max())) + 1
+    graph = coo_array((np.ones(len(row)), (row, column + count)), shape=(2 * count, 2 * count))
+    group = connected_components(graph, directed=False)[1][row]
+    order = np.argsort(group, kind="stable")
+    chosen = [usable[alone]]
+    for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        (rows, r), (columns, c) = (np.unique(side[pairs], return_inverse=True) for side in (row, column))
+        table, place = np.full((len(rows), len(columns)), none), np.full((len(rows), len(columns)), -1)
+        table[r, c], place[r, c] = cost[contested[pairs]], contested[pairs]
+        taken = place[linear_sum_assignment(table)]
+        chosen.append(taken[taken >= 0])
+    return np.sort(np.concatenate(chosen))
