@@ -132,9 +132,6 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
     with clock.stage("fuse"):
         fused = fuse(placed, across=plan.fuses)
     with clock.stage("track", run.progress):
-<<<<<<< HEAD
-        tracks = track_ends(by_end, schedule.t_ns, config.track, ego_velocity(log, schedule))
-=======
         limits = config.track
         tracks = track(
             fused,
@@ -142,8 +139,8 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
             birth_score=limits.birth_score,
             max_gap_s=limits.max_gap_s,
             min_life_s=limits.min_life_s,
+            flow_mps=ego_velocity(log, schedule),
         )
->>>>>>> main
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
         obstacles = observations.obstacles
