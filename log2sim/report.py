@@ -22,6 +22,7 @@ from log2sim.logs.checks import explain_missing_poses
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.records import RecordSource
+from log2sim.perception.run_cache import StageCache
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage
@@ -35,7 +36,7 @@ class Run:
 
     `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
     `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
-    of processes that share the work.
+    of processes that share the work. `earlier` knows what stages of earlier runs made; None to do all again.
     """
 
     log: Log
@@ -49,6 +50,7 @@ class Run:
     poses: PoseChoice = GIVEN
     faults: tuple[Finding, ...] = ()
     registration: Sequence[dict[str, Any]] = ()
+    earlier: StageCache | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +193,7 @@ def conclude(
 
     `measurements`: by tick. `described`: what `describe` returns.
     """
-    log, config, schedule, clock, cache = run.log, run.config, run.schedule, run.clock, run.detectors.cache
+    log, config, schedule, clock = run.log, run.config, run.schedule, run.clock
     scenario, decisions, figures = described
     found: Mapping[Stage, Callable[[Decision], Decision]] = {
         Stage.MOTION_COMPENSATION: lambda d: _compensation(d, observations),
@@ -223,7 +225,7 @@ def conclude(
         "poses": run.poses.to_dict(),
         "faults": [fault.to_dict() for fault in (*run.faults, *observations.faults)],
         "registration": list(run.registration),
-        "detection_cache": None if cache is None else cache.figures(),
+        "detection_cache": None if run.earlier is None else run.earlier.figures(run.detectors.cache),
     }
     return Result(scenario, report, log, (*run.poses.findings, *run.faults, *observations.faults))
 

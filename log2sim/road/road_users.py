@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,6 +48,10 @@ class RoadUsers:
         t_s = (self._t_ns - scenario.t0_ns) / NS_PER_S
         self._rows = np.stack([_rows_of(agent, t_s) for agent in self._agents], axis=1) if self._agents else None
         self._ego = _ego_rows(log, self._t_ns)
+
+    def made_of(self) -> list[Any]:
+        """Return all boxes at all times, and who never moves."""
+        return [self._t_ns, self._rows, [agent.static for agent in self._agents], self._ego]
 
     def at(self, t_ns: int) -> Boxes:
         """Return the boxes of the agents that are there at one of the times, without the ego's."""
