@@ -10,7 +10,15 @@ import numpy as np
 
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.conflicts import extend_static
-from log2sim.agents.estimate import ego_agent, ego_path, estimate_agents, simplify, with_observers, with_pose_errors
+from log2sim.agents.estimate import (
+    ego_agent,
+    ego_path,
+    ego_velocity,
+    estimate_agents,
+    simplify,
+    with_observers,
+    with_pose_errors,
+)
 from log2sim.agents.evidence import Recording
 from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import judge
@@ -151,6 +159,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
             birth_score=limits.birth_score,
             max_gap_s=limits.max_gap_s,
             min_life_s=limits.min_life_s,
+            flow_mps=ego_velocity(log, schedule),
         )
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):

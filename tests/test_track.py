@@ -168,6 +168,22 @@ def test_tracks_that_cross_keep_their_identities(apart_m: float, seed: int) -> N
     assert [len(t) for t in tracks] == [60, 60]
 
 
+@pytest.mark.parametrize("rate_hz", [2, 5, 10, 20])
+def test_a_motorway_is_followed_by_the_velocity_of_the_ego(rate_hz: int) -> None:
+    """From a car at 32 m/s others, 0.9 s behind each other, and oncoming ones, which are in view for some ticks only."""
+    t_ns = stamps(6 * rate_hz, 1 / rate_hz)
+    ways = {f"with {k}": line(-60 + 30 * k, 3.5, 30 + k, 0) for k in range(5)}
+    ways |= {f"towards {k}": line(100 + 70 * k, 14, -33, 0) for k in range(3)}
+    rng, found = np.random.default_rng(0), []
+    for k, now_ns in enumerate(t_ns):
+        t_s = k / rate_hz
+        here = [n for n, way in ways.items() if abs(way(t_s)[0] - 32 * t_s) < 80]
+        found.append(seen(np.array([ways[n](t_s) for n in here]) + rng.normal(0, 0.1, (len(here), 2)), now_ns, here))
+    tracks = track(found, t_ns, **OPTIONS, flow_mps=np.tile([32.0, 0.0], (len(t_ns), 1)))
+    assert sorted(names_of(tracks)) == [[n] for n in sorted(ways)]
+    assert sum(map(len, tracks)) == sum(map(len, found))
+
+
 def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
     t_ns = stamps(5, 0.5)
     row = {f"car {k}": (6.5 * k, 4.6) for k in range(6)}
@@ -176,7 +192,9 @@ def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
         here = [n for j, n in enumerate(row) if k != 1 or j != 0]  # the first is missed once,
         here = here if k >= 1 else here[:-1]  # when another one comes into view at the end
         found.append(seen(np.array([row[n] for n in here]), t_ns[k], here))
-    assert sorted(names_of(track(found, t_ns, **OPTIONS))) == [[n] for n in row]
+    for flow_mps in (0.0, 8.0, 13.0, 30.0):  # of an ego that passes the row
+        flow = np.tile([flow_mps, 0.0], (len(t_ns), 1))
+        assert sorted(names_of(track(found, t_ns, **OPTIONS, flow_mps=flow))) == [[n] for n in row]
 
 
 @pytest.mark.parametrize("gap_ticks", [1, 3, 8, 11])

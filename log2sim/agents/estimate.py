@@ -153,6 +153,16 @@ def ego_path(log: Log, schedule: Schedule) -> Array:
     return np.column_stack([poses[:, :2, 3], yaw_of(poses)])
 
 
+def ego_velocity(log: Log, schedule: Schedule) -> Array:
+    """Return the velocity (T, 2) of the ego in the map at every tick, m/s; 0 where it is not known."""
+    if log.ego is None or len(schedule) < 2:
+        return np.zeros((len(schedule), 2))
+    map_T_ego, valid = log.ego.at(schedule.t_ns)
+    xy = np.where(valid[:, None], map_T_ego[:, :2, 3], np.nan)
+    t_s = (schedule.t_ns - schedule.t_ns[0]) / NS_PER_S
+    return np.asarray(np.nan_to_num(np.gradient(xy, t_s, axis=0)), dtype=np.float64)
+
+
 def with_observers(candidate: AgentCandidate, agent: Agent, timeline: Timeline) -> Agent:
     """Return an agent with the spans of time in which each end measured the candidate that it was made of."""
     spans: dict[str, tuple[Span, ...]] = {}

@@ -42,17 +42,21 @@ def track(
     max_gap_s: float,
     min_life_s: float,
     whole_boxes: bool = False,
+    flow_mps: Array | None = None,
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, sorted by their first tick.
 
     `t_ns`: (T,). `birth_score`: lowest score that can start a track. `max_gap_s`: longest occlusion that is bridged, s.
     `whole_boxes`: whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the
-    motion. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
+    motion. `flow_mps`: (T, 2): velocity of the ego, as others may drive. `min_life_s`: shorter tracks,
+    after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     everything = Measurements.join(measurements)
     first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
-    for ticks, rows in track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes):
+    for ticks, rows in track_forward(
+        measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps
+    ):
         found = everything.take(first_row[ticks] + rows)
         tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
     tracks = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
