@@ -103,6 +103,7 @@ def start(
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
         asked = config.calibration
+        # What mends the log gives more than findings, which alone are kept.
         if not asked.check or asked.fix_time or asked.fix_mounts:
             log, faults = check_calibration(log, config, sensors, progress=progress)
         else:

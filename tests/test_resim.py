@@ -287,9 +287,12 @@ def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scen
     away = np.where(ends, 10 / ray[:, 0], 30).astype(np.float32)
     away[at[:, 2] < -0.5] = 5.0  # a wall before the feet
     ends &= at[:, 2] >= -0.5
+    lost = ends & (np.abs(at[:, 2] - 0.3) < 0.06)  # a dark stripe of three rays
+    away[lost], ends[lost] = np.nan, False
     seen = sighting(
-        0.0, np.array([-10.0, 0, 0]), ray, away, ends, np.ones(len(ray), np.float32), half, np.full(2, step)
-    )
+        0.0, np.array([-10.0, 0, 0]), ray, range_m=away, on=ends, intensity=np.ones(len(ray), np.float32), half_m=half,
+        cell_rad=np.full(2, step),
+    )  # fmt: skip
     assert seen is not None
     w = recorded[1].others[0].waypoints.take([0])
     zero = np.zeros(1)
@@ -300,11 +303,18 @@ def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scen
     rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
     body = disc_surfels(np.array([[10.0, 0, -0.7], [10, 0, 0.5]]), np.tile([-1.0, 0, 0], (2, 1)), 0.15)
     met = meetings(rays, grid_of(rays), body, body.center_m, body.normal)
-    met, discs = with_sightings(met, body, np.array([0, 0, 2]), [person.id], rays, now, {person.id: [seen]})
-    ended = first_hits(met, discs, len(shots.t_ns), np.random.default_rng(0)).range_m
+    met, discs = with_sightings(
+        met, body, first=np.array([0, 0, 2]), ids=[person.id], rays=rays, scenario=now, sightings={person.id: [seen]}
+    )
+    hits = first_hits(met, discs, len(shots.t_ns), np.random.default_rng(0))
+    ended = hits.range_m
     at = shots.direction * (10 / shots.direction[:, :1])
-    high = at[:, 2] > -0.48
+    high = (at[:, 2] > -0.48) & (np.abs(at[:, 2] - 0.3) > 0.1)
     legs = on_legs(at)
+    stripe = (np.abs(np.abs(at[:, 1]) - 0.15) < 0.02) & (np.abs(at[:, 2] - 0.3) < 0.07)
+    assert (hits.returned[stripe] == 0).sum() >= 3
+    assert not (hits.returned[stripe] > 0).any()
+    assert (hits.returned[np.isfinite(ended) & high] == 1).all()
     assert (np.isfinite(ended) & high).sum() == pytest.approx((legs & high).sum(), rel=0.1)
     # Not further from a leg than half the gap between rays, 3.5 cm, and not on the disc between the legs.
     wide = np.abs(np.abs(at[:, 1]) - 0.15)

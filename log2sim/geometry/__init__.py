@@ -7,7 +7,6 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
-from log2sim.geometry.assignment import CHI2_2DOF_99, CHI2_2DOF_999, CHI2_4DOF_999, choose_pairs
 from log2sim.geometry.boxes import (
     ProjectedBoxes,
     box_corners,
@@ -44,12 +43,19 @@ from log2sim.geometry.rectangles import (
     separating_axes,
     upright_box_iou,
 )
+from log2sim.geometry.statistics import (
+    CHI2_2DOF_99,
+    CHI2_2DOF_999,
+    CHI2_4DOF_999,
+    choose_pairs,
+    fit_windows,
+    weighted_quantile,
+)
 from log2sim.geometry.transforms import (
     NS_PER_S,
     Array,
     apply,
     cos_sin,
-    fit_windows,
     inverse,
     nearest_index,
     nearest_rotation,
@@ -60,7 +66,6 @@ from log2sim.geometry.transforms import (
     shift_poses,
     slerp,
     transform,
-    weighted_quantile,
     whole_kilometers,
     wrap_angle,
     yaw_of,

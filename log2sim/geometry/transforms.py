@@ -7,8 +7,6 @@ scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
 
 from __future__ import annotations
 
-import math
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,35 +34,6 @@ def nearest_index(stamps: NDArray[Any], t: ArrayLike) -> NDArray[np.int64]:
 
 
 Array = NDArray[np.float64]
-
-
-def weighted_quantile(values: Array, weight: Array, share: float) -> float:
-    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
-    order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weight[order])
-    return float(values[order[min(int(np.searchsorted(reached, reached[-1] * share)), len(order) - 1)]])
-
-
-def fit_windows(values: NDArray[Any], window: int, degree: int, derivative: int = 0, spacing: float = 1.0) -> Any:
-    """Fit a polynomial to the odd `window` around each of the values (N,) and return it, or a derivative; at either end the last window's.
-
-    Savitzky and Golay (1964): `scipy.signal.savgol_filter`, which fits both ends anew for each call.
-    """
-    half, weights = window // 2, _window_weights(window, degree, derivative, spacing)
-    inside = np.correlate(values, weights[half], "valid")
-    return np.concatenate([weights[:half] @ values[:window], inside, weights[half + 1 :] @ values[-window:]])
-
-
-@lru_cache(maxsize=64)
-def _window_weights(window: int, degree: int, derivative: int, spacing: float) -> Array:
-    """Return the weights (W, W) of the values of a window in the polynomial, or its derivative, at each of them."""
-    at = np.arange(-(window // 2), window // 2 + 1) * spacing
-    fit = np.linalg.pinv(np.vander(at, degree + 1, increasing=True))
-    return sum(
-        (math.perm(k, derivative) * np.outer(at ** (k - derivative), fit[k]) for k in range(derivative, degree + 1)),
-        start=np.zeros((window, window)),
-    )
-
 
 FLOAT32_MILLIMETER_M = 8192.0
 """From here on neighboring float32 values are 1 mm apart."""

@@ -64,13 +64,13 @@ class Sighting:
         )
 
 
-def is_limber(agent: Agent) -> bool:
+def is_non_rigid(agent: Agent) -> bool:
     """Tell whether an agent changes its shape."""
     return GROUP_OF[agent.category] in ("pedestrian", "two_wheeler")
 
 
 def sighting(
-    t_s: float, view_m: Array, offset: Array, range_m: Floats, on: NDArray[np.bool_], intensity: Floats,
+    t_s: float, view_m: Array, offset: Array, *, range_m: Floats, on: NDArray[np.bool_], intensity: Floats,
     half_m: Array, cell_rad: Array,
 ) -> Sighting | None:  # fmt: skip
     """Take what rays around an agent met; None where none ended on it.
@@ -126,7 +126,7 @@ def choose_sighting(sightings: Sequence[Sighting], t_s: float, view_m: Array) ->
 
 
 def with_sightings(
-    met: Meetings, surfels: Surfels, first: NDArray[np.int64], ids: Sequence[str], rays: Rays, scenario: Scenario,
+    met: Meetings, surfels: Surfels, *, first: NDArray[np.int64], ids: Sequence[str], rays: Rays, scenario: Scenario,
     sightings: Mapping[str, Sequence[Sighting]],
 ) -> tuple[Meetings, Surfels]:  # fmt: skip
     """Let rays end on people and riders as in their sightings; where those were hidden, on their discs.

@@ -117,7 +117,13 @@ class Simulation:
         placed = place(self.world, self.scenario, rays, self.agents)
         met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
         met, surfels = with_sightings(
-            met, placed.surfels, placed.first, placed.ids, rays, self.scenario, self.world.sightings
+            met,
+            placed.surfels,
+            first=placed.first,
+            ids=placed.ids,
+            rays=rays,
+            scenario=self.scenario,
+            sightings=self.world.sightings,
         )
         hits = first_hits(met, surfels, len(shots.t_ns), rng)
         back = rng.random(len(shots.t_ns), dtype=np.float32) < hits.returned

@@ -32,7 +32,7 @@ from log2sim.resim.rays import (
     rays_in_map,
     recorded_shots,
 )
-from log2sim.resim.sightings import Sighting, frame_at, is_limber, sighting
+from log2sim.resim.sightings import Sighting, frame_at, is_non_rigid, sighting
 from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
 from log2sim.synth import shapes
 
@@ -191,7 +191,7 @@ def build_world(
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
     background, own = SurfelGrid(), {agent.id: SurfelGrid() for agent in scenario.others}
-    sightings: dict[str, list[Sighting]] = {agent.id: [] for agent in scenario.others if is_limber(agent)}
+    sightings: dict[str, list[Sighting]] = {agent.id: [] for agent in scenario.others if is_non_rigid(agent)}
     refined = refine_poses(log)
     surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
@@ -363,7 +363,9 @@ def _add_sightings(
         on = np.zeros(len(shots.t_ns), dtype=bool)
         on[rows] = True
         half = np.array(agent.size_m) / 2
-        seen = sighting(t_s, view, direction @ agent_R_map.T, shots.range_m, on, intensity, half, cell_rad)
+        seen = sighting(
+            t_s, view, direction @ agent_R_map.T, range_m=shots.range_m, on=on, intensity=intensity, half_m=half, cell_rad=cell_rad
+        )  # fmt: skip
         if seen is not None:
             sightings[agent.id].append(seen)
 

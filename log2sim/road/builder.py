@@ -181,11 +181,11 @@ class GroundMapBuilder:
         self._standing: dict[str, tuple[View, StandingPictures]] = {}
         self._colors = ColorRaster(self.raster) if any(len(i) for i in self._frames.values()) else None
 
-    def made_of(self) -> list[Any]:
+    def inputs(self) -> list[Any]:
         """Return what the map depends on besides the log: its cells, which records it takes, what is known of them, and road users."""
         known = [self._records.watch.known(name) for name in (*self._log.cameras, *self._log.lidars)]
         places = [self.raster.resolution_m, self.raster.extent_m, self._anchors, self._z0_m, self.notes]
-        return [*places, self._frames, self._sweeps, known, *self._users.made_of()]
+        return [*places, self._frames, self._sweeps, known, *self._users.inputs()]
 
     def frames(self) -> Mapping[str, NDArray[np.int64]]:
         """Return the indices of the frames that the map is made of, by camera."""

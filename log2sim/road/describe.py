@@ -63,7 +63,7 @@ def describe(
     look = partial(_appearance, scenario, log, plan, observations, records)
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         if builder is not None:
-            draw, of = partial(_draw, builder, records, clock, progress), [*builder.made_of(), drawn.ego]
+            draw, of = partial(_draw, builder, records, clock, progress), [*builder.inputs(), drawn.ego]
             features = (
                 draw() if earlier is None else earlier.known("map", log, of, (MapFeatures, Marking, RoadBorder), draw)
             )

@@ -49,7 +49,7 @@ class RoadUsers:
         self._rows = np.stack([_rows_of(agent, t_s) for agent in self._agents], axis=1) if self._agents else None
         self._ego = _ego_rows(log, self._t_ns)
 
-    def made_of(self) -> list[Any]:
+    def inputs(self) -> list[Any]:
         """Return all boxes at all times, and who never moves."""
         return [self._t_ns, self._rows, [agent.static for agent in self._agents], self._ego]
 

@@ -1,7 +1,9 @@
-"""Which of two sets belong together: pairs one to one, at the least cost."""
+"""Assignment, gates, quantiles, and polynomials fitted to windows."""
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -47,3 +49,31 @@ def choose_pairs(
         taken = place[linear_sum_assignment(table)]
         chosen.append(taken[taken >= 0])
     return np.sort(np.concatenate(chosen))
+
+
+def weighted_quantile(values: Array, weight: Array, share: float) -> float:
+    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weight[order])
+    return float(values[order[min(int(np.searchsorted(reached, reached[-1] * share)), len(order) - 1)]])
+
+
+def fit_windows(values: NDArray[Any], window: int, degree: int, derivative: int = 0, spacing: float = 1.0) -> Any:
+    """Fit a polynomial to the odd `window` around each of the values (N,) and return it, or a derivative; at either end the last window's.
+
+    Savitzky and Golay (1964): `scipy.signal.savgol_filter`, which fits both ends anew for each call.
+    """
+    half, weights = window // 2, _window_weights(window, degree, derivative, spacing)
+    inside = np.correlate(values, weights[half], "valid")
+    return np.concatenate([weights[:half] @ values[:window], inside, weights[half + 1 :] @ values[-window:]])
+
+
+@lru_cache(maxsize=64)
+def _window_weights(window: int, degree: int, derivative: int, spacing: float) -> Array:
+    """Return the weights (W, W) of the values of a window in the polynomial, or its derivative, at each of them."""
+    at = np.arange(-(window // 2), window // 2 + 1) * spacing
+    fit = np.linalg.pinv(np.vander(at, degree + 1, increasing=True))
+    return sum(
+        (math.perm(k, derivative) * np.outer(at ** (k - derivative), fit[k]) for k in range(derivative, degree + 1)),
+        start=np.zeros((window, window)),
+    )
