@@ -15,7 +15,7 @@ from log2sim.geometry import Array, apply
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.road_users import RoadUsers, draw_outlines
-from log2sim.road.surface import MAX_POINTS, GroundPoints, Surface, map_intensity, take_sweep
+from log2sim.road.surface import MAX_POINTS, take_sweep
 
 SETTINGS = MapConfig(cell_m=0.05)
 
@@ -47,24 +47,6 @@ def test_cells_and_positions_are_inverse(ground: GroundMap) -> None:
     x0, _, _, y1 = ground.extent_m
     np.testing.assert_allclose(ground.xy_of(0, 0), [x0 + 0.025, y1 - 0.025])
     np.testing.assert_allclose(np.array(ground.extent_m) / 0.05, np.rint(np.array(ground.extent_m) / 0.05), atol=1e-6)
-
-
-def test_wide_spots_of_a_lidar_count_only_where_no_camera_shows_the_ground() -> None:
-    raster = Raster.covering((0.0, 8.0, 0.0, 4.0), 0.1)
-    rows, columns = (k.ravel() for k in np.mgrid[:40, :80])
-    xy = np.stack([columns, rows], axis=1).astype(np.float32) / 10 + np.float32(0.05)
-    far = columns >= 40  # the eastern half is seen from 30 m
-    same = np.ones(len(xy), np.float32)
-    points = GroundPoints(
-        xy, 0 * same, np.where(far, 30, 10) * same, 0.3 * same, far.astype(np.int16), np.zeros(len(xy), np.int8)
-    )
-    surface = Surface(raster, np.zeros(raster.shape, np.float32), np.ones(raster.shape, bool))
-    shown = np.zeros(raster.shape, bool)
-    shown[:20] = True
-    known = np.isfinite(map_intensity(points, surface, raster, ~shown & False, shown))
-    assert known[20:].all()
-    assert known[:20, :40].all()
-    assert not known[:9, 51:].any()  # but for what the points around it smear into its edge
 
 
 def test_heights_are_those_of_the_road_and_of_the_curb(ground: GroundMap) -> None:

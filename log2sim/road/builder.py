@@ -232,7 +232,7 @@ class GroundMapBuilder:
             self._colors = None
         standing = draw_footprints([self._users.standing()], self.raster) > 0
         alpha[standing], color[standing] = 0, 0
-        height, intensity = self._measured(alpha > 0)
+        height, intensity = self._measured()
         for name in ("_swept", "_surface", "_laid", "_likely_ground"):
             self.__dict__.pop(name, None)
         for layer in (height, intensity):
@@ -322,14 +322,14 @@ class GroundMapBuilder:
         near = stamps[np.abs(stamps - t_ns) <= MAX_APART_S * NS_PER_S]
         return np.concatenate([hiding[t] for t in near.tolist()]) if len(near) else None
 
-    def _measured(self, shown: NDArray[np.bool_]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Height, m, and intensity on the cells of the map (R, C), of which cameras show some; NaN where no sweep tells."""
+    def _measured(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Height, m, and intensity on the cells of the map (R, C), NaN where no sweep tells."""
         surface, shape = self._surface, self.raster.shape
         factor = round(surface.raster.resolution_m / self.raster.resolution_m)
         height = upsample(surface.z_m, factor, shape) + np.float32(self._z0_m)
         known = np.repeat(np.repeat(surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
         height[~known] = np.nan
-        intensity = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster), shown)
+        intensity = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster))
         return height, intensity
 
     def _road(self, raster: Raster, half_width_m: float = ROAD_HALF_WIDTH_M) -> NDArray[np.bool_]:

@@ -308,20 +308,18 @@ MIN_WEIGHT = 0.02
 
 
 def map_intensity(
-    points: GroundPoints, surface: Surface, raster: Raster, road: NDArray[np.bool_], shown: NDArray[np.bool_]
+    points: GroundPoints, surface: Surface, raster: Raster, road: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Map relative intensities of points onto a raster: (R, C) in [0, 1], NaN where there are none.
 
     `surface`: points off it are left out. `road`: (r, c) bool: cells of the surface's raster that are road surely,
-    because the ego drove there. `shown`: (R, C) bool: cells that a camera shows, where points beyond `SHARP_RANGE_M` are left
-    out: their spots are wider than a line, which they would only deny.
+    because the ego drove there.
     """
     cell = cells_of_points(points, surface.raster)
     kept = np.isfinite(points.intensity) & (np.abs(points.z - surface.z_m.ravel()[cell]) < ON_SURFACE_M)
     relative = normalize(points, kept, kept & road.ravel()[cell])
-    fine = cells_of_points(points, raster)
-    kept &= np.isfinite(relative) & ((points.range_m <= SHARP_RANGE_M) | ~shown.ravel()[fine])
-    fine = fine[kept]
+    kept &= np.isfinite(relative)
+    fine = cells_of_points(points, raster)[kept]
     weight = 1 / (1 + (points.range_m[kept] / SHARP_RANGE_M) ** 2)
     count = raster.shape[0] * raster.shape[1]
     total = np.bincount(fine, weight, count).astype(np.float32).reshape(raster.shape)
