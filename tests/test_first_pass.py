@@ -17,7 +17,7 @@ from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream
 from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
-from log2sim.perception.first_pass import base_pose, observe
+from log2sim.perception.first_pass import base_poses, observe
 from log2sim.perception.frames import AHEAD, give_pictures, work_ahead
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, obstacles_of, sample_rays
@@ -201,7 +201,7 @@ def test_sensors_on_a_post_need_no_ego():
         for solid, category in zip(SOLIDS, CATEGORIES):
             row = m.take(m.category == category)
             assert np.hypot(*(row.center_m[0] - solid.center_m)[:2]) < 0.3
-    np.testing.assert_array_equal(base_pose(log, T0_NS), np.eye(4))
+    np.testing.assert_array_equal(base_poses(log, np.array([T0_NS]))[0], np.eye(4))
     origin, ground = cloud_origin(log, T0_NS)
     np.testing.assert_allclose(origin, [0.0, 0.0, (1.9 + 1.6) / 2])
     assert ground == 0.0

@@ -10,15 +10,27 @@ from worlds import camera_ahead, outline_px, scan, standing
 
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Obstacles, Stream
-from log2sim.geometry import PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
-from log2sim.perception.first_pass import Observations
-from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.geometry import (
+    PoseTrack,
+    RollingShutter,
+    apply,
+    apply_homography,
+    inverse,
+    line_stamps_ns,
+    project,
+    project_moving,
+    rotation_from_rpy,
+    transform,
+)
+from log2sim.perception.first_pass import Observations, base_poses
+from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes
 from log2sim.perception.homography_stage import (
     CameraHomography,
     calibrated_homography,
     fit_homographies,
     place_by_homography,
 )
+from log2sim.perception.lidar.projection import poses_around
 from log2sim.plan import HomographyScope, Plan
 
 T0_NS = 1_700_000_000_000_000_000
@@ -157,3 +169,54 @@ FAR_WALL = standing(22.0, 0.0, 0.0, (0.5, 80.0, 4.0))
 
 def test_what_the_lidar_looks_through_is_not_placed():
     assert placed_where_rays_go([FAR_WALL]).source.tolist() == [""]
+
+
+# A camera that turns while it reads its lines.
+
+
+def turning_log(readout_s):
+    """An ego that drives slalom at 6 m/s; turns that stay the same a homography would absorb."""
+    t = T0_NS + np.arange(-1, 82) * 50_000_000
+    s = (t - T0_NS) / 1e9
+    yaw, places = 0.3 * np.sin(np.pi * s), np.column_stack([6.0 * s, np.zeros((len(t), 2))])
+    ego = PoseTrack(t, np.array([transform(rotation_from_rpy(0, 0, y), p) for y, p in zip(yaw, places)]))
+    shutter = RollingShutter("down", readout_s) if readout_s else None
+    camera = tilted(0.06, rolling_shutter=shutter)
+    return Log("log", "test", {"front": camera}, {}, {"front": Stream("front", t[1:-1:2], lambda i: None)}, ego)
+
+
+def seen_in_lines(log, t_ns, posts_xy):
+    """Boxes (N, 4) over posts that stand at places (N, 2) of the ego frame at the stamp, and their feet in the map (N, 3)."""
+    feet = apply(log.ego.at(t_ns)[0][0], np.column_stack([posts_xy, np.zeros(len(posts_xy))]))
+    camera = log.cameras["front"]
+    moving = replace(camera, rolling_shutter=RollingShutter("down", 0.06))
+    uv, _, valid = project_moving(moving, feet, poses_around(log, "front", int(t_ns)))
+    box_px = np.column_stack([uv[:, 0] - 20, uv[:, 1] - 60, uv[:, 0] + 20, uv[:, 1]])
+    return box_px[valid], feet[valid]
+
+
+@pytest.mark.parametrize(("told", "limit_m"), [(True, (0.0, 0.001)), (False, (0.02, 1.0))], ids=["told", "not told"])
+def test_a_camera_that_turns_while_it_reads_its_lines_places_obstacles_where_they_are(told, limit_m):
+    log, rng = turning_log(0.06 if told else 0.0), np.random.default_rng(2)
+    camera, seen = log.cameras["front"], Observations(measurements=[], obstacles=[])
+    errors = []
+    for tick, t_ns in enumerate(log.streams["front"].t_ns):
+        posts = np.column_stack([rng.uniform(6, 40, 14), rng.uniform(-0.6, 0.6, 14)])
+        posts[:, 1] *= posts[:, 0]
+        box_px, feet = seen_in_lines(log, t_ns, posts)
+        ego_T_map = inverse(base_poses(log, line_stamps_ns(camera, int(t_ns), feet_of_boxes(box_px))))
+        xy = ((ego_T_map[:, :3, :3] @ feet[:, :, None])[:, :, 0] + ego_T_map[:, :3, 3])[:, :2]
+        one = np.full(len(xy), tick)
+        seen.feet.setdefault("front", []).append(Correspondences(feet_of_boxes(box_px), xy, one))
+        seen.measurements.append(unplaced(box_px, int(t_ns), "pedestrian"))
+        seen.obstacles.append(None)
+        errors.append(feet)
+    grounds = fit(log, seen)
+    assert grounds["front"].source == "obstacles"
+    depth = sum(TYPICAL_SIZE_M["pedestrian"][:2]) / 4
+    for k, rows in enumerate(place_by_homography(log, seen, grounds)):
+        placed = rows.source == "topdown"
+        away = rows.center_m[placed, :2] - errors[k][placed, :2]
+        ray = rows.center_m[placed, :2] - log.map_T_sensor("front", rows.t_ns[0])[0][0][:2, 3]
+        errors[k] = np.hypot(*(away - depth * ray / np.hypot(*ray.T)[:, None]).T)
+    assert limit_m[0] < np.median(np.concatenate(errors)) < limit_m[1]

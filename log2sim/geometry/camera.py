@@ -18,7 +18,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.files.documents import short_repr
-from log2sim.geometry.transforms import Array, apply, inverse
+from log2sim.geometry.transforms import NS_PER_S, Array, apply, inverse
 
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane, or behind it, are not projected."""
@@ -241,6 +241,11 @@ def line_time_s(camera: Camera, uv_px: Array) -> Array:
     share = np.nan_to_num(np.clip(uv_px[:, along] / size_px, 0.0, 1.0) - 0.5)
     sign = 1.0 if shutter.direction in ("down", "right") else -1.0
     return np.asarray(sign * shutter.readout_s * share)
+
+
+def line_stamps_ns(camera: Camera, t_ns: int, uv_px: Array) -> NDArray[np.int64]:
+    """Compute at which absolute stamps (N,) the lines of pixels (N, 2) of an image of the stamp `t_ns` are exposed."""
+    return t_ns + np.round(line_time_s(camera, uv_px) * NS_PER_S).astype(np.int64)
 
 
 def project_moving(

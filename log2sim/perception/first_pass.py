@@ -33,11 +33,16 @@ from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.packing import pack
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
-from log2sim.geometry import Array, inverse
+from log2sim.geometry import Array, inverse, line_stamps_ns
 from log2sim.perception.cooperative import align_parts
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import FrameDetector
-from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
+from log2sim.perception.homography.correspondences import (
+    Correspondences,
+    feet_of_boxes,
+    foot_points,
+    undistorted_pixels,
+)
 from log2sim.perception.lidar.cloud import (
     Cloud,
     assemble_views,
@@ -466,10 +471,12 @@ class FirstPass:
         out = SeenTick(rows.take(~far))
         if self.plan.keeps(Stage.HOMOGRAPHY):
             for view, _, cloud in chain(*frames.values()):
-                ego_T_map, name = inverse(base_pose(self.log, view.t_ns)), view.camera.name
+                # Where the ego is when a line is read, one homography maps all lines of a rolling shutter to the ground.
+                name, at_ns = view.camera.name, line_stamps_ns(view.camera, view.t_ns, feet_of_boxes(rows.box_px))
+                ego_T_map = inverse(base_poses(self.log, at_ns))
                 out.feet[name] = foot_points(view.camera, rows, ego_T_map, tick)
                 if cloud is not None:
-                    out.ground[name] = _ground_points(view, cloud, ego_T_map, tick)
+                    out.ground[name] = _ground_points(self.log, view, cloud, tick)
         return out
 
     def _view(self, camera: str, tick: int) -> View | None:
@@ -488,19 +495,20 @@ def _seen_from_end(cloud: Cloud | None, end: str) -> Cloud | None:
     return join_parts([part for part in cloud.parts if part.end == end]) or cloud
 
 
-def base_pose(log: Log, t_ns: int) -> Array:
-    """Pose (4, 4) of what carries the cameras: the ego, or the map itself for a roadside log."""
-    return np.eye(4) if log.ego is None else log.ego.at(t_ns)[0][0]
+def base_poses(log: Log, t_ns: NDArray[np.int64]) -> Array:
+    """Poses (N, 4, 4) at stamps (N,) of what carries the cameras: the ego, or the map itself for a roadside log."""
+    return np.tile(np.eye(4), (len(t_ns), 1, 1)) if log.ego is None else log.ego.at(t_ns)[0]
 
 
-def _ground_points(view: View, cloud: Cloud, ego_T_map: Array, tick: int) -> Correspondences:
+def _ground_points(log: Log, view: View, cloud: Cloud, tick: int) -> Correspondences:
     """Sample the LiDAR's ground points that the camera sees evenly."""
     visible, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
     if len(visible) == 0:
         return Correspondences.join([])
     step = np.linspace(0, len(visible) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(visible))).round().astype(np.intp)
     points = cloud.xyz[cloud.ground_sample[visible[step]]].astype(np.float64) + cloud.origin
-    xy = (points @ ego_T_map[:3, :3].T + ego_T_map[:3, 3])[:, :2]
+    ego_T_map = inverse(base_poses(log, line_stamps_ns(view.camera, view.t_ns, uv[step])))
+    xy = ((ego_T_map[:, :3, :3] @ points[:, :, None])[:, :, 0] + ego_T_map[:, :3, 3])[:, :2]
     return Correspondences(undistorted_pixels(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
-from log2sim.geometry import Array, Camera, ground_homography, inverse
-from log2sim.perception.first_pass import Observations, base_pose
-from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.geometry import Array, Camera, ground_homography, inverse, line_stamps_ns
+from log2sim.perception.first_pass import Observations, base_poses
+from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes
 from log2sim.perception.homography.estimate import (
     MAX_CONDITION,
     STREAM_METHODS,
@@ -190,10 +190,12 @@ def _place_tick(
         camera = log.cameras.get(str(m.camera[k]))
         if camera is None or camera.name not in ground_H_image or not _has_foot(camera, m.box_px[k]):
             continue
-        frame = (camera.name, int(m.t_ns[k]))
+        # Seen in its line of a rolling shutter from where the camera was then.
+        frame = camera.name, int(line_stamps_ns(camera, int(m.t_ns[k]), feet_of_boxes(m.box_px[[k]]))[0])
         if frame not in poses:
-            map_T_base = base_pose(log, frame[1])
-            poses[frame] = map_T_base, inverse(map_T_base) @ log.map_T_sensor(camera.name, frame[1])[0][0]
+            map_T_base = base_poses(log, np.array(frame[1:]))[0]
+            on_map = camera.mount == "map" and log.ego is not None
+            poses[frame] = map_T_base, inverse(map_T_base) @ camera.mount_T_cam if on_map else camera.mount_T_cam
         (map_T_base, base_T_cam), h = poses[frame], ground_H_image[camera.name]
         placed = place_obstacle(h, camera, m.box_px[k], str(m.category[k]), base_T_cam[:2, 3])
         if placed is None:

@@ -14,9 +14,14 @@ from log2sim.errors import ConfigError
 from log2sim.evaluation.bench.settings import ErrorSums, Point, error_of
 from log2sim.evaluation.metrics.comparison import StateTable, truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, project_boxes
-from log2sim.perception.first_pass import Observations, base_pose
-from log2sim.perception.homography.correspondences import Correspondences, foot_points, undistorted_pixels
+from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, line_stamps_ns, project_boxes
+from log2sim.perception.first_pass import Observations, base_poses
+from log2sim.perception.homography.correspondences import (
+    Correspondences,
+    feet_of_boxes,
+    foot_points,
+    undistorted_pixels,
+)
 from log2sim.perception.homography.estimate import MAX_RANGE_M
 from log2sim.perception.homography_stage import CameraHomography, place_by_homography
 from log2sim.perception.sync import Schedule
@@ -277,7 +282,8 @@ def split_holdout(
         for camera in obstacles:
             rows = np.flatnonzero(good & (m.camera == camera))
             stamp = int(log.streams[camera].t_ns[schedule.frames[camera][tick]])
-            ego_T_map = inverse(base_pose(log, stamp))
+            at_ns = line_stamps_ns(log.cameras[camera], stamp, feet_of_boxes(m.box_px[rows]))
+            ego_T_map = inverse(base_poses(log, at_ns))
             holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
             obstacles[camera].append(_drop_positions(m.take(rows), stamp))
             places[camera].append(KnownPositions(xy[rows], object_id[rows]))

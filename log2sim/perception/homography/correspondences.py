@@ -184,8 +184,15 @@ def undistorted_pixels(camera: Camera, uv: Array) -> Array:
     return undistort(camera, uv) @ camera.K[:2, :2].T + camera.K[:2, 2]
 
 
+def feet_of_boxes(box_px: Array) -> Array:
+    """Return the middles of the lower edges (N, 2) of boxes (N, 4), px."""
+    return np.column_stack([(box_px[:, 0] + box_px[:, 2]) / 2, box_px[:, 3]])
+
+
 def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: int) -> Correspondences:
     """Find where obstacles touch the ground.
+
+    `ego_T_map`: (4, 4), or of each row (M, 4, 4): at the time at which its foot is seen.
 
     In the image it is the middle of the box's lower edge, on the ground the point below the nearest side of their LiDAR
     points. Truncated boxes and obstacles with few points are left out.
@@ -193,20 +200,20 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
     kept = np.array([len(c) > 0 for c in measured.cluster], dtype=bool)
     good = (measured.source == "lidar") & ~measured.truncated & (measured.points >= MIN_FOOT_POINTS) & kept
     rows = np.flatnonzero(good & (measured.camera == camera.name))
-    uv, xy = [], []
+    xy = []
     for k in rows.tolist():
         sensor, cluster = measured.sensor_m[k, :2], measured.cluster[k][:, :2]
         direction = measured.center_m[k, :2] - sensor
         direction /= np.hypot(*direction)
         nearest = quantile_of_sorted(np.sort((cluster - sensor) @ direction), NEAREST_SIDE_QUANTILE)
         foot = np.append(sensor + direction * nearest, measured.bottom_m[k])
-        box = measured.box_px[k]
-        xy.append((ego_T_map[:3, :3] @ foot + ego_T_map[:3, 3])[:2])
-        uv.append([(box[0] + box[2]) / 2, box[3]])
+        pose = ego_T_map if ego_T_map.ndim == 2 else ego_T_map[k]
+        xy.append((pose[:3, :3] @ foot + pose[:3, 3])[:2])
     if not rows.size:
         return Correspondences.join([])
-    feet, boxes = undistorted_pixels(camera, np.array(uv)), measured.box_px[rows]
+    boxes = measured.box_px[rows]
+    feet = undistorted_pixels(camera, feet_of_boxes(boxes))
     height_m = np.array([TYPICAL_SIZE_M[str(c)][2] for c in measured.category[rows]])
-    ego_T_cam = camera.mount_T_cam if camera.mount == "ego" else ego_T_map @ camera.mount_T_cam
+    ego_T_cam = camera.mount_T_cam if camera.mount == "ego" else ego_T_map.reshape(-1, 4, 4)[0] @ camera.mount_T_cam
     by_size = ground_from_sizes(feet, boxes[:, 3] - boxes[:, 1], height_m, camera.K, ego_T_cam)
     return Correspondences(feet, np.array(xy), np.full(len(rows), tick, dtype=np.int64), by_size)
