@@ -11,7 +11,7 @@ import pytest
 from log2sim.geometry import CHI2_2DOF_99, apply_homography, rotation_from_rpy
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
-from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.fit import HomographyFit, ground_covariances
 from log2sim.perception.homography.normalized import (
     NormalizedCorrespondences,
     linearize,
@@ -154,6 +154,26 @@ def test_a_homography_knows_how_sure_it_is() -> None:
         away = through(fit.ground_H_image, through(image_H_ground(), probes)) - probes
         ratios.append(np.hypot(*away.T).max() / fit.sigma_m)
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, 0.1], ids=["fixed", "pitching"])
+@pytest.mark.parametrize("method", ["time-aware", "calibrated"])
+def test_the_covariance_of_a_homography_is_that_of_its_errors_near_and_far(method: str, pitch_deg: float) -> None:
+    ground = np.array([[x, y] for x in (*NEAR_M, *FAR_M) for y in (-0.3 * x, 0.3 * x)])
+    uv, near = through(image_H_ground(), ground), ground[:, 0] <= NEAR_M[-1]
+    nees = []
+    for seed in range(16):
+        world = pitching_stream(seed, pitch_deg, ticks=20)
+        fit = world.fit(method, pitch_roll=pitch_deg > 0)
+        for tick in range(0, 20, 3) if pitch_deg else [0]:
+            h, covariance = fit.at_tick(tick), fit.covariance_at(tick)
+            assert h is not None
+            assert covariance is not None
+            away = through(h, uv) - through(np.linalg.inv(world.poses[tick]), uv)
+            each = np.linalg.solve(ground_covariances(h, covariance, uv), away[:, :, None])[:, :, 0]
+            squared = (away * each).sum(axis=1) / 2
+            nees.append((squared[near].mean(), squared[~near].mean()))
+    assert ((np.mean(nees, axis=0) > 0.6) & (np.mean(nees, axis=0) < 1.6)).all()
 
 
 # Calibrated.

@@ -170,8 +170,9 @@ def place_by_homography(
     """Place the measurements without LiDAR points by their camera's homography, where it is able to, at every tick."""
     out = []
     for tick, (m, obstacles) in enumerate(zip(observed.measurements, observed.obstacles, strict=True)):
-        h = {name: homography.fit.at_tick(tick) for name, homography in homographies.items()}
-        out.append(_place_tick(log, m, obstacles, {name: v for name, v in h.items() if v is not None}))
+        fits = {name: homography.fit for name, homography in homographies.items()}
+        found = {name: (h, f.covariance_at(tick)) for name, f in fits.items() if (h := f.at_tick(tick)) is not None}
+        out.append(_place_tick(log, m, obstacles, found))
     return out
 
 
@@ -179,7 +180,7 @@ def _place_tick(
     log: Log,
     m: Measurements,
     obstacles: Obstacles | None,
-    ground_H_image: Mapping[str, Array],
+    homographies: Mapping[str, tuple[Array, Array | None]],
 ) -> Measurements:
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
@@ -188,7 +189,7 @@ def _place_tick(
     poses: dict[tuple[str, int], tuple[Array, Array]] = {}
     for k in missing:
         camera = log.cameras.get(str(m.camera[k]))
-        if camera is None or camera.name not in ground_H_image or not _has_foot(camera, m.box_px[k]):
+        if camera is None or camera.name not in homographies or not _has_foot(camera, m.box_px[k]):
             continue
         # Seen in its line of a rolling shutter from where the camera was then.
         frame = camera.name, int(line_stamps_ns(camera, int(m.t_ns[k]), feet_of_boxes(m.box_px[[k]]))[0])
@@ -196,8 +197,8 @@ def _place_tick(
             map_T_base = base_poses(log, np.array(frame[1:]))[0]
             on_map = camera.mount == "map" and log.ego is not None
             poses[frame] = map_T_base, inverse(map_T_base) @ camera.mount_T_cam if on_map else camera.mount_T_cam
-        (map_T_base, base_T_cam), h = poses[frame], ground_H_image[camera.name]
-        placed = place_obstacle(h, camera, m.box_px[k], str(m.category[k]), base_T_cam[:2, 3])
+        (map_T_base, base_T_cam), (h, uncertainty) = poses[frame], homographies[camera.name]
+        placed = place_obstacle(h, camera, m.box_px[k], str(m.category[k]), base_T_cam[:2, 3], uncertainty)
         if placed is None:
             continue
         if obstacles is not None:

@@ -17,7 +17,7 @@ from log2sim.perception.homography.correspondences import (
     sigma_from_sizes_m,
     undistorted_pixels,
 )
-from log2sim.perception.homography.fit import HomographyFit, PitchRoll, refused_fit, validated_fit
+from log2sim.perception.homography.fit import HomographyFit, PitchRoll, ground_covariances, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import NormalizedCorrespondences, scaled
 from log2sim.perception.homography.pitch_roll import (
     PITCH_SIGMA_PX,
@@ -136,9 +136,12 @@ def _fit_stream(data: NormalizedCorrespondences, options: EstimationOptions, rng
     robust = ransac(data, rng, pitch_sigma=pitch_sigma, image_K=image_K, schedule=schedule)
     if robust.h is None or not options.pitch_roll:
         return validated_fit(robust, image_K)
-    moving, warps = fit_pitch_roll(data, robust.h, image_K)
+    moving, warps, unsure = fit_pitch_roll(data, robust.h, image_K)
     fit = validated_fit(moving, image_K)
-    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h)) if fit.ok and moving.h is not None else fit
+    if not fit.ok or moving.h is None:
+        return fit
+    unsure = fit.ground_H_image @ np.linalg.inv(data.image_N_px) @ unsure @ data.image_N_px
+    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h), unsure=unsure)
 
 
 def _spread_to_all(
@@ -156,7 +159,12 @@ def _spread_to_all(
         missing = fit.ground_H_image if of_stream else np.full((3, 3), np.nan)
         per_tick = np.repeat(missing[None], len(ticks), axis=0)
         per_tick[np.unique(number[rows])] = fit.per_tick
-    return replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick)
+    unsure = fit.unsure
+    if unsure is not None:
+        # A tick without usable rows may have any angle that other ticks have.
+        unsure = np.repeat(unsure[[np.abs(unsure).sum(axis=(1, 2, 3)).argmax()]], len(ticks), axis=0)
+        unsure[np.unique(number[rows])] = fit.unsure
+    return replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick, unsure=unsure)
 
 
 # A detector's box ends this far from the true foot point (standard deviation).
@@ -205,7 +213,8 @@ def fit_camera(
     if not stable.ok:
         return fit, source
     per_tick = scaled(stable.ground_H_image @ stabilizing_warps(moving))
-    return replace(stable, ticks=moving.ticks, per_tick=per_tick, pitch_roll=pitch_roll), source
+    unsure = stable.ground_H_image @ np.linalg.inv(moving.ground_H_image) @ moving.unsure
+    return replace(stable, ticks=moving.ticks, per_tick=per_tick, unsure=unsure, pitch_roll=pitch_roll), source
 
 
 def _fit_fixed(
@@ -291,12 +300,17 @@ GROUND_POSITION_SIGMA_M = 0.2
 
 
 def place_obstacle(
-    ground_H_image: Array, camera: Camera, box_px: Array, category: str, camera_xy: Array
+    ground_H_image: Array,
+    camera: Camera,
+    box_px: Array,
+    category: str,
+    camera_xy: Array,
+    homography_covariance: Array | None = None,
 ) -> tuple[Array, Array] | None:
     """Place an obstacle by the middle of the lower edge of its box.
 
-    `ground_H_image`: (3, 3). `box_px`: (4,). `category`: its typical size is used. `camera_xy`: (2,): position of the
-    camera in the frame of the ground positions, m.
+    `ground_H_image`: (3, 3), of `homography_covariance` (9, 9), None for 0. `box_px`: (4,). `category`: its typical size is
+    used. `camera_xy`: (2,): position of the camera in the frame of the ground positions, m.
 
     Returns its center (2,), m, on the ground and the covariance (2, 2); None above the horizon and beyond `MAX_RANGE_M`.
     """
@@ -312,6 +326,8 @@ def place_obstacle(
     slope = homography_jacobian(ground_H_image, uv)[0]
     covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * GROUND_POSITION_SIGMA_M**2
     covariance = covariance + depth_sigma**2 * np.outer(direction, direction)
+    if homography_covariance is not None:
+        covariance = covariance + ground_covariances(ground_H_image, homography_covariance, uv)[0]
     return xy[0] + direction * depth, covariance
 
 

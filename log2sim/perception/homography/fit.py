@@ -31,37 +31,53 @@ MAX_RELATIVE_SIGMA = 0.25
 PROBES = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
 
 
+def homography_covariance(
+    h: Array, linear: Linearization, use: NDArray[np.bool_], image_K: Array | None
+) -> Array | None:
+    """Compute the covariance (9, 9) of the elements of `inv(h)`, row by row, ground to image and normalized units for `h` (3, 3).
+
+    `use` (N,): correspondences that it was fitted to. None where they do not determine it.
+    """
+    basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
+    slope = (linear.slope[0] * use).reshape(9, -1)
+    normal = basis.T @ (slope @ slope.T) @ basis
+    size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    try:
+        inverse = np.linalg.inv(normal / size[:, None] / size)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.abs(inverse).max() < 1e13:
+        return None
+    back = np.linalg.inv(h)
+    by_parameters = -np.kron(back, back.T) @ basis / size
+    return np.asarray(by_parameters @ inverse @ by_parameters.T)
+
+
+def ground_covariances(ground_H_image: Array, covariance: Array, uv: Array) -> Array:
+    """Compute the covariances (N, 2, 2) that a homography (3, 3) of covariance (9, 9) gives the ground positions of pixels (N, 2)."""
+    pixel = np.column_stack([uv, np.ones(len(uv))])
+    q = pixel @ ground_H_image.T
+    by_h = np.zeros((len(uv), 2, 9))
+    by_h[:, 0, 0:3] = by_h[:, 1, 3:6] = pixel / q[:, 2:]
+    by_h[:, :, 6:] = -(q[:, :2] / q[:, 2:])[:, :, None] * by_h[:, :1, 0:3]
+    return np.asarray(by_h @ covariance @ by_h.swapaxes(1, 2))
+
+
 def predicted_sigma(
-    data: NormalizedCorrespondences, h: Array, linear: Linearization, use: NDArray[np.bool_], image_K: Array | None
+    data: NormalizedCorrespondences, h: Array, covariance: Array | None, use: NDArray[np.bool_]
 ) -> tuple[float, float]:
     """Predict the standard deviation on the ground one spread of the inliers from their mean.
 
     Returns `sigma`, `spread`: the standard deviation and that spread, normalized units.
     """
-    basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
-    slope = (linear.slope[0] * use).reshape(9, -1)
-    normal = basis.T @ (slope @ slope.T) @ basis
     ground_xy = data.ground[:2, use]
     mean = ground_xy.mean(axis=1, keepdims=True)
     spread = float(np.sqrt(((ground_xy - mean) ** 2).sum(axis=0).mean() / 2))
-    size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
-    scaled = normal / size[:, None] / size
-    try:
-        inverse = np.linalg.inv(scaled)
-    except np.linalg.LinAlgError:
+    if spread == 0 or covariance is None:
         return float("inf"), spread
-    if spread == 0 or not np.abs(inverse).max() < 1e13:
-        return float("inf"), spread
-    probes = np.vstack([mean + spread * PROBES, np.ones((1, 4))])
-    q = h @ probes
-    probes, q = probes[:, q[2] > 0], q[:, q[2] > 0]
-    uv = q[:2] / q[2]
-    by_h = np.zeros((probes.shape[1], 2, 9))
-    by_h[:, 0, 0:3] = by_h[:, 1, 3:6] = (probes / q[2]).T
-    by_h[:, :, 6:] = -uv.T[:, :, None] * by_h[:, :1, 0:3]
-    by_ground = (h[:2, :2] - uv.T[:, :, None] * h[2, :2]) / q[2][:, None, None]
-    by_parameters = np.linalg.solve(by_ground, by_h @ basis) / size
-    variance = np.einsum("nij,jk,nik->n", by_parameters, inverse, by_parameters)
+    q = h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
+    q = q[:, q[2] > 0]
+    variance = ground_covariances(np.linalg.inv(h), covariance, (q[:2] / q[2]).T).trace(axis1=1, axis2=2)
     return (float(np.sqrt(variance.max())) if len(variance) else float("inf")), spread
 
 
@@ -125,6 +141,11 @@ class HomographyFit:
     per_tick: Array | None = None
     # Standard deviation of the homography on the ground, m, one spread of the inliers from their mean
     sigma_m: float = float("nan")
+    # (9, 9): covariance of the elements of `ground_H_image`, row by row, that the noise of the inliers causes; None where it is
+    # not known
+    covariance: Array | None = None
+    # (T, 2, 3, 3): by how much `per_tick` changes with one standard deviation of the pitch and of the roll of a tick
+    unsure: Array | None = None
     # Whether each tick has its own pitch and roll, and by how much they vary; None where that was not tested
     pitch_roll: PitchRoll | None = None
 
@@ -138,6 +159,16 @@ class HomographyFit:
         if k < len(self.ticks) and self.ticks[k] == tick:
             return np.asarray(self.per_tick[k]) if np.isfinite(self.per_tick[k]).all() else None
         return None if self.pitch_roll is None else self.ground_H_image
+
+    def covariance_at(self, tick: int) -> Array | None:
+        """Return the covariance (9, 9) of the elements of `at_tick`, with that of the tick's angles; None where it is not known."""
+        if self.covariance is None or self.unsure is None:
+            return self.covariance
+        k = int(np.searchsorted(self.ticks, tick))
+        if k >= len(self.ticks) or self.ticks[k] != tick:
+            k = int(np.abs(self.unsure).sum(axis=(1, 2, 3)).argmax())
+        by_angle = self.unsure[k].reshape(2, 9)
+        return np.asarray(self.covariance + by_angle.T @ by_angle)
 
     @property
     def jitter_m(self) -> float:
@@ -184,7 +215,8 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
     s = singular_values(data, inliers)
     if image_K is None and s[7] < MIN_S8_S1 * s[0]:
         return refused_fit(f"the {count} correspondences that agree lie on a line or a point", rows)
-    sigma, spread = predicted_sigma(data, robust.h, robust.linear, inliers, image_K)
+    covariance = homography_covariance(robust.h, robust.linear, inliers, image_K)
+    sigma, spread = predicted_sigma(data, robust.h, covariance, inliers)
     scale = data.ground_N_m[0, 0]
     if not sigma < MAX_RELATIVE_SIGMA * spread:
         reason = (
@@ -198,4 +230,7 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
     back = np.linalg.inv(robust.h) @ image
     error_m = float(np.median(np.hypot(*(back[:2] / back[2] - data.ground[:2])[:, inliers]) / scale))
     condition, h = float(s[0] / s[7]) if s[7] > 0 else float("inf"), data.to_ground_H_image(robust.h)
-    return HomographyFit(True, "", h, inliers, error_m, condition, sigma_m=float(sigma / scale))
+    unscaled = np.linalg.inv(data.ground_N_m) @ np.linalg.inv(robust.h) @ data.image_N_px
+    to_px = np.kron(np.linalg.inv(data.ground_N_m), data.image_N_px.T) / np.linalg.norm(unscaled[2])
+    covariance = None if covariance is None else to_px @ covariance @ to_px.T
+    return HomographyFit(True, "", h, inliers, error_m, condition, sigma_m=float(sigma / scale), covariance=covariance)

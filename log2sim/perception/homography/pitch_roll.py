@@ -55,11 +55,11 @@ class _Angles:
         return np.asarray(np.eye(3) + first + first @ first / 2)
 
 
-def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | None) -> tuple[RobustFit, Array]:
+def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | None) -> tuple[RobustFit, Array, Array]:
     """Fit the stream's homography and the angles of all ticks together, starting from `h` (3, 3).
 
-    Returns the fit, and the image homography of each tick on top of it (T, 3, 3). An angle counts among the effective parameters
-    by how little its prior determines it.
+    Returns the fit; the image homography of each tick on top of it (T, 3, 3); and the image motions (T, 2, 3, 3) by one standard
+    deviation of its two angles. An angle counts among the effective parameters by how little its prior determines it.
 
     Notes
     -----
@@ -86,7 +86,8 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
         angles = replace(angles, sigma=sigma)
     warps = angles.warps()
     of_rows, parameters = warps[noisy.tick], float((angles.significant * information * variance).sum())
-    return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps
+    unsure = (np.sqrt(variance) * angles.significant)[:, :, None, None] * angles.generators
+    return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps, unsure
 
 
 def _is_significant(angles: _Angles, information: Array) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ correspondences of different cameras serve one hypothesis, three determine it, a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,28 +95,41 @@ def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = 
     return scaled(scaled(back @ np.linalg.inv(image_H_ground)) @ below)
 
 
-def foot_sigma_m(rig: Rig, state: RigState, name: str, covariance: Array) -> float:
-    """Predict the standard deviation, m, of ground positions `PROBE_M` ahead of a camera; NaN where it does not see so far.
+# Steps at which the change of a homography by the parameters of the feet is read: px, m and rad.
+STEPS = np.array([1e-3, 1e-5, 1e-7, 1e-7, 1e-7])
+
+
+def foot_covariance(rig: Rig, state: RigState, name: str, covariance: Array) -> Array:
+    """Compute the covariance (9, 9) of the elements of `foot_homography`, row by row.
 
     `covariance` (5, 5) is that of `below_px`, and of `lift_m` and the rotation `feet` of the camera.
     """
-    cam_T_rig = rig.cam_T_rig[name]
-    axis, place = cam_T_rig[2, :3], inverse(cam_T_rig)[:2, 3]
-    if not np.hypot(*axis[:2]) > 0:
-        return float("nan")
-    at = place + PROBE_M * axis[:2] / np.hypot(*axis[:2])
-    turn = rotation_of(state.feet[name])
-    matrix = cam_of_ground(cam_T_rig, state.plane, turn)
-    point = matrix @ [*at, 1.0]
-    if not point[2] > 0:
-        return float("nan")
-    by_point = np.array([[1.0, 0.0, -point[0] / point[2]], [0.0, 1.0, -point[1] / point[2]]]) / point[2]
-    by_parameter = np.zeros((2, 5))
-    by_parameter[1, 0] = -1.0 / rig.cameras[name].K[1, 1]
-    by_parameter[:, 1] = by_point @ (turn @ cam_T_rig[:3, 2])
-    by_parameter[:, 2:] = by_point @ np.cross(np.eye(3), point).T
-    on_ground = np.linalg.solve(by_point @ matrix[:, :2], by_parameter)
-    return float(np.sqrt(np.linalg.eigvalsh(on_ground @ covariance @ on_ground.T)[-1]))
+    columns = []
+    for k, step in enumerate(STEPS):
+        d = step * np.eye(len(STEPS))[k]
+        ends = [
+            replace(
+                state,
+                below_px=state.below_px + sign * d[0],
+                lift_m={**state.lift_m, name: state.lift_m[name] + sign * d[1]},
+                feet={**state.feet, name: state.feet[name] + sign * d[2:]},
+            )
+            for sign in (1.0, -1.0)
+        ]
+        after, before = (foot_homography(rig, end, name) for end in ends)
+        columns.append((after - before).ravel() / (2 * step))
+    by_parameter = np.column_stack(columns)
+    return np.asarray(by_parameter @ covariance @ by_parameter.T)
+
+
+def probe_of(rig: Rig, state: RigState, name: str) -> Array | None:
+    """Return the pixel (1, 2) that shows the ground `PROBE_M` ahead of a camera; None where it does not see so far."""
+    axis, place = rig.cam_T_rig[name][2, :2], inverse(rig.cam_T_rig[name])[:2, 3]
+    if not np.hypot(*axis) > 0:
+        return None
+    at = place + PROBE_M * axis / np.hypot(*axis) + rig.origin_m[:2]
+    point = np.linalg.inv(foot_homography(rig, state, name)) @ [*at, 1.0]
+    return np.asarray(point[None, :2] / point[2]) if point[2] > 0 else None
 
 
 # Parameters of feet: one that all cameras share, then of each camera the height of feet above the road, m, and its rotation.

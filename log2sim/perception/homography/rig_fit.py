@@ -22,7 +22,14 @@ from log2sim.perception.homography.estimate import (
     GROUND_SIGMA_PX,
     MIN_TESTED_FEET,
 )
-from log2sim.perception.homography.fit import MIN_INLIER_SHARE, MIN_INLIERS, HomographyFit, PitchRoll, refused_fit
+from log2sim.perception.homography.fit import (
+    MIN_INLIER_SHARE,
+    MIN_INLIERS,
+    HomographyFit,
+    PitchRoll,
+    ground_covariances,
+    refused_fit,
+)
 from log2sim.perception.homography.normalized import MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS
 from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, HeldOutErrors
 from log2sim.perception.homography.rig import (
@@ -35,10 +42,11 @@ from log2sim.perception.homography.rig import (
     RigRows,
     RigState,
     find_plane,
+    foot_covariance,
     foot_homography,
-    foot_sigma_m,
     heights_of,
     linearize_feet,
+    probe_of,
     tilt_of_ticks,
 )
 
@@ -251,5 +259,9 @@ def _fit_of_camera(result: RigFit, fit: FeetFit, rows: RigRows, name: str, data:
     known = distance[np.isfinite(distance)]
     error_m, s = float(np.median(known)) if len(known) else float("nan"), np.linalg.svd(h, compute_uv=False)
     per_tick = foot_homography(result.rig, fit.state, name, result.planes) if len(result.ticks) else None
-    sigma_m = foot_sigma_m(result.rig, fit.state, name, fit.covariance_of(number))
-    return HomographyFit(True, "", h, inliers, error_m, float(s[0] / s[-1]), result.ticks, per_tick, sigma_m)
+    covariance = foot_covariance(result.rig, fit.state, name, fit.covariance_of(number))
+    probe, sigma_m = probe_of(result.rig, fit.state, name), float("nan")
+    if probe is not None:
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(ground_covariances(h, covariance, probe)[0])[-1]))
+    condition = float(s[0] / s[-1])
+    return HomographyFit(True, "", h, inliers, error_m, condition, result.ticks, per_tick, sigma_m, covariance)
