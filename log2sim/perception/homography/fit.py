@@ -75,9 +75,9 @@ def predicted_sigma(
     spread = float(np.sqrt(((ground_xy - mean) ** 2).sum(axis=0).mean() / 2))
     if spread == 0 or covariance is None:
         return float("inf"), spread
-    q = h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
-    q = q[:, q[2] > 0]
-    variance = ground_covariances(np.linalg.inv(h), covariance, (q[:2] / q[2]).T).trace(axis1=1, axis2=2)
+    q: Array = h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
+    seen: Array = (q[:2, q[2] > 0] / q[2, q[2] > 0]).T
+    variance = ground_covariances(np.linalg.inv(h), covariance, seen).trace(axis1=1, axis2=2)
     return (float(np.sqrt(variance.max())) if len(variance) else float("inf")), spread
 
 
