@@ -177,6 +177,7 @@ def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, Cam
                 "error_m": float(fit.error_m) if np.isfinite(fit.error_m) else None,
                 "condition": float(fit.condition),
                 "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
+                "slope": None if fit.slope is None else fit.slope.to_dict(),
             }
         entries.append({"name": name, "used": name in used, "homography": homography})
     return entries
@@ -339,6 +340,7 @@ def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
         "jitter_m": rounded(fit.jitter_m, 4),
         "condition": rounded(fit.condition, 3),
         "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
+        "slope": None if fit.slope is None else fit.slope.to_dict(),
     }
 
 

@@ -12,8 +12,10 @@ from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
 from log2sim.geometry import Array, Camera, ground_homography, inverse, line_stamps_ns
 from log2sim.perception.first_pass import Observations, base_poses
-from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes
+from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes, undistorted_pixels
 from log2sim.perception.homography.estimate import (
+    FOOT_SIGMA_M,
+    FOOT_SIGMA_PX,
     MAX_CONDITION,
     STREAM_METHODS,
     EstimationOptions,
@@ -21,9 +23,10 @@ from log2sim.perception.homography.estimate import (
     place_obstacle,
     spanned_height_m,
 )
-from log2sim.perception.homography.fit import HomographyFit, refused_fit
+from log2sim.perception.homography.fit import HomographyFit, RoadSlope, refused_fit
 from log2sim.perception.homography.rig import SAMPLES, Rig
 from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.homography.slope import fit_slope, slope_homography
 from log2sim.perception.lidar.measure import BORDER_PX
 from log2sim.plan import HomographyScope, Plan
 
@@ -71,7 +74,18 @@ def fit_homographies(
     apart = {
         c: replace(g, source=f"{g.source} (apart: {why_apart[c]})") if why_apart.get(c) else g for c, g in apart.items()
     }
-    return {c: together[c] if c in together else apart[c] for c in plan.cameras if c in wanted}
+    found = {c: together[c] if c in together else apart[c] for c in plan.cameras if c in wanted}
+    return {c: _with_slope(log, observed, g) for c, g in found.items()} if config.method in STREAM_METHODS else found
+
+
+def _with_slope(log: Log, observed: Observations, ground: CameraHomography) -> CameraHomography:
+    """Fit a second plane of the road to what the homography of a camera was fitted to, the feet of obstacles where they were many."""
+    name = ground.camera.name
+    stamps = {k: m.t_ns[m.camera == name] for k, m in enumerate(observed.measurements)}
+    map_T_base = {k: base_poses(log, t_ns[:1])[0] for k, t_ns in stamps.items() if len(t_ns)}
+    feet = Correspondences.join(observed.feet.get(name, []))
+    fit = fit_slope(ground.fit, feet, ground.camera.K, map_T_base, FOOT_SIGMA_PX, FOOT_SIGMA_M)
+    return replace(ground, fit=fit)
 
 
 def _fit_together(
@@ -171,7 +185,9 @@ def place_by_homography(
     out = []
     for tick, (m, obstacles) in enumerate(zip(observed.measurements, observed.obstacles, strict=True)):
         fits = {name: homography.fit for name, homography in homographies.items()}
-        found = {name: (h, f.covariance_at(tick)) for name, f in fits.items() if (h := f.at_tick(tick)) is not None}
+        found = {
+            name: (h, f.covariance_at(tick), f.slope) for name, f in fits.items() if (h := f.at_tick(tick)) is not None
+        }
         out.append(_place_tick(log, m, obstacles, found))
     return out
 
@@ -180,7 +196,7 @@ def _place_tick(
     log: Log,
     m: Measurements,
     obstacles: Obstacles | None,
-    homographies: Mapping[str, tuple[Array, Array | None]],
+    homographies: Mapping[str, tuple[Array, Array | None, RoadSlope | None]],
 ) -> Measurements:
     missing = np.flatnonzero(m.source == "")
     if len(missing) == 0:
@@ -197,7 +213,13 @@ def _place_tick(
             map_T_base = base_poses(log, np.array(frame[1:]))[0]
             on_map = camera.mount == "map" and log.ego is not None
             poses[frame] = map_T_base, inverse(map_T_base) @ camera.mount_T_cam if on_map else camera.mount_T_cam
-        (map_T_base, base_T_cam), (h, uncertainty) = poses[frame], homographies[camera.name]
+        (map_T_base, base_T_cam), (h, uncertainty, slope) = poses[frame], homographies[camera.name]
+        if slope is not None:
+            foot_px = undistorted_pixels(camera, feet_of_boxes(m.box_px[[k]]))[0]
+            beyond = slope_homography(slope, h, camera.K, map_T_base, foot_px)
+            if beyond is not None:
+                h, by_slope = beyond
+                uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
         placed = place_obstacle(h, camera, m.box_px[k], str(m.category[k]), base_T_cam[:2, 3], uncertainty)
         if placed is None:
             continue

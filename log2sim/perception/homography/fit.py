@@ -77,7 +77,8 @@ def predicted_sigma(
         return float("inf"), spread
     q: Array = h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
     seen: Array = (q[:2, q[2] > 0] / q[2, q[2] > 0]).T
-    variance = ground_covariances(np.linalg.inv(h), covariance, seen).trace(axis1=1, axis2=2)
+    back = np.asarray(np.linalg.inv(h), dtype=np.float64)
+    variance = ground_covariances(back, covariance, seen).trace(axis1=1, axis2=2)
     return (float(np.sqrt(variance.max())) if len(variance) else float("inf")), spread
 
 
@@ -124,6 +125,29 @@ class PitchRoll:
 
 
 @dataclass(frozen=True, eq=False)
+class RoadSlope:
+    """A second plane of the road, which begins at a line of the map on the other side than the ego."""
+
+    line: Array  # (3,): of the map: `line @ (x, y, 1)` is the distance from it, m
+    change: float  # by how much the road rises beyond the line against the plane before it, m a meter
+    sigma: float  # its standard deviation
+    # Median error of held-out correspondences in the image with one plane and with two, px
+    held_out_px: tuple[float, float]
+    significance: float  # fall of the held-out loss in standard errors
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to a JSON document, as it is written in scenarios and reports."""
+        before, after = self.held_out_px
+        return {
+            "line": [rounded(float(v), 4) for v in self.line],
+            "change": rounded(self.change, 5),
+            "sigma": rounded(self.sigma, 5),
+            "held_out_px": {"one_plane": rounded(before, 3), "two_planes": rounded(after, 3)},
+            "significance": rounded(self.significance, 2),
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class HomographyFit:
     """A homography from the image to the ground, and its health."""
 
@@ -148,6 +172,7 @@ class HomographyFit:
     unsure: Array | None = None
     # Whether each tick has its own pitch and roll, and by how much they vary; None where that was not tested
     pitch_roll: PitchRoll | None = None
+    slope: RoadSlope | None = None  # a second plane of the road, where held-out errors ask for it
 
     def at_tick(self, tick: int) -> Array | None:
         """Return the homography (3, 3) of a tick; None where a method of single frames has none for it."""
