@@ -216,9 +216,9 @@ def _place_tick(
         (map_T_base, base_T_cam), (h, uncertainty, slope) = poses[frame], homographies[camera.name]
         if slope is not None:
             foot_px = undistorted_pixels(camera, feet_of_boxes(m.box_px[[k]]))[0]
-            beyond = slope_homography(slope, h, camera.K, map_T_base, foot_px)
-            if beyond is not None:
-                h, by_slope = beyond
+            bent = slope_homography(slope, h, camera.K, map_T_base, foot_px)
+            if bent is not None:
+                h, by_slope = bent
                 uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
         placed = place_obstacle(h, camera, m.box_px[k], str(m.category[k]), base_T_cam[:2, 3], uncertainty)
         if placed is None:
