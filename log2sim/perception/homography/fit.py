@@ -49,8 +49,13 @@ def homography_covariance(
     if not np.abs(inverse).max() < 1e13:
         return None
     back = np.linalg.inv(h)
-    by_parameters = -np.kron(back, back.T) @ basis / size
+    by_parameters = -by_elements(back, back) @ basis / size
     return np.asarray(by_parameters @ inverse @ by_parameters.T)
+
+
+def by_elements(left: Array, right: Array) -> Array:
+    """Build the matrix (9, 9) that takes the elements of `m`, row by row, to those of `left @ m @ right`, all (3, 3)."""
+    return np.asarray((left[:, None, :, None] * right.T[None, :, None, :]).reshape(9, 9), dtype=np.float64)
 
 
 def ground_covariances(ground_H_image: Array, covariance: Array, uv: Array) -> Array:
@@ -256,6 +261,6 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
     error_m = float(np.median(np.hypot(*(back[:2] / back[2] - data.ground[:2])[:, inliers]) / scale))
     condition, h = float(s[0] / s[7]) if s[7] > 0 else float("inf"), data.to_ground_H_image(robust.h)
     unscaled = np.linalg.inv(data.ground_N_m) @ np.linalg.inv(robust.h) @ data.image_N_px
-    to_px = np.kron(np.linalg.inv(data.ground_N_m), data.image_N_px.T) / np.linalg.norm(unscaled[2])
+    to_px = by_elements(np.linalg.inv(data.ground_N_m), data.image_N_px) / np.linalg.norm(unscaled[2])
     covariance = None if covariance is None else to_px @ covariance @ to_px.T
     return HomographyFit(True, "", h, inliers, error_m, condition, sigma_m=float(sigma / scale), covariance=covariance)

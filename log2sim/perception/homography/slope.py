@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.fit import HomographyFit, RoadSlope
+from log2sim.perception.homography.fit import HomographyFit, RoadSlope, by_elements
 from log2sim.perception.homography.normalized import TRUNCATED_VARIANCE_SHARE, scale_free_basis, scaled
 from log2sim.perception.homography.pitch_roll import (
     CHI2_2DOF_50,
@@ -96,7 +96,7 @@ def fit_slope(
     planes, covariance = _refine(kinds[best], _search(kinds[best], start, K), K, slopes=True)
     back = np.linalg.inv(planes.image_H_ground)
     size = np.linalg.norm(back[2])
-    to_ground = -np.kron(back, back.T) / size
+    to_ground = -by_elements(back, back) / size
     before, after = np.median(judged[best].distance_px, axis=1).tolist()
     slope = RoadSlope(planes.line, planes.change, float(np.sqrt(covariance[9, 9])), (before, after), significance)
     h, keeps = back / size, fit.per_tick is not None and best == 1
