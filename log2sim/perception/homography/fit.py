@@ -53,7 +53,7 @@ def homography_covariance(
     return np.asarray(by_parameters @ inverse @ by_parameters.T)
 
 
-def by_elements(left: Array, right: Array) -> Array:
+def by_elements(left: NDArray[np.floating[Any]], right: NDArray[np.floating[Any]]) -> Array:
     """Build the matrix (9, 9) that takes the elements of `m`, row by row, to those of `left @ m @ right`, all (3, 3)."""
     return np.asarray((left[:, None, :, None] * right.T[None, :, None, :]).reshape(9, 9), dtype=np.float64)
 
