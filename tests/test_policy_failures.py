@@ -13,8 +13,10 @@ from command_line import run
 
 from log2sim.datatypes import EGO, Scenario
 from log2sim.errors import ConfigError
-from log2sim.scenarios import Base, ask, choose_base, fit, open_index
 from log2sim.scenarios.failure import LIMITS, Outcome, judge_run, report_page, search, with_ego
+from log2sim.scenarios.index import open_index
+from log2sim.scenarios.logical import Base, choose_base, fit
+from log2sim.scenarios.query import ask
 from log2sim.simulation.metrics.all_metrics import parse_limits
 from log2sim.simulation.policy import Controls
 

@@ -17,7 +17,7 @@ from log2sim.edit import Remove, edit
 from log2sim.errors import ScenarioError
 from log2sim.geometry import fit_windows, wrap_angle
 from log2sim.scenarios import criticality as c
-from log2sim.scenarios import criticality_table, find_tags, tag
+from log2sim.scenarios.tagging import criticality_table, find_tags, tag
 from log2sim.scenarios.traffic import Traffic, latched, runs
 
 # What has to be reached on the truth.

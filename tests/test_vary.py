@@ -13,9 +13,10 @@ from command_line import run
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.scenarios import find_tags, open_index
+from log2sim.scenarios.index import open_index
 from log2sim.scenarios.logical import SAMPLERS, TIMING, Base, Logical, choose_base, concrete, fit, write_openscenario
 from log2sim.scenarios.query import ask
+from log2sim.scenarios.tagging import find_tags
 
 pytest.importorskip("duckdb")
 pytest.importorskip("pyarrow")

@@ -44,7 +44,7 @@ def tag(
     """
     from log2sim.datatypes import TAGS, Scenario
     from log2sim.files.documents import check_targets
-    from log2sim.scenarios import criticality_table, tag, write_criticality
+    from log2sim.scenarios.tagging import criticality_table, tag, write_criticality
 
     check_targets(out, criticality, overwrite=overwrite)
     tagged = tag(Scenario.load(scenario))
