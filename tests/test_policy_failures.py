@@ -89,6 +89,16 @@ def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
         base, logical, keeps, {"min_gap_m": free.values["min_gap_m"] + 1}, "scenario", far
     ).margin == pytest.approx(-1)
 
+    # At constant speed along the path nothing is uncomfortable; 20 m/s are a failure where 15 are allowed.
+    assert free.values["max_speed_mps"] == pytest.approx(20.0, abs=0.01)
+    assert free.values["max_jerk_mps3"] < 0.5
+    assert free.values["max_lateral_mps2"] < 0.5
+    fast = judge_run(base, logical, keeps, {"max_speed_mps": 15.0, "max_jerk_mps3": 8.4}, "scenario", far)
+    assert fast.margin == pytest.approx(-5.0, abs=0.01)
+    swerving = judge_run(base, logical, lambda seen: Controls(0.0, 0.03), {"max_off_path_m": 1.0}, "scenario", far)
+    assert swerving.margin == pytest.approx(1.0 - swerving.values["max_off_path_m"])
+    assert swerving.values["max_lateral_mps2"] > free.values["max_lateral_mps2"]
+
     def raises(seen):
         raise ZeroDivisionError("of my own")
 
