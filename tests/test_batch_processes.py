@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from batch_logs import FAST, install_reader, lay_out_logs, tell
-from benchmarks.tags import traffic
+from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.batch.discovery import find_logs

@@ -186,7 +186,7 @@ def esmini_states(file: Path) -> dict[str, np.ndarray]:
 
 
 def test_asam_s_checker_finds_nothing_in_variations_and_their_distribution(tmp_path: Path) -> None:
-    from benchmarks.tags import traffic
+    from benchmarks.tag_worlds import traffic
 
     from log2sim.scenarios.logical import Base, write_openscenario
     from log2sim.scenarios.tagging import find_tags

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.tags import traffic
+from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.datatypes import TAGS
