@@ -11,15 +11,9 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Stream, Sweep
 from log2sim.datatypes.log import camera_of
 from log2sim.errors import RecordError
+from log2sim.files.images import MAX_IMAGE_PX, decode_image, image_size
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, inverse, transform
-from log2sim.logs.records import (
-    MAX_IMAGE_PX,
-    MAX_SWEEP_POINTS,
-    decode_image,
-    find_intensity_field,
-    image_size,
-    sweep_of,
-)
+from log2sim.logs.records import MAX_SWEEP_POINTS, find_intensity_field, sweep_of
 from log2sim.logs.ros import messages
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
