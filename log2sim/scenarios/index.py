@@ -53,8 +53,8 @@ class Index:
 
 def rows_of(scenario: Scenario, file: str) -> list[Row]:
     """Return a row for each tag of a scenario: those that it has, else those that are found in it."""
-    from log2sim.prediction.motion_table import TICK_S
     from log2sim.scenarios.tagging import find_tags
+    from log2sim.simulation.prediction.motion_table import TICK_S
 
     tags = find_tags(scenario) if scenario.tags is None else scenario.tags
     agents = {a.id: a for a in scenario.agents}
