@@ -47,7 +47,7 @@ def replace_poses(log: Log, new: PoseTrack) -> Log:
         return read
 
     streams = {
-        name: Stream(name, lambda stream=stream: stream.t_ns, moved(stream), stream.encoded)  # type: ignore[misc]
+        name: Stream(name, lambda stream=stream: stream.t_ns, moved(stream))  # type: ignore[misc]
         if name in log.lidars and log.lidars[name].mount == "ego"
         else stream
         for name, stream in log.streams.items()
@@ -85,4 +85,4 @@ def shift_stream(stream: Stream, shift_ns: int, moved: Array | None = None) -> S
             compensated_ns=None if record.compensated_ns is None else int(record.compensated_ns) + shift_ns,
         )
 
-    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded)
+    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded if moved is None else None)
