@@ -420,7 +420,7 @@ def fence(length: float, rng: Rng) -> Parts:
 
 
 def building(length: float, rng: Rng) -> Parts:
-    """Draw a house front along x that faces -y, with windows, a bay or an entrance."""
+    """Draw a house front along x that faces -y, with windows, a bay or an entrance, pilasters or downpipes."""
     half, height, depth = length / 2, rng.uniform(3.5, 16.0), 6.0
     parts = [box((-half, 0, 0), (half, depth, height), WALL)]
     if rng.random() < 0.5:
@@ -429,6 +429,10 @@ def building(length: float, rng: Rng) -> Parts:
     parts += [box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)][:2]
     if rng.random() < 0.3:
         parts.append(box((-half, -1.5, 2.8), (half, 0.1, 3.0), WALL))
+    if rng.random() < 0.4:
+        width, out = rng.uniform(0.08, 0.6), rng.uniform(0.06, 0.4)
+        for x in rng.uniform(-half, half, rng.integers(1, 5)):
+            parts.append(box((x - width / 2, -out, 0), (x + width / 2, 0.1, height), WALL))
     return tuple(parts)
 
 
