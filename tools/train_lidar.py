@@ -61,7 +61,8 @@ HELD_OUT_SHARE = 0.2
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 WARM_UP_STEPS = 100
-START_BATCHES = 4  # to find the moments of the layers of a network that training starts from
+# To find the moments of the layers of a network that training starts from; and the greatest learning rate from there.
+START_BATCHES, START_RATE = 4, 1.5e-3
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
 CELLS = {"vehicle": 256, "roadside": 192}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
@@ -80,8 +81,8 @@ class Round:
 # The second round of the vehicle has scenes with a second LiDAR and more clutter, the third with what is close beside the sensor's car, at
 # walls and seen end-on; pictures of misses asked for them.
 ROUNDS = {
-    "vehicle": (Round(1, 4_000, 5_500), Round(2, 2_000, 4_000, rate=1.2e-3), Round(3, 6_000, 15_000, rate=1.2e-3)),
-    "roadside": (Round(1, 3_000, 4_500), Round(2, 400, 5_000, rate=1.2e-3)),
+    "vehicle": (Round(1, 4_000, 5_500), Round(2, 2_000, 4_000, rate=1.2e-3), Round(3, 6_000, 15_000)),
+    "roadside": (Round(1, 3_000, 4_500), Round(2, 400, 5_000, rate=1.2e-3), Round(3, 3_000, 9_000, rate=1.5e-3)),
 }
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
 RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
@@ -224,8 +225,10 @@ def fit(
     fitting.fit(network, step_loss, plan)
 
 
-def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = ()) -> None:
-    """Export, calibrate and report; the files that ship are in `out` afterwards.
+def finish(
+    mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = (), start: Path | None = None
+) -> None:  # fmt: skip
+    """Export, calibrate and report; the files that ship are in `out` afterwards. The card tells the rounds of `start`, too.
 
     Without simulated scenes the scores are calibrated and tested on the held-out sweeps; with both, on both.
     """
@@ -240,7 +243,13 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
     info = description(mount, CELL_M[mount], RANGE_M[mount])
     export_onnx(checkpoint_path(out, len(rounds)), path, info)
     info["calibration"] = calibrate(path, calibration)
-    info["card"] = {"mount": mount, "rounds": [asdict(r) for r in rounds], "batch": BATCH, "torch": torch.__version__}
+    before = [] if start is None else open_network(start, LidarConfig(), name=mount).network.info.card.get("rounds", [])
+    info["card"] = {
+        "mount": mount,
+        "rounds": [*before, *(asdict(r) for r in rounds)],
+        "batch": BATCH,
+        "torch": torch.__version__,
+    }
     describe(path, info)
     detector = open_network(path, LidarConfig(), name=mount)
     card = info["card"] | {"simulated" if simulated else "own": report(detector, test, range_m=RANGE_M[mount])}
@@ -259,7 +268,8 @@ def main(
     rounds: Sequence[Round] = ROUNDS[mount]
     if steps or scenes is not None:
         first = rounds[0]
-        rounds = (Round(seed, first.scenes if scenes is None else scenes, steps or first.steps),)
+        rate = START_RATE if start else first.rate
+        rounds = (Round(seed, first.scenes if scenes is None else scenes, steps or first.steps, rate),)
     if scenes == 0 and not data:
         raise ConfigError("--scenes 0 needs --data")
     shards = out / "data"
@@ -276,7 +286,7 @@ def main(
         if generator is not None:
             generator.terminate()
     if only in ("", "finish"):
-        finish(mount, out, rounds, examples, held_out)
+        finish(mount, out, rounds, examples, held_out, start)
 
 
 if __name__ == "__main__":

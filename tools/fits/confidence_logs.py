@@ -236,7 +236,9 @@ class SimulatedDetector:
 class MistakenDetector:
     """Adds boxes of road users on what is none to those of a detector in sweeps; every box depends on the seed and its sweep alone."""
 
-    def __init__(self, detector: LidarDetector, log: Log, scene: TrafficScene, true: PoseTrack | None, seed: int) -> None:
+    def __init__(
+        self, detector: LidarDetector, log: Log, scene: TrafficScene, true: PoseTrack | None, seed: int
+    ) -> None:
         self._detector, self._log, self._true, self._seed, self.name = detector, log, true, seed, detector.name
         rng = np.random.default_rng([seed, 4])
         share, self._seen = SEEN_SHARE * np.exp(rng.normal(0, 0.7)), []
@@ -372,7 +374,10 @@ def cases_of(seed: int, index: int) -> list[Case]:
     rng = np.random.default_rng([seed, index, 10])
     searched = names[str(rng.choice(list(SEARCHED), p=list(SEARCHED.values())))]
     blind = log.changed(lidars={}, streams={"camera": log.streams["camera"]})
-    return [_case(log, scene, true, truth, searched, seed + index), _case(blind, scene, true, truth, "labels", seed + index)]
+    return [
+        _case(log, scene, true, truth, searched, seed + index),
+        _case(blind, scene, true, truth, "labels", seed + index),
+    ]
 
 
 def _case(log: Log, scene: TrafficScene, true: PoseTrack | None, truth: Scenario, detector: str, seed: int) -> Case:
