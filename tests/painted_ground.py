@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array
 from log2sim.road.ground_map import GroundMap
 
-ASPHALT, WHITE, YELLOW, GRASS, CONCRETE = (92, 91, 90), (214, 216, 216), (50, 160, 205), (60, 110, 80), (150, 158, 160)
+ASPHALT, WHITE, GRASS = (92, 91, 90), (214, 216, 216), (60, 110, 80)
 FINE = 4  # masks are drawn so much finer than cells
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from lidar_networks import NAMES, empty_maps, encode, info
@@ -229,16 +227,3 @@ def test_most_headings_point_forward(scenes) -> None:
     matches = match_detections(sure, truth, Criterion("iou_bev", 0.5))
     off = wrap_angle(sure.box[matches.right, 6] - truth.box[matches.truth[matches.right], 6])
     assert np.mean(np.abs(off) < np.pi / 2) > 0.75
-
-
-def test_a_turned_scene_gives_turned_boxes(scenes) -> None:
-    """By a quarter turn, which maps cells onto cells."""
-    detector, examples, found = scenes
-    cloud = examples[0].cloud
-    xyz = np.column_stack([-cloud.xyz[:, 1], cloud.xyz[:, 0], cloud.xyz[:, 2]])
-    sensor = np.array([-cloud.sensor[1], cloud.sensor[0], cloud.sensor[2]], np.float32)
-    turned = detector.detect(replace(cloud, xyz=xyz, sensor=sensor))
-    sure = found[0].take(found[0].score > 0.6)
-    away = np.hypot(turned.center_m[:, 0] + sure.box[:, None, 1], turned.center_m[:, 1] - sure.box[:, None, 0])
-    assert len(sure) > 3
-    assert np.mean(away.min(axis=1) < 1.0) > 0.8

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from test_detect_labels import CAR, SECOND, log_with
 
-from log2sim.config import Config, LidarConfig
+from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
-from log2sim.files import plugins
 from log2sim.geometry import Array, points_in_box
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.detectors import create_lidar_detector
@@ -52,12 +51,6 @@ def test_the_object_with_most_points_comes_first_and_far_ones_are_left_out() -> 
     cloud = cloud_of([[1010.0, 2000.0, 31.0], [1020.0, 2000.0, 31.0], [1020.5, 2000.0, 31.0], [1060.0, 2000.0, 31.0]])
     assert detect(log, cloud).center_m[:, 0].tolist() == [1020.0, 1010.0, 1060.0]
     assert detect(log, cloud, range_m=59.0).center_m[:, 0].tolist() == [1020.0, 1010.0]
-
-
-def test_a_plug_in_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(plugins.BUILT_IN["lidar_detector"], "mine", "log2sim.perception.detect3d.detectors:create")
-    log = log_with((0, "car", (0.0, 0.0, 0.0), CAR))
-    assert create_lidar_detector("lidar:mine", log, Config().lidar).name == "lidar:labels"
 
 
 def random_boxes(rng: np.random.Generator, m: int) -> tuple[Array, Array, Array]:

@@ -159,14 +159,6 @@ def test_runs_with_and_without_the_cache_give_the_same(tiny_folder: Path, folder
     assert len(without.scenario.others) >= 2
 
 
-def test_the_first_pass_takes_the_same_from_a_picture(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
-    log = open_log(tiny_folder)
-    (_, one), (_, other) = look(log), look(log)
-    assert len(one.lights) == 2 * len(one.measurements) > 0  # two traffic lights in each picture
-    assert_same_observations(one, other)
-    assert len(made[-1].seen) == 0
-
-
 def test_another_setting_of_the_detector_searches_everything(
     tiny_folder: Path, folder: Path, made: list[Seeing], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,11 +8,11 @@ from scipy.spatial import KDTree
 from worlds import Solid, camera_ahead, outline_px, scan, standing
 
 from log2sim.datatypes import Boxes3D, Detections
-from log2sim.geometry import Camera, apply, inverse, transform
+from log2sim.geometry import apply, inverse, transform
 from log2sim.perception.boxes import rotate
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
 from log2sim.perception.lidar.clusters import continued_sides
-from log2sim.perception.lidar.measure import measure, project_cloud
+from log2sim.perception.lidar.measure import measure
 from log2sim.perception.lidar.projection import View
 
 T0_NS = 1_700_000_000_000_000_000
@@ -237,41 +237,6 @@ def project(view, world):
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = p[:, :2] / p[:, 2:] * 700.0 + [600.0, 300.0]
     return uv, p[:, 2] > 0.1
-
-
-@pytest.mark.parametrize("far", [(0.0, 0.0, 0.0), (5e5, 5e6, 100.0)])
-def test_the_cameras_view_of_a_cloud_equals_the_pinhole_formula_for_every_point(far):
-    rng = np.random.default_rng(0)
-    world = rng.uniform([-30, -30, -2], [30, 30, 6], (4000, 3))
-    view = view_ahead(far, yaw=0.7)
-    index = np.arange(0, 4000, 3)
-    seen, uv, depth = project_cloud(view, cloud_of(world, far=far), index)
-    expected, front = project(view_ahead(yaw=0.7), world[index])
-    inside = front & (expected > 0.01).all(axis=1) & (expected < [1199.99, 599.99]).all(axis=1)
-    assert inside.sum() > 100
-    assert set(np.flatnonzero(inside)) <= set(seen.tolist())
-    np.testing.assert_allclose(uv, expected[seen], atol=0.05)
-    np.testing.assert_allclose(
-        depth, apply(inverse(view_ahead(yaw=0.7).map_T_cam), world[index[seen]])[:, 2], atol=1e-4
-    )
-
-
-def test_a_bent_lens_loses_no_point_that_it_shows():
-    plain = view_ahead()
-    c = plain.camera
-    bent = Camera(c.name, c.width_px, c.height_px, c.K, c.mount, c.mount_T_cam, "brown", (-0.2, 0.03, 0.0, 0.0))
-    view = View(bent, T0_NS, plain.map_T_cam)
-    a, b = np.meshgrid(np.linspace(-1.1, 1.1, 80), np.linspace(-0.6, 0.6, 50))
-    a, b = a.ravel(), b.ravel()
-    r2 = a * a + b * b
-    scale = 1 - 0.2 * r2 + 0.03 * r2 * r2
-    uv = np.stack([a * scale * 700 + 600, b * scale * 700 + 300], axis=1)
-    shown = (uv > 0.1).all(axis=1) & (uv < [1199.9, 599.9]).all(axis=1)
-    world = apply(view.map_T_cam, 12.0 * np.stack([a, b, np.ones_like(a)], axis=1))
-    seen, pixels, _ = project_cloud(view, cloud_of(world), np.arange(len(world)))
-    assert set(np.flatnonzero(shown)) <= set(seen.tolist())
-    assert (shown & ((np.abs(a) > 600 / 700) | (np.abs(b) > 300 / 700))).sum() > 50
-    np.testing.assert_allclose(pixels, uv[seen], atol=0.05)
 
 
 def flank(azimuth_step_deg, *, length_m=16.0, aside_m=2.5, start_m=2.0):

@@ -320,8 +320,10 @@ def test_names_order_place_and_heading_of_the_world_make_no_difference():
 
     ours = shifted(broken(), 0.3)
     ours = replace(ours, agents=tuple(moved(a, sigma_xy_m=np.full(TICKS, 0.2)) for a in ours.agents))
-    plain = without_names(judged(ours, world()))
-    other = without_names(judged(turned(ours, 1.1, 1e4), turned(world(), 1.1, 1e4)))
+    plain, other = evaluate(ours, world()), evaluate(turned(ours, 1.1, 1e4), turned(world(), 1.1, 1e4))
+    for key in ("recall", "precision", "position_rmse_m", "yaw_median_deg", "speed_rmse_mps", "mota", "hota", "counts"):
+        assert other[key] == pytest.approx(plain[key], abs=2e-6), key
+    plain, other = (without_names(found["correctness"]) for found in (plain, other))
     rules = plain.pop("rules")
     assert other.pop("rules") == rules
     plain_rows, other_rows = plain.pop("judged_agents"), other.pop("judged_agents")

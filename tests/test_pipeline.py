@@ -12,8 +12,8 @@ import pytest
 from plain_settings import AGENTS_ALONE
 from worlds import PARKED, tiny_log
 
-from log2sim import Config, Scenario, reconstruct, replay
-from log2sim.datatypes import Labels, Log, Stream
+from log2sim import Config, Scenario, reconstruct
+from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check, write_json
@@ -127,31 +127,3 @@ def test_nobody_in_sight_leaves_the_ego_alone() -> None:
 
 
 # --- replay of what came out
-
-
-def test_the_scenario_replays_and_the_replay_reads_back(result: Result, tmp_path: Path) -> None:
-    from log2sim.simulation.result import Replay
-
-    done = replay(result.scenario)
-    done.save(tmp_path / "r.json")
-    assert {a.id for a in Replay.load(tmp_path / "r.json").agents} == {a.id for a in result.scenario.agents}
-    assert done.metrics["cross_track_rms_m"] < 0.1
-    assert not [c for c in done.metrics["collisions"] if not c["in_log"]]
-
-
-def test_a_stream_that_fails_now_and_then_is_counted_by_stream(tiny: tuple[Log, Scenario]) -> None:
-    from log2sim.errors import RecordError
-
-    log, truth = tiny
-    sound = log.streams["top"]
-
-    def read(i: int) -> Any:
-        if i % 3 == 0:
-            raise RecordError(f"sweep {i} is gone")
-        return sound.read(i)
-
-    got = run(replace(log, streams={**log.streams, "top": Stream("top", sound.t_ns, read)}))
-    gone = len(range(0, len(sound.t_ns), 3))
-    assert got.report["unreadable"]["top"]["count"] == gone - (len(sound.t_ns) % 3 == 1)  # no frame asks for the last
-    assert got.report["unreadable"]["top"]["first"] == "sweep 0 is gone"
-    assert evaluate(got.scenario, truth)["recall"] >= 0.9

@@ -124,13 +124,3 @@ def test_a_saved_scenario_reads_back_bit_by_bit(tmp_path: Path, scenario: Scenar
     again.save(path)
     assert path.read_bytes() == before
     assert json.loads(before)["scenario_version"] == 1
-
-
-@settings(deadline=None, max_examples=60)
-@given(agents("one"))
-def test_an_agent_at_a_waypoint_is_at_it(agent: Agent) -> None:
-    w = agent.waypoints
-    at = agent.at(w.t_s)
-    assert at.valid.all()
-    travel_m = np.abs(w.speed_mps).max() * np.diff(w.t_s).max(initial=0.0)
-    np.testing.assert_allclose(at.x_m, w.x_m, atol=1e-11 * max(np.abs(w.x_m).max(), travel_m, 1.0))

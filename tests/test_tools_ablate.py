@@ -111,16 +111,8 @@ def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
 def test_rows_are_worse_better_or_equal_beyond_the_noise_of_seeds():
     def row(label: str, change: str, outcome: str, **figures: float) -> dict:
         figures = dict.fromkeys(ablate.FIGURES, 1.0) | figures
-        return {
-            "case": "log",
-            "label": label,
-            "change": change,
-            "stage": "tracking",
-            "unit": "",
-            "value": "2",
-            "figures": figures,
-            "outcome": outcome,
-        }
+        told = {"label": label, "change": change, "figures": figures, "outcome": outcome}
+        return {"case": "log", "stage": "tracking", "unit": "", "value": "2", **told}
 
     rows = [row("seed", str(k), "abc", recall=1.0 + 0.01 * k) for k in range(3)]
     rows += [

@@ -185,31 +185,3 @@ def test_a_white_surface_in_even_light_is_as_bright_as_the_light() -> None:
     np.testing.assert_allclose(_harmonics(normals) @ even, 1.0, atol=0.02)
     above = np.einsum("rc,rck->k", AREA[ROWS // 2 :], HARMONICS[ROWS // 2 :]) * COSINE
     np.testing.assert_allclose(_harmonics(normals) @ above, (1 + normals[:, 2]) / 2, atol=0.06)
-
-
-def test_a_toy_learns_to_find_paint_on_drawn_maps(tmp_path: Path) -> None:
-    """Half a minute from nothing: what is called paint on fresh maps is paint three times as often as chance."""
-    import train_lanes
-
-    train_lanes.main(tmp_path, files=1, maps=30, steps=350)
-    drawn = json.loads((tmp_path / "paint.json").read_text())["drawn"]
-    report = np.load(tmp_path / "report-1-000.npz")
-    kinds = report["kind"][report["kind"] != train_lanes.IGNORED]
-    assert drawn["recall"] > 0.03
-    assert drawn["precision"] > 3 * np.mean(kinds > 0)
-    assert (tmp_path / "paint.onnx").stat().st_size < 500_000
-
-
-def test_paint_that_nothing_shows_is_not_asked_for() -> None:
-    import train_lanes
-
-    layers, kind = np.zeros((train_lanes.LAYERS, 160, 160), np.int8), np.zeros((160, 160), np.uint8)
-    layers[3] = 31
-    kind[40:42], kind[100:102] = 1, 1
-    layers[0, 40:42, :80] = 31
-    layers[0, 38:40] = 62  # a curb beside the line
-    kept = train_lanes.leave_out_unseen(layers, kind)
-    assert (kept[40:42, 10:70] == 1).all()
-    assert (kept[40:42, 90:] == train_lanes.IGNORED).all()
-    assert (kept[100:102] == train_lanes.IGNORED).all()
-    assert not kept[kind == 0].any()

@@ -203,21 +203,6 @@ def text_of(browser: Browser, id: str) -> str:
     return str(browser.run("return document.getElementById(arguments[0]).textContent", id))
 
 
-def test_agents_are_where_the_scenario_has_them(browser: Browser, sample: Path) -> None:
-    scenario, moments = Scenario.load(TRUTH), [0.0, 0.013, 1.77, 5.2, 3.3, 3.31]
-    opened(browser, sample)
-    scale = browser.run("return log2sim.pixelsPerMeter")
-    script = (
-        "log2sim.time = arguments[0]; return Object.fromEntries(log2sim.agents.map((id) => [id, log2sim.placeOf(id)]))"
-    )
-    for t in moments:
-        shown = browser.run(script, t)
-        for a in scenario.agents[1:]:
-            mine, ego = a.at(t), scenario.agents[0].at(t)
-            offset = (np.array(shown[a.id]) - shown["ego"]) / scale
-            np.testing.assert_allclose(offset, [mine.x_m[0] - ego.x_m[0], ego.y_m[0] - mine.y_m[0]], atol=2e-3)
-
-
 def test_agents_are_where_they_are_between_waypoints_too(browser: Browser, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     source = agent("a", rng.uniform(-50, 50, 60), 0.0)

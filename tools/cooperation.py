@@ -2,7 +2,7 @@
 
     python tools/cooperation.py blind_area --variants 50 --seed 0
 
-Tests: range (A), blind_area (B), overlap (C), ap (random traffic, AP BEV .5), registration (pose and clock of the pole). Variants are drawn
+Tests: range (A), blind_area (B), overlap (C), ap (random traffic, AP BEV .5). Variants are drawn
 from the seed and those that follow. --ways are ends alone and levels of fusion, by commas; --noise is the share of 0.5 m, 2 degrees and 0.3 s by
 which the road's end is off at most, --no-delay puts none into its clock; --no-register takes its pose and clock as they are; --every N uses
 one sweep in N.
@@ -23,10 +23,8 @@ from cooperation_worlds.runs import (
     detect,
     perceive,
     prepared,
-    registration_figures,
-    registration_row,
 )
-from cooperation_worlds.world import RoadError, World, disturb, draw_error, log_of
+from cooperation_worlds.world import World, disturb, draw_error, log_of
 from entry import run
 
 from log2sim.datatypes import Log
@@ -108,18 +106,8 @@ def run_ap(choices: Choices) -> dict[str, Any]:
     return hidden_traffic.figures(rows)
 
 
-def run_registration(choices: Choices) -> dict[str, Any]:
-    """Errors of the pole's pose and clock before and after registration, in worlds of all three tests by turns."""
-    rows = []
-    for seed in choices.seeds:
-        world = replace(list(DRAW.values())[seed % len(DRAW)](seed), every=choices.every)
-        error: RoadError = draw_error(seed, choices.noise or 1.0, delayed=choices.delayed)
-        rows.append(registration_row(log_of(world)[0], error))
-    return registration_figures(rows)
-
-
 RUN: dict[str, Callable[[Choices], dict[str, Any]]] = {
-    "range": run_range, "blind_area": run_blind_area, "overlap": run_overlap, "ap": run_ap, "registration": run_registration,
+    "range": run_range, "blind_area": run_blind_area, "overlap": run_overlap, "ap": run_ap,
 }  # fmt: skip
 
 if __name__ == "__main__":

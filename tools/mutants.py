@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MUTANTS = (
     ("sync takes later frames", "perception/sync.py", "np.abs(residual_ns) <= tolerance_ns", "residual_ns <= tolerance_ns", "sync"),
     ("poses are not interpolated", "geometry/poses.py", "position[i] + fraction[:, None] * (position[k] - position[i])", "position[i]", "geometry"),
-    ("inverse of a transform", "geometry/transforms.py", "-(rt @ dst_T_src[..., :3, 3:])", "(rt @ dst_T_src[..., :3, 3:])", "geometry"),
+    ("inverse of a transform", "geometry/transforms.py", "-(rt @ dst_T_src[..., :3, 3:])", "(rt @ dst_T_src[..., :3, 3:])", "geometry_properties"),
     ("sweeps are not compensated", "perception/lidar/cloud.py", "one_pose = not compensate or", "one_pose = True or", "ground sync"),
     ("ground without curvature", "perception/lidar/cloud.py", "x * x, x * y, y * y", "0 * x, 0 * x, 0 * y", "ground"),
     ("depth is not tested", "perception/homography/normalized.py", "ex[~(w > 0)] = np.inf", "ex[w == 0] = np.inf", "homography_ransac homography"),

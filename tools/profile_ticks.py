@@ -2,9 +2,8 @@
 
     OPENBLAS_NUM_THREADS=1 python tools/profile_ticks.py LOG ... --detector NAME
 
-Runs and floors take turns; medians of their wall and processor times are shown. The floor is measured with one thread and
-with as many as there are cores. Processor time is told apart as seconds of the log (a fixed number of records is looked at: poses, clocks,
-mounts, what is loaded), milliseconds of a tick, and seconds of 100 m of way (map and lanes). Kept detections are not used.
+Runs and floors take turns; medians of their wall and processor times are shown, in milliseconds a tick. The floor is measured with one
+thread and with as many as there are cores. Kept detections are not used.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from benchmarks.table import markdown
 from entry import run
 
@@ -34,9 +32,11 @@ from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.report import Run
 
 DETECTORS = ("labels", "lidar:vehicle", "labels+lidar:vehicle", "ssd-mobilenet-v2+lidar:vehicle")
-WARM_UP_TICKS = 4
-# Stages that look at so many records of a log at most, and those that draw the ground along the way; all others go tick by tick.
-OF_LOG, OF_WAY = ("poses", "calibration", "registration", "sync"), ("pictures", "lanes")
+WARM_UP_S = 0.4
+HEAD = [
+    "log", "detector", "ticks", "ticks/s", "wall ms", "cpu ms", "detector cpu", "floor cpu", "floor wall, all threads", "cpu / floor",
+    "without detector / floor",
+]  # fmt: skip
 
 
 @dataclass
@@ -53,7 +53,6 @@ class Measured:
 
     times: Times
     ticks: int
-    way_m: float
     stages: dict[str, Times]
 
 
@@ -88,129 +87,69 @@ def floor_of(log: Log, wanted: Sequence[tuple[str, int]], threads: int) -> Times
     return times_of(read_all)[1]
 
 
-def measure(path: Path, config: Config, jobs: int | None = None) -> tuple[Measured, Schedule]:
+def measure(path: Path, config: Config) -> tuple[Measured, Schedule]:
     """Run all stages on a log that is opened anew."""
     log = open_log(path)
 
     def reconstruct() -> Run:
-        run = start(log, config, cache=False, jobs=jobs)
+        run = start(log, config, cache=False)
         infer_scenario(run, observe_log(run))
         return run
 
     run, times = times_of(reconstruct)
     stages = {name: Times(seconds, run.clock.cpu_seconds[name]) for name, seconds in run.clock.seconds.items()}
-    return Measured(times, len(run.schedule), way_of(run), stages), run.schedule
+    return Measured(times, len(run.schedule), stages), run.schedule
 
 
-def way_of(run: Run) -> float:
-    """How far the ego goes from the first to the last tick, m; 0 without known poses."""
-    if run.log.ego is None:
-        return 0.0
-    poses, known = run.log.ego.at(run.schedule.t_ns)
-    return float(np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1).sum())
-
-
-def config_of(log: Log, detector: str, ticks: int, settings: Sequence[str]) -> Config:
-    """Settings of a run of the first ticks."""
-    config = Config.load(None, settings, detect={"name": detector})
-    if ticks:
-        cameras = list(log.cameras) if config.detect.in_images else []
-        preferred = log.reference_camera if log.reference_camera in cameras else None
-        most = max(log.lidars, key=lambda name: len(log.streams[name].t_ns), default="")
-        t_ns = log.streams[preferred or (cameras[0] if cameras else most)].t_ns
-        last = min(ticks, len(t_ns)) - 1
-        return config.changed(stop_s=float(t_ns[last] - t_ns[0]) * 1e-9 + 1e-4)
-    return config
-
-
-def profile(
-    path: Path, detectors: Sequence[str], ticks: int, repeats: int, jobs: int | None, settings: Sequence[str]
-) -> Iterator[dict[str, Any]]:
+def profile(path: Path, detectors: Sequence[str], repeats: int) -> Iterator[tuple[list[str], str]]:
     """Figures of a log with each detector."""
     log, threads = open_log(path), sorted({1, len(os.sched_getaffinity(0))})
     configs: dict[str, Config] = {}
     for detector in detectors:
+        config = Config.load(detect={"name": detector})
         try:
-            measure(path, config_of(log, detector, WARM_UP_TICKS, settings))
-            configs[detector] = config_of(log, detector, ticks, settings)
+            measure(path, config.changed(stop_s=WARM_UP_S))
+            configs[detector] = config
         except Log2SimError as problem:
             print(f"{log.name}, {detector}: left out: {problem}", file=sys.stderr)
     runs: dict[str, list[Measured]] = {name: [] for name in configs}
     floors: dict[str, dict[int, list[Times]]] = {name: {n: [] for n in threads} for name in configs}
     for _ in range(repeats):
         for name, config in configs.items():
-            measured, schedule = measure(path, config, jobs)
+            measured, schedule = measure(path, config)
             runs[name].append(measured)
             for count, of in floors[name].items():
                 of.append(floor_of(open_log(path), records_of(schedule), count))
     for name, of_name in runs.items():
-        yield figures(log, name, of_name, floors[name])
+        yield figures(log.name, name, of_name, floors[name])
 
 
-def figures(log: Log, detector: str, runs: list[Measured], floors: dict[int, list[Times]]) -> dict[str, Any]:
-    """Medians of the runs and floors of one detector; ms are a tick."""
-    ticks = runs[0].ticks
+def figures(log: str, detector: str, runs: list[Measured], floors: dict[int, list[Times]]) -> tuple[list[str], str]:
+    """Medians of the runs and floors of one detector: a row of the table, and a table of its stages."""
 
-    def ms(values: list[float]) -> float:
-        return round(1e3 * statistics.median(values) / ticks, 2)
+    def ms(times: Sequence[Times]) -> tuple[float, float]:
+        per_tick = 1e3 / runs[0].ticks
+        return per_tick * statistics.median(t.wall_s for t in times), per_tick * statistics.median(
+            t.cpu_s for t in times
+        )
 
-    wall, cpu = ms([r.times.wall_s for r in runs]), ms([r.times.cpu_s for r in runs])
-    floor = {n: {"wall": ms([t.wall_s for t in f]), "cpu": ms([t.cpu_s for t in f])} for n, f in floors.items()}
-    of_way = statistics.median(sum(r.stages[k].cpu_s for k in OF_WAY if k in r.stages) for r in runs)
-    each = [sum(v.cpu_s for k, v in r.stages.items() if k not in (*OF_LOG, *OF_WAY)) for r in runs]
-    fixed_s = statistics.median(r.times.cpu_s - e for r, e in zip(runs, each)) - of_way
-    detecting = ms([r.stages["detect"].cpu_s for r in runs]) if "detect" in runs[0].stages else 0.0
-    return {
-        "log": log.name,
-        "detector": detector,
-        "ticks": ticks,
-        "repeats": len(runs),
-        "ticks_per_second": round(1e3 / wall, 2),
-        "wall_ms": wall,
-        "cpu_ms": cpu,
-        "cpu_of_log_s": round(fixed_s, 2),
-        "cpu_of_tick_ms": ms(each),
-        "cpu_of_100_m_s": round(100 * of_way / runs[0].way_m, 2) if runs[0].way_m else None,
-        "detector_cpu_ms": round(detecting, 2),
-        "floor_ms": floor,
-        "cpu_over_floor": round(cpu / floor[1]["cpu"], 2),
-        "without_detector_over_floor": round((cpu - detecting) / floor[1]["cpu"], 2),
-        "stages_ms": {
-            k: {"wall": ms([r.stages[k].wall_s for r in runs]), "cpu": ms([r.stages[k].cpu_s for r in runs])}
-            for k in runs[0].stages
-        },
-    }
-
-
-def show(found: list[dict[str, Any]]) -> str:
-    """Tables of rates and stages."""
-    rates, rest = [], []
-    for f in found:
-        one, most = min(f["floor_ms"]), max(f["floor_ms"])
-        rates.append([
-            f["log"], f"`{f['detector']}`", str(f["ticks"]), f"{f['ticks_per_second']:.2f}", f"{f['wall_ms']:.0f}",
-            f"{f['cpu_ms']:.0f}", f"{f['cpu_of_log_s']:.2f}", f"{f['cpu_of_tick_ms']:.0f}", f"{f['cpu_of_100_m_s']}",
-            f"{f['detector_cpu_ms']:.0f}", f"{f['floor_ms'][one]['cpu']:.0f}",
-            f"{f['floor_ms'][most]['wall']:.0f}", f"{f['cpu_over_floor']:.2f}",
-            f"{f['without_detector_over_floor']:.2f}",
-        ])  # fmt: skip
-        rest.append(f"\n{f['log']}, `{f['detector']}`, ms a tick\n")
-        stages = f["stages_ms"].items()
-        rest.append(markdown(["stage", "wall", "cpu"], [[k, f"{v['wall']:.1f}", f"{v['cpu']:.1f}"] for k, v in stages]))
-    head = [
-        "log", "detector", "ticks", "ticks/s", "wall ms", "cpu ms", "s a log", "ms a tick", "s a 100 m", "detector cpu", "floor cpu", "floor wall, all threads",
-        "cpu / floor", "without detector / floor",
+    (wall, cpu), floor, most = ms([r.times for r in runs]), ms(floors[1])[1], ms(floors[max(floors)])[0]
+    stages = {name: ms([r.stages[name] for r in runs]) for name in runs[0].stages}
+    detecting = stages.get("detect", (0.0, 0.0))[1]
+    row = [
+        log, f"`{detector}`", str(runs[0].ticks), f"{1e3 / wall:.2f}", *(f"{v:.0f}" for v in (wall, cpu, detecting, floor, most)),
+        f"{cpu / floor:.2f}", f"{(cpu - detecting) / floor:.2f}",
     ]  # fmt: skip
-    return "\n".join([markdown(head, rates), *rest])
+    table = markdown(["stage", "wall", "cpu"], [[name, *(f"{v:.1f}" for v in of)] for name, of in stages.items()])
+    return row, f"\n{log}, `{detector}`, ms a tick\n\n{table}"
 
 
-def main(
-    logs: list[Path], detector: list[str] = list(DETECTORS), ticks: int = 0, repeats: int = 3, jobs: int | None = None, set: list[str] = [],
-) -> None:  # fmt: skip
-    """Print the tables of the first ticks of logs, or of all, by so many processes; `set` SECTION.KEY=VALUE as of reconstruct."""
+def main(logs: list[Path], detector: list[str] = list(DETECTORS), repeats: int = 3) -> None:
+    """Print the tables of logs."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         print("OPENBLAS_NUM_THREADS is not 1: times will swing", file=sys.stderr)
-    print(show([found for path in logs for found in profile(path, detector, ticks, repeats, jobs, set)]))
+    found = [one for path in logs for one in profile(path, detector, repeats)]
+    print(markdown(HEAD, [row for row, _ in found]), *(stages for _, stages in found), sep="\n")
 
 
 if __name__ == "__main__":

@@ -145,15 +145,11 @@ def share(right: NDArray[np.bool_]) -> float:
     return round(float(right.mean()), 4)
 
 
-def main(
-    out: Path, worlds: int = WORLDS, steps: int = STEPS, seed: int = 1, only_draw: bool = False, first: int = 0
-) -> None:
-    """Run the steps in a folder of pictures, checkpoint and results; with `only_draw` those files of pictures alone that begin with the first."""
+def main(out: Path, worlds: int = WORLDS, steps: int = STEPS, seed: int = 1) -> None:
+    """Run the steps in a folder of pictures, checkpoint and results."""
     out.mkdir(parents=True, exist_ok=True)
     each = min(PER_FILE, worlds)
-    paths = [draw(out, "train", k, each, 1, seed) for k in range(first, worlds // each)]
-    if only_draw:
-        return
+    paths = [draw(out, "train", k, each, 1, seed) for k in range(worlds // each)]
     tune, test = (draw(out, part, 0, min(TRACKS, each), VIEWS, seed) for part in ("tune", "report"))
     begun = time.process_time()
     network, path = fit(paths, out, steps, seed), out / "colors.onnx"

@@ -11,7 +11,6 @@ Communications of the ACM 23, 1980: 0.28 s a key, 1.1 s to point, 0.1 s a button
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -183,15 +182,13 @@ def figures(scenario: Scenario, truth: Any, max_range_m: float | None) -> dict[s
     }
 
 
-def main(scenario_path: Path, truth_path: Path, range: float | None = None, out: Path | None = None) -> None:
-    """Print figures before and after, of agents up to `range` m from the ego; `out` gets the corrections."""
+def main(scenario_path: Path, truth_path: Path, range: float | None = None) -> None:
+    """Print figures before and after, of agents up to `range` m from the ego."""
     scenario = Scenario.load(scenario_path)
     truth = load_truth(truth_path, scenario, points=True)
     steps = steps_of(scenario, truth, range, np.random.default_rng(0))
     made = [entry for own in steps for _, entry in own]
-    document = {"format": "log2sim-corrections", "version": 1, "log": scenario.name, "corrections": made}
-    document["map_offset_m"] = list(scenario.map.offset_m)
-    after = correct(scenario, document)
+    after = correct(scenario, {"corrections": made, "map_offset_m": list(scenario.map.offset_m)})
     columns = [figures(s, truth, range) for s in (scenario, after.scenario)]
     rows = [[k, *("-" if c[k] is None else f"{c[k]:.3g}" for c in columns)] for k in columns[0]]
     print(markdown(["figure", "before", "corrected"], rows))
@@ -199,5 +196,3 @@ def main(scenario_path: Path, truth_path: Path, range: float | None = None, out:
     actions, seconds = effort(steps)
     print(f"\n{len(steps) - new} of {len(scenario.others)} agents, {new} added, {dict(kinds)}, {len(after.unmatched)} without their agent; "
           f"an agent: {actions:.0f} actions, {seconds:.0f} s")  # fmt: skip
-    if out is not None:
-        out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

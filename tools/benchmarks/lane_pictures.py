@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -28,23 +28,12 @@ FORWARD_R_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 CURBS = (20, 21)  # left and right, of OpenLane's categories
 MATCH_M = 1.5
 SPANS_M = ((0.0, 40.0), (40.0, 80.0))
+# Name, picture (H, W, 3), mask (H, W) of the true lines, camera where it is known, annotations.
+Picture = tuple[str, np.ndarray, np.ndarray, Camera | None, dict]
 
 
-@dataclass(frozen=True)
-class Score:
-    """Precision and recall of pixels."""
-
-    precision: float
-    recall: float
-
-    @property
-    def f1(self) -> float:
-        total = self.precision + self.recall
-        return 2 * self.precision * self.recall / total if total else 0.0
-
-
-def score_masks(found: np.ndarray, true: np.ndarray) -> Score:
-    """Compare masks (H, W): shares of the pixels of each within `WITHIN_PX` of the other."""
+def score_masks(found: np.ndarray, true: np.ndarray) -> tuple[float, float, float]:
+    """Precision, recall and F1 of masks (H, W): shares of the pixels of each within `WITHIN_PX` of the other."""
 
     def share(of: np.ndarray, near: np.ndarray) -> float:
         if not of.any() or not near.any():
@@ -52,7 +41,8 @@ def score_masks(found: np.ndarray, true: np.ndarray) -> Score:
         distance = cv2.distanceTransform((~near).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         return float(np.mean(distance[of] <= WITHIN_PX))
 
-    return Score(share(found, true), share(true, found))
+    precision, recall = share(found, true), share(true, found)
+    return precision, recall, 2 * precision * recall / max(precision + recall, 1e-9)
 
 
 def draw_lines(shape: tuple[int, ...], lines: list[np.ndarray]) -> np.ndarray:
@@ -65,36 +55,21 @@ def draw_lines(shape: tuple[int, ...], lines: list[np.ndarray]) -> np.ndarray:
     return mask > 0
 
 
-def score_tusimple(folder: Path) -> list[Score]:
-    scores = []
+def tusimple(folder: Path) -> Iterator[Picture]:
+    """Pictures with the mask of their lines; nothing is known of the camera."""
     for path in sorted((folder / "image").glob("*.jpg")):
-        image, true = cv2.imread(str(path)), cv2.imread(str(folder / "gt_binary_image" / f"{path.stem}.png"), 0) > 0
-        start = time.perf_counter()
-        found = find_markings_in_picture(image)
-        seconds = time.perf_counter() - start
-        score = score_masks(draw_lines(image.shape, [found.project(line.points_m) for line in found.lane_lines]), true)
-        print(_row(f"tusimple {path.stem}", score, f"{len(found.lane_lines)} lines, {seconds:.1f} s"))
-        scores.append(score)
-    return scores
+        true = cv2.imread(str(folder / "gt_binary_image" / f"{path.stem}.png"), 0) > 0
+        yield path.stem, cv2.imread(str(path)), true, None, {}
 
 
-def score_openlane(folder: Path) -> list[Score]:
-    scores = []
+def openlane(folder: Path) -> Iterator[Picture]:
+    """Pictures with the mask of their lines, their camera and their annotations."""
     for path in sorted((folder / "lane3d" / "annotations").rglob("*.json")):
         image = cv2.imread(str(folder / "lane2d" / "images" / f"{path.stem}.jpg"))
         document = json.loads(path.read_text(encoding="utf-8"))
-        camera = openlane_camera(document, image.shape)
-        start = time.perf_counter()
-        found = find_markings_in_picture(image, camera)
-        seconds = time.perf_counter() - start
         lines = [line for line in document["lane_lines"] if line["category"] not in CURBS]
         true = draw_lines(image.shape, [np.array(line["uv"]).T[np.argsort(line["uv"][1])] for line in lines])
-        drawn = draw_lines(image.shape, [found.project(line.points_m) for line in found.lane_lines])
-        score = score_masks(drawn, true)
-        errors = "; ".join(lateral_errors(document, camera, found))
-        print(_row(f"openlane {path.stem}", score, f"{len(found.lane_lines)} lines, {seconds:.1f} s; {errors}"))
-        scores.append(score)
-    return scores
+        yield path.stem, image, true, openlane_camera(document, image.shape), document
 
 
 def openlane_camera(document: dict, shape: tuple[int, ...]) -> Camera:
@@ -123,22 +98,23 @@ def lateral_errors(document: dict, camera: Camera, found: PictureMarkings) -> li
     out = []
     for low, high in SPANS_M:
         error = [e for x, e in rows if low <= x < high]
-        out.append(
-            f"lateral error {low:.0f}-{high:.0f} m: {np.median(error):.2f} m"
-            if error
-            else f"{low:.0f}-{high:.0f} m: none"
-        )
+        median = f"lateral error {low:.0f}-{high:.0f} m: {np.median(error):.2f} m" if error else ""
+        out.append(median or f"{low:.0f}-{high:.0f} m: none")
     return out
 
 
-def _row(name: str, score: Score, more: str) -> str:
-    return f"{name}: precision {score.precision:.3f}, recall {score.recall:.3f}, F1 {score.f1:.3f}; {more}"
-
-
 def main(folder: Path) -> None:
-    for name, scores in (
-        ("tusimple", score_tusimple(folder / "tusimple")),
-        ("openlane", score_openlane(folder / "openlane")),
-    ):
+    """Print the scores of each picture, and the mean of each data set."""
+    for data_set in (tusimple, openlane):
+        name, scores = data_set.__name__, []
+        for stem, image, true, camera, document in data_set(folder / name):
+            begin = time.perf_counter()
+            found = find_markings_in_picture(image, camera)
+            more = [f"{len(found.lane_lines)} lines, {time.perf_counter() - begin:.1f} s"]
+            drawn = draw_lines(image.shape, [found.project(line.points_m) for line in found.lane_lines])
+            precision, recall, f1 = score_masks(drawn, true)
+            more += lateral_errors(document, camera, found) if camera is not None else []
+            print(f"{name} {stem}: precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f}; {'; '.join(more)}")
+            scores.append(f1)
         if scores:
-            print(f"{name}: mean F1 {np.mean([s.f1 for s in scores]):.3f} of {len(scores)} pictures")
+            print(f"{name}: mean F1 {np.mean(scores):.3f} of {len(scores)} pictures")

@@ -1,6 +1,6 @@
 """Large and close vehicles: one row of ten kinds of 4 to 19 m, in eight poses, with and without a second vehicle.
 
-    python tools/bench.py large_vehicles [--kind bus ...] [--pose overtaking ...] [--seed 0]
+    python tools/bench.py large_vehicles [--kind bus ...] [--pose overtaking ...]
 
 Each is a small synthetic log of one LiDAR, reconstructed by `lidar:vehicle` and compared with its truth as `evaluate` does: recall of
 the vehicle, position, yaw, length, width and speed, and how many agents there are besides.
@@ -82,7 +82,6 @@ def scene_of(kind: str, pose: str, *, second: bool) -> Scene:
 def main(
     kind: Annotated[list[str], typer.Option(help=", ".join(KINDS))] = list(KINDS),
     pose: Annotated[list[str], typer.Option(help=", ".join(POSES))] = list(POSES),
-    seed: int = 0,
 ) -> None:
     """Reconstruct every scene and print the table, and the mean of each pose."""
     config = Config.load(settings=["detect.name=lidar:vehicle", "map.lanes=false"])
@@ -92,7 +91,7 @@ def main(
         found = list[list[float | None]]()
         for of in kind:
             for second in (False, True):
-                log, truth = synthesize(scene_of(of, name, second=second), seed=seed)
+                log, truth = synthesize(scene_of(of, name, second=second), seed=0)
                 judged = evaluate(reconstruct(log, config, cache=False), truth)
                 row = next((a for a in judged["agents"] if a["id"] == "target"), None)
                 recall = row["matched"] / row["ticks"] if row and row["ticks"] else 0.0

@@ -25,15 +25,15 @@ RUN = """
 import json, sys
 from log2sim import Config, open_log, reconstruct
 from benchmarks.memory import loop_log
-path, times, settings = json.loads(sys.argv[1])
-result = reconstruct(loop_log(open_log(path), times), Config.load(**settings))
+path, times = json.loads(sys.argv[1])
+result = reconstruct(loop_log(open_log(path), times), Config.load(detect={"name": "lidar:vehicle"}))
 print(json.dumps({"ticks": result.report["ticks"], "stages": result.report["stages"], "agents": len(result.scenario.agents)}))
 """
 
 
-def measure(path: str, times: int, settings: dict[str, Any]) -> dict[str, Any]:
+def measure(path: str, times: int) -> dict[str, Any]:
     """Reconstruct a log that is driven several times in a row; returns ticks, agents and the report's stages."""
-    job = json.dumps([path, times, settings])
+    job = json.dumps([path, times])
     ran = subprocess.run(
         [sys.executable, "-c", RUN, job], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
     )
@@ -43,9 +43,9 @@ def measure(path: str, times: int, settings: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def main(log: Path, times: list[int] = [1, 4, 16], detector: str = "lidar:vehicle") -> None:
+def main(log: Path, times: list[int] = [1, 4, 16]) -> None:
     """Print the table."""
-    runs = [measure(str(log.resolve()), count, {"detect": {"name": detector}}) for count in times]
+    runs = [measure(str(log.resolve()), count) for count in times]
     peaks = [{stage["stage"]: float(stage["peak_memory_mib"]) for stage in run["stages"]} for run in runs]
     names = dict.fromkeys(name for of_run in peaks for name in of_run)
     rows = [[name, *(f"{of_run[name]:.0f} MiB" if name in of_run else "-" for of_run in peaks)] for name in names]

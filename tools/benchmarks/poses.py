@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.table import markdown
 from log2sim import Config, open_log
 from log2sim.datatypes import GROUP_OF, Labels
-from log2sim.geometry import Array, PoseTrack, inverse
+from log2sim.geometry import Array, PoseTrack, inverse, nearest_rotation
 from log2sim.localization.choice import localize
 from log2sim.localization.odometry import densest_lidar
 from log2sim.localization.verdict import compare_poses
@@ -34,8 +34,7 @@ MAX_STANDING_MPS = 0.3
 def rigid(source: Array, target: Array) -> tuple[Array, Array]:
     """Rotation (3, 3) and translation (3,) that lay points (N, 3) on others best (Kabsch)."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    rotation = nearest_rotation(b.T @ a)
     return rotation, target.mean(axis=0) - rotation @ source.mean(axis=0)
 
 

@@ -9,13 +9,12 @@ either below the limits is counted as false.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from kitti.boxes import read_view
+from kitti.boxes import Boxes, read_tracks, read_view
 
 from log2sim.datatypes import EGO, Agent, EgoVehicle, Scenario, Waypoints
 from log2sim.evaluation.metrics.truth import is_static, speed_along, truth_from_log
@@ -93,24 +92,23 @@ def kitti_tracking(folder: Path) -> Iterator[tuple[str, Scenario]]:
         if not motion.is_file():
             continue
         frames = len(motion.read_text().splitlines())
-        view = read_view(folder / "calib" / labels.name, motion, frames)
-        rows = defaultdict(list)
-        for line in labels.read_text().splitlines():
-            words = line.split()
-            if words[2] in CATEGORY_OF and int(words[0]) < frames:
-                rows[words[1], CATEGORY_OF[words[2]]].append([int(words[0]), *map(float, words[10:17])])
-        agents = [_labeled(name, kind, np.array(r), view.map_T_cam) for (name, kind), r in rows.items()]
+        view, rows = read_view(folder / "calib" / labels.name, motion, frames), read_tracks(labels)
+        rows = rows.take(np.isin(rows.category, list(CATEGORY_OF)) & (rows.frame < frames))
+        kind = np.array([CATEGORY_OF[name] for name in rows.category.tolist()])
+        agents = [
+            _labeled(f"{of}-{number}", of, rows.take((rows.track_id == number) & (kind == of)), view.map_T_cam)
+            for number, of in dict.fromkeys(zip(rows.track_id.tolist(), kind.tolist()))
+        ]
         yield labels.stem, Scenario(labels.stem, 0, frames * PERIOD_S, (_kitti_ego(view.map_T_cam), *agents))
 
 
-def _labeled(name: str, kind: str, rows: np.ndarray, map_T_cam: np.ndarray) -> Agent:
-    """An agent from rows frame, height, width, length, x, y, z (bottom, camera axes), yaw about the camera's y."""
-    pose = map_T_cam[rows[:, 0].astype(int)]
-    height, turn = rows[:, 1], rows[:, 7]
-    center = apply(pose, rows[:, 4:7] - np.column_stack([0 * height, height / 2, 0 * height]))
+def _labeled(name: str, kind: str, rows: Boxes, map_T_cam: np.ndarray) -> Agent:
+    """An agent from its labels."""
+    pose, height, turn = map_T_cam[rows.frame], rows.size_hwl_m[:, 0], rows.yaw_rad
+    center = apply(pose, rows.bottom_m - np.column_stack([0 * height, height / 2, 0 * height]))
     ahead = np.einsum("nij,nj->ni", pose[:, :3, :3], np.column_stack([np.cos(turn), 0 * turn, -np.sin(turn)]))
-    size = tuple(np.median(rows[:, [3, 2, 1]], axis=0).tolist())
-    return _agent(f"{kind}-{name}", kind, size, rows[:, 0] * PERIOD_S, center, np.arctan2(ahead[:, 1], ahead[:, 0]))
+    size = tuple(np.median(rows.size_hwl_m[:, ::-1], axis=0).tolist())
+    return _agent(name, kind, size, rows.frame * PERIOD_S, center, np.arctan2(ahead[:, 1], ahead[:, 0]))
 
 
 def _kitti_ego(map_T_cam: np.ndarray) -> Agent:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,12 +10,12 @@ import numpy as np
 from benchmarks.table import cell, markdown
 from numpy.typing import NDArray
 
-from cooperation_worlds.world import ROAD_LIDAR, Array, RoadError, disturb
+from cooperation_worlds.world import Array
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Agent, Boxes3D, Log, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.detection.detect_log import detect_log
-from log2sim.geometry import NS_PER_S, inverse
+from log2sim.geometry import NS_PER_S
 from log2sim.pipeline import reconstruct, start
 
 ALONE = ("vehicle", "road")
@@ -78,37 +78,6 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
     return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
 
 
-def registration_row(log: Log, error: RoadError) -> tuple[Array, Array, bool]:
-    """Errors of the pole's end (3,) before and after `log2sim` has prepared a run, NaN where it is left out, and whether it says that it is unsure."""
-    disturbed = disturb(log, error)
-    run = start(disturbed, settings("points", register=True))
-    after = _error(log, run.log) if ROAD_LIDAR in run.log.lidars else np.full(3, np.nan)
-    told = any(f.kind in ("unknown_road_pose", "wrong_road_pose") for f in run.faults if f.subject == ROAD_LIDAR)
-    return _error(log, disturbed), after, told
-
-
-def _error(log: Log, other: Log) -> Array:
-    """Offset m, turn degrees and delay s, their sizes."""
-    true, pose = log.lidars[ROAD_LIDAR].mount_T_lidar, other.lidars[ROAD_LIDAR].mount_T_lidar
-    turned = inverse(true)[:3, :3] @ pose[:3, :3]
-    angle = np.rad2deg(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
-    late_ns = other.streams[ROAD_LIDAR].t_ns[0] - log.streams[ROAD_LIDAR].t_ns[0]
-    return np.array([np.linalg.norm(pose[:2, 3] - true[:2, 3]), angle, abs(late_ns) / NS_PER_S])
-
-
-def registration_figures(rows: Sequence[tuple[Array, Array, bool]]) -> dict[str, Any]:
-    """Medians and 90th percentiles (2, 3) of the errors, of those that are used, and shares."""
-    before, after, told = map(np.array, zip(*rows))
-    good = (after[:, 0] <= 0.1) & (after[:, 1] <= 0.3)
-    return {
-        "before": np.quantile(before, [0.5, 0.9], axis=0),
-        "after": np.nanquantile(after, [0.5, 0.9], axis=0),
-        "within 0.1 m and 0.3 deg": good.mean(),
-        "left out": np.isnan(after[:, 0]).mean(),
-        "silent": (~good & ~told).mean(),
-    }
-
-
 NAMES = {
     "vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes", "tracks": "both, tracks",
 }  # fmt: skip
@@ -154,12 +123,6 @@ def ap_table(figures: dict[str, Any]) -> str:
     return markdown(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
 
 
-def registration_table(figures: dict[str, Any]) -> str:
-    rows = [[when, *(f"{m:.3f} / {p:.3f}" for m, p in figures[when].T)] for when in ("before", "after")]
-    shares = [f"{name}: {value:.2f}" for name, value in figures.items() if name not in ("before", "after")]
-    return markdown(["median / 90 %", "position m", "angle deg", "clock s"], rows) + f"\n\n{'; '.join(shares)}"
-
-
 TABLE: dict[str, Callable[[dict[str, Any]], str]] = {
-    "range": range_table, "blind_area": blind_area_table, "overlap": overlap_table, "ap": ap_table, "registration": registration_table,
+    "range": range_table, "blind_area": blind_area_table, "overlap": overlap_table, "ap": ap_table,
 }  # fmt: skip

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Scenario, Stream, Sweep
 from log2sim.geometry import NS_PER_S, rectangles_overlap, rotation_from_rpy, transform, wrap_angle
+from log2sim.localization.replaced import shift_stream
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Material, Polytope, Shape, box
@@ -345,22 +346,9 @@ def disturb(log: Log, error: RoadError) -> Log:
     pose = np.array(lidar.mount_T_lidar)
     # Turned about itself, not about the origin of the map.
     turned = transform(rotation_from_rpy(*np.deg2rad(error.turn_deg)) @ pose[:3, :3], pose[:3, 3] + error.offset_m)
-    late_ns = round(error.delay_s * NS_PER_S)
-    stream = log.streams[ROAD_LIDAR]
-    late = Stream(ROAD_LIDAR, stream.t_ns + late_ns, _later(stream.read, late_ns))
-    return log.changed(
-        lidars={**log.lidars, ROAD_LIDAR: replace(lidar, mount_T_lidar=turned)},
-        streams={**log.streams, ROAD_LIDAR: late},
-    )
-
-
-def _later(read: Callable[[int], Any], late_ns: int) -> Callable[[int], Sweep]:
-    def moved(i: int) -> Sweep:
-        sweep: Sweep = read(i)
-        t_ns = None if sweep.t_ns is None else sweep.t_ns + late_ns
-        return replace(sweep, stamp_ns=sweep.stamp_ns + late_ns, t_ns=t_ns)
-
-    return moved
+    late = shift_stream(log.streams[ROAD_LIDAR], round(error.delay_s * NS_PER_S))
+    lidars = {**log.lidars, ROAD_LIDAR: replace(lidar, mount_T_lidar=turned)}
+    return log.changed(lidars=lidars, streams={**log.streams, ROAD_LIDAR: late})
 
 
 # Points on the target's axis and sides, at shares of its half length, half width and height.

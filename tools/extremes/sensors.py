@@ -30,6 +30,7 @@ from log2sim.errors import MissingExtra
 from log2sim.evaluation.metrics.comparison import Selection
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
 from log2sim.geometry import NS_PER_S, Array, rotation_from_rpy, transform
+from log2sim.localization.replaced import shift_stream
 
 
 @case("log: one camera", "all agents, no fusion")
@@ -220,8 +221,7 @@ def no_sweeps(log: Log) -> Log:
 
 
 def late_sweeps(log: Log) -> Log:
-    old, shift_ns = log.streams[LIDAR], 100_000_000
-    return with_stream(log, Stream(LIDAR, old.t_ns + shift_ns, lambda i: moved_in_time(old.read(i), shift_ns)))
+    return with_stream(log, shift_stream(log.streams[LIDAR], 100_000_000))
 
 
 def yawed(mount_T_sensor: Array, degrees: float) -> Array:

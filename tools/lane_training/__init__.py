@@ -1,1 +1,0 @@
-"""What the network that finds paint on roads is trained with."""
