@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from log2sim.version import __version__
+from log2sim.files.version import __version__
 
 if TYPE_CHECKING:
     from log2sim.batch.run import reconstruct_all

@@ -183,10 +183,10 @@ class CooperationConfig(Section):
     """Sensors on the ego (the vehicle end) and fixed in the map (the road end) together."""
 
     ends: Literal["both", "vehicle", "road"] = setting("both", "Whose sensors are used.")
-    fusion: Literal["points", "boxes", "tracks"] = setting(
+    fusion: Literal["points", "boxes"] = setting(
         "points",
         "What of the two ends is joined where both have LiDARs: points: their clouds, before detection; boxes: what is "
-        "detected in the clouds of each; tracks: what is tracked by each.",
+        "detected in the clouds of each.",
     )
     register_road: bool = setting(
         True, "Whether poses and clocks of the road's sensors are checked and corrected against what the vehicle sees."

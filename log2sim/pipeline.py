@@ -10,27 +10,40 @@ import numpy as np
 
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.conflicts import extend_static
-from log2sim.agents.estimate import ego_agent, ego_path, estimate_agents, simplify, with_observers, with_pose_errors
+from log2sim.agents.estimate import (
+    ego_agent,
+    ego_path,
+    ego_velocity,
+    estimate_agents,
+    simplify,
+    with_observers,
+    with_pose_errors,
+)
 from log2sim.agents.evidence import Recording
 from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import judge
 from log2sim.config import Config
-from log2sim.datatypes import Log
+from log2sim.datatypes import Finding, Log
 from log2sim.files.processes import default_jobs
 from log2sim.files.stages import StageClock
+from log2sim.geometry import PoseTrack
 from log2sim.localization.choice import localize, refine_for_map
 from log2sim.localization.given_poses import list_faults
 from log2sim.localization.mounts import check_calibration
 from log2sim.localization.roadside import register_road
 from log2sim.perception.first_pass import Observations, observe
-from log2sim.perception.fusion import fuse_by_end
+from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import fit_homographies, place_by_homography
+from log2sim.perception.run_cache import StageCache, open_store
 from log2sim.perception.run_detectors import GivenDetector, create_detectors, sort_detectors
 from log2sim.perception.sync import schedule_of
 from log2sim.plan import choose_detector, make_plan, select_sensors
 from log2sim.report import Progress, Result, Run, conclude, draft_scenario
 from log2sim.road.describe import describe
-from log2sim.tracking.tracker import mark_unrecorded, track_ends
+from log2sim.tracking.tracker import mark_unrecorded, track
+
+LATER = ("topdown", "track", "smooth", "map", "appearance")
+"""Settings of stages after the first pass."""
 
 
 def reconstruct(
@@ -82,27 +95,43 @@ def start(
     """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
     clock, progress = StageClock(), progress or (lambda *_: None)
+    store = open_store() if cache else None
+    earlier = StageCache(log, store, clock)
     with clock.stage("poses"):
-        log, poses = localize(log, given.config, progress=progress)
+        log, poses = localize(earlier.log, given.config, progress=progress)
     config = choose_detector(log, given.config)
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
-        log, faults = check_calibration(log, config, sensors, progress=progress)
+        asked = config.calibration
+        # What mends the log gives more than findings, which alone are kept.
+        if not asked.check or asked.fix_time or asked.fix_mounts:
+            log, faults = check_calibration(log, config, sensors, progress=progress)
+        else:
+            of = [{name: value for name, value in config.to_dict().items() if name not in LATER}, sensors]
+            faults = earlier.known(
+                "calibration",
+                log,
+                of,
+                (Finding,),
+                lambda: check_calibration(log, config, sensors, progress=progress)[1],
+            )
         sensors = sensors.without([fault.subject for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
-        poses = refine_for_map(log, poses, faults)
+        of = [poses.source, poses.checked, poses.during_ns, faults]
+        for_map = earlier.known("map-poses", log, of, (PoseTrack,), lambda: refine_for_map(log, poses, faults).for_map)
+        poses = replace(poses, for_map=for_map)
     with clock.stage("registration"):
         road = register_road(log, config, sensors, progress=progress)
         sensors = sensors.without([fault.subject for fault in road.faults if fault.treatment == "left_out"])
     progress("load", 0, 0)
     log = sensors.restrict(road.log)
-    detectors = create_detectors(log, config, given, cache=cache)
+    detectors = create_detectors(log, config, given, store=store)
     with clock.stage("sync"):
         schedule = schedule_of(log, sensors.cameras, config)
     plan = make_plan(road.log, config, sensors, schedule.t_ns)
     faults = (*list_faults(log, poses.stretches, *schedule.t_ns[[0, -1]].tolist()), *faults, *road.faults)
     jobs = jobs or (default_jobs() if detectors.own else 1)
-    return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures)
+    return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures, earlier)
 
 
 def observe_log(run: Run) -> Observations:
@@ -122,9 +151,17 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         homographies = fit_homographies(log, observations, plan, config.topdown, rng=np.random.default_rng(config.seed))
         placed = place_by_homography(log, observations, homographies)
     with clock.stage("fuse"):
-        by_end = fuse_by_end(placed, plan)
+        fused = fuse(placed, across=plan.fuses)
     with clock.stage("track", run.progress):
-        tracks = track_ends(by_end, schedule.t_ns, config.track)
+        limits = config.track
+        tracks = track(
+            fused,
+            schedule.t_ns,
+            birth_score=limits.birth_score,
+            max_gap_s=limits.max_gap_s,
+            min_life_s=limits.min_life_s,
+            flow_mps=ego_velocity(log, schedule),
+        )
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
         obstacles = observations.obstacles
@@ -144,7 +181,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
 
     scenario = draft_scenario(run, observations, homographies, agents if ego is None else [ego, *agents])
     described = describe(
-        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, jobs=run.jobs, clock=clock,
-        progress=run.progress,
+        scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, earlier=run.earlier,
+        jobs=run.jobs, clock=clock, progress=run.progress,
     )  # fmt: skip
-    return conclude(run, observations, by_end, homographies, described)
+    return conclude(run, observations, fused, homographies, described)

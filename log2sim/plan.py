@@ -188,7 +188,6 @@ class FusionLevel(StrEnum):
 
     POINTS = "points"
     BOXES = "boxes"
-    TRACKS = "tracks"
 
 
 def fusion_level(log: Log, config: Config) -> tuple[FusionLevel | None, str]:
@@ -288,6 +287,11 @@ class Plan:
     def keeps(self, stage: Stage) -> bool:
         """Return whether a stage runs."""
         return any(d.kept for d in self.decisions if d.stage is stage)
+
+    @property
+    def fuses(self) -> bool:
+        """Whether several sensors may have measured an object at a tick."""
+        return self.keeps(Stage.FUSION) or self.keeps(Stage.FUSION_WITH_LIDAR)
 
     def only_agents(self) -> Plan:
         """Return a plan without the stages that describe the scenario beyond the motion of its agents."""

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from log2sim.agents.estimate import TOLERANCE_M, camera_entries, provenance_of, roadside_sensors
+from log2sim.agents.estimate import TOLERANCE_M
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Finding, Log, Measurements, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.files.documents import rounded
 from log2sim.files.stages import StageClock
-from log2sim.geometry import NS_PER_S
+from log2sim.files.version import __version__
+from log2sim.geometry import NS_PER_S, Array, apply, inverse, undistort
 from log2sim.localization.choice import GIVEN, PoseChoice
 from log2sim.logs.checks import explain_missing_poses
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
+from log2sim.perception.records import RecordSource
+from log2sim.perception.run_cache import StageCache
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage
-from log2sim.version import __version__
 
 Progress = Callable[[str, int, int], None]
 
@@ -33,7 +36,7 @@ class Run:
 
     `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
     `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
-    of processes that share the work.
+    of processes that share the work. `earlier` knows what stages of earlier runs made; None to do all again.
     """
 
     log: Log
@@ -47,6 +50,7 @@ class Run:
     poses: PoseChoice = GIVEN
     faults: tuple[Finding, ...] = ()
     registration: Sequence[dict[str, Any]] = ()
+    earlier: StageCache | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,24 +89,111 @@ def draft_scenario(
         cameras=tuple(camera_entries(log, run.plan.cameras, homographies)),
         sensors=roadside_sensors(log, config.measure.max_range_m),
         provenance={
-            **provenance_of(log, config, run.detectors.name, run.poses.to_provenance()),
+            "log": {"name": log.name, "format": log.format, "digest": log.digest},
+            "log2sim_version": __version__,
+            "detector": run.detectors.name,
+            "poses": dict(run.poses.to_provenance()),
+            "config": config.to_dict(),
+            "seed": config.seed,
+            "history": ["reconstruct"],
             **({"faults": faults} if faults else {}),
         },
     )
 
 
+# Neighboring directions of LiDARs are less than a degree apart; a mast next to one hides a few degrees more.
+MIN_BLIND_RAD = math.radians(5.0)
+# Sweeps of which directions are taken, over the whole log.
+VIEW_SWEEPS = 3
+
+
+def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
+    """Return the sensors that are fixed in the map, as a scenario states them.
+
+    A camera looks where the rays of its middle row and column go, a LiDAR where it measured points.
+    """
+    mounts = [(name, "camera", c.mount_T_cam) for name, c in log.cameras.items() if c.mount == "map"]
+    mounts += [(name, "lidar", lidar.mount_T_lidar) for name, lidar in log.lidars.items() if lidar.mount == "map"]
+    entries = []
+    for name, kind, map_T_sensor in mounts:
+        rays_map = (_camera_rays(log, name) if kind == "camera" else _lidar_rays(log, name)) @ map_T_sensor[:3, :3].T
+        yaw_rad, fov_rad = _view_of(np.arctan2(rays_map[:, 1], rays_map[:, 0]))
+        place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
+        look = {"yaw_rad": yaw_rad, "fov_rad": fov_rad, "range_m": range_m}
+        entries.append({"name": name, "kind": kind, **place, **look})
+    return tuple(entries)
+
+
+def _camera_rays(log: Log, name: str) -> Array:
+    """Return rays (N, 3), cam frame, of pixels in the middle row and column that the lens model explains."""
+    camera = log.cameras[name]
+    u, v = np.linspace([0.0, 0.0], [camera.width_px, camera.height_px], 65).T
+    row = np.column_stack([u, np.full_like(u, camera.height_px / 2)])
+    column = np.column_stack([np.full_like(v, camera.width_px / 2), v])
+    xy = undistort(camera, np.concatenate([row, column]))
+    xy = xy[np.isfinite(xy).all(axis=1)]
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+def _lidar_rays(log: Log, name: str) -> Array:
+    """Return rays (N, 3), lidar frame, to the points of some sweeps of a LiDAR that is fixed in the map."""
+    records, count = RecordSource(log), len(log.streams[name].t_ns)
+    lidar_T_map = inverse(log.lidars[name].mount_T_lidar)
+    rays = [np.zeros((0, 3))]
+    for i in np.unique(np.linspace(0, count, VIEW_SWEEPS, endpoint=False).astype(int))[:count]:
+        sweep = records.get(name, int(i))
+        if sweep is None:
+            continue  # the stages before have reported it
+        xyz = np.asarray(sweep.xyz_m, dtype=np.float64)
+        rays.append(apply(lidar_T_map, xyz) if sweep.frame == "map" else xyz)
+    return np.concatenate(rays)
+
+
+def _view_of(azimuth_rad: Array) -> tuple[float, float]:
+    """Return middle and width, rad, of the narrowest field of view that holds azimuths (N,); all around where there are not two."""
+    azimuth = np.unique(azimuth_rad % (2 * math.pi))
+    if len(azimuth) < 2:
+        return 0.0, 2 * math.pi
+    gap = np.diff(azimuth, append=azimuth[0] + 2 * math.pi)
+    widest = int(gap.argmax())
+    if gap[widest] < MIN_BLIND_RAD:
+        return 0.0, 2 * math.pi
+    middle = azimuth[widest] + gap[widest] / 2 + math.pi
+    return math.remainder(float(middle), 2 * math.pi), float(2 * math.pi - gap[widest])
+
+
+def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:
+    """Return the cameras of a log with their homographies, as a scenario states them."""
+    entries = []
+    for name in log.cameras:
+        ground, homography = homographies.get(name), None
+        if ground is not None and ground.fit.ok:
+            fit = ground.fit
+            homography = {
+                "ground_H_image": fit.ground_H_image.tolist(),
+                "source": ground.source,
+                "inliers": int(fit.inliers.sum()),
+                "correspondences": len(fit.inliers),
+                "error_m": float(fit.error_m) if np.isfinite(fit.error_m) else None,
+                "condition": float(fit.condition),
+                "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
+            }
+        entries.append({"name": name, "used": name in used, "homography": homography})
+    return entries
+
+
 def conclude(
     run: Run,
     observations: Observations,
-    measurements: Sequence[Sequence[Measurements]],
+    measurements: Sequence[Measurements],
     homographies: Mapping[str, CameraHomography],
     described: tuple[Scenario, Sequence[Decision], Mapping[str, Any]],
 ) -> Result:
     """Join the plan and what became of it to the report of a finished run, and write what each stage did into its scenario.
 
-    `measurements`: by end and tick. `described`: what `describe` returns.
+    `measurements`: by tick. `described`: what `describe` returns.
     """
-    log, config, schedule, clock, cache = run.log, run.config, run.schedule, run.clock, run.detectors.cache
+    log, config, schedule, clock = run.log, run.config, run.schedule, run.clock
     scenario, decisions, figures = described
     found: Mapping[Stage, Callable[[Decision], Decision]] = {
         Stage.MOTION_COMPENSATION: lambda d: _compensation(d, observations),
@@ -114,7 +205,7 @@ def conclude(
     planned = (d for d in run.plan.decisions if d.stage not in DESCRIBING)
     stages = (*(found[d.stage](d) if d.stage in found else d for d in planned), *decisions)
     scenario = replace(scenario, stages=tuple(stage.to_dict() for stage in stages))
-    from_lidar = [rows.source == "lidar" for end in measurements for rows in end]
+    from_lidar = [rows.source == "lidar" for rows in measurements]
     report = {
         "report_version": 1,
         "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
@@ -134,7 +225,7 @@ def conclude(
         "poses": run.poses.to_dict(),
         "faults": [fault.to_dict() for fault in (*run.faults, *observations.faults)],
         "registration": list(run.registration),
-        "detection_cache": None if cache is None else cache.figures(),
+        "detection_cache": None if run.earlier is None else run.earlier.figures(run.detectors.cache),
     }
     return Result(scenario, report, log, (*run.poses.findings, *run.faults, *observations.faults))
 

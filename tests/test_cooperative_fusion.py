@@ -1,4 +1,4 @@
-"""Fusion of the vehicle's and the road's LiDARs: boxes side by side, clouds by viewpoint, tracks at common ticks."""
+"""Fusion of the vehicle's and the road's LiDARs: boxes side by side, clouds by viewpoint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plain_settings import AGENTS_ALONE
 from worlds import rows_at, tiny_log, tiny_table
 
 from log2sim.config import Config
-from log2sim.datatypes import Boxes3D, Measurements, Track
+from log2sim.datatypes import Boxes3D, Measurements
 from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
 from log2sim.perception.cooperative import (
@@ -28,7 +28,6 @@ from log2sim.perception.lidar.cloud import Cloud, CloudSensor, assemble_views, j
 from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
-from log2sim.tracking.tracker import merge_tracks
 
 POST = {
     "name": "post",
@@ -143,7 +142,7 @@ def test_clouds_of_both_ends_keep_their_viewpoints(both_ends) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", ["points", "boxes", "tracks"])
+@pytest.mark.parametrize("level", ["points", "boxes"])
 def test_every_level_finds_every_object_once(both_ends, level) -> None:
     chosen = Config.load(
         settings=["detect.name=lidar:labels", f"cooperation.fusion={level}", "cooperation.register_road=false"],
@@ -175,48 +174,6 @@ def test_levels_fall_back_where_an_end_has_no_lidar(both_ends) -> None:
     assert "no LiDAR of vehicle" in reason
     vehicle = both_ends.changed(lidars={"top": both_ends.lidars["top"]})
     assert fusion_level(vehicle, config)[1] == ""
-
-
-def track_of(ticks, xy, *, late_s=0.0, end=0, category="car"):
-    """A track measured at ticks of 0.1 s, some time late."""
-    ticks = np.array(ticks)
-    rows = rows_at(xy, category=category, sigma_m=0.2, source="lidar", camera="")
-    seen_by = np.zeros((len(ticks), 2), bool)
-    seen_by[:, end] = True
-    return Track(category, ticks, replace(rows, t_ns=(ticks * 1e8 + late_s * 1e9).astype(np.int64), seen_by=seen_by))
-
-
-def line(ticks, speed, y=0.0, late_s=0.0):
-    return [[speed * (0.1 * k + late_s), y] for k in ticks]
-
-
-def test_tracks_are_compared_where_their_velocities_carry_them() -> None:
-    # 1.5 m apart at each tick, as the road measures 0.1 s later: one car, not two.
-    ticks = range(10)
-    a = track_of(ticks, line(ticks, 15.0))
-    b = track_of(ticks, line(ticks, 15.0, late_s=0.1), late_s=0.1, end=1)
-    (merged,) = merge_tracks([a], [b])
-    assert merged.tick.tolist() == list(ticks)
-    assert merged.measurements.seen_by.all()
-    t_s = merged.measurements.t_ns / 1e9
-    assert merged.measurements.center_m[:, 0] == pytest.approx(15 * t_s, abs=0.05)
-    # The next car follows 1.5 m behind in the same lane only if it is one that nobody could drive.
-    beside = track_of(ticks, line(ticks, 15.0, y=3.0), end=1)
-    assert len(merge_tracks([a], [beside])) == 2
-    oncoming = track_of(ticks, [[13.5 - x, 0.4] for x, _ in line(ticks, 15.0)], end=1)
-    assert len(merge_tracks([a], [oncoming])) == 2
-
-
-def test_the_road_joins_two_tracks_of_a_hidden_object() -> None:
-    first, last, whole = range(8), range(30, 40), range(40)
-    a = [track_of(first, line(first, 5.0)), track_of(last, line(last, 5.0))]
-    b = [track_of(whole, line(whole, 5.0, y=0.1), end=1)]
-    (merged,) = merge_tracks(a, b)
-    assert merged.tick.tolist() == list(whole)
-    assert merged.measurements.seen_by[:, 0].sum() == 18
-    # Two objects that the vehicle sees at the same ticks are never one.
-    twin = track_of(first, line(first, 5.0, y=0.3))
-    assert len(merge_tracks([a[0], twin], b)) == 2
 
 
 def test_a_row_keeps_the_view_of_the_other_end(both_ends) -> None:

@@ -17,12 +17,15 @@ import pytest
 
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Detections, Frame, Log, Stream
-from log2sim.errors import LogError
+from log2sim.errors import LogError, RecordError
 from log2sim.files import plugins
 from log2sim.files.documents import check
-from log2sim.perception import first_pass, first_pass_cache
+from log2sim.files.packing import pack
+from log2sim.files.stages import StageClock
+from log2sim.perception import first_pass, run_cache
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.first_pass_cache import open_cache
+from log2sim.perception.records import RecordSource
+from log2sim.perception.run_cache import StageCache, open_cache, open_store
 from log2sim.pipeline import observe_log, start
 from log2sim.report import Run
 
@@ -102,8 +105,8 @@ def untimed(report: dict[str, Any]) -> dict[str, Any]:
     out = copy.deepcopy(report)
     for key in ("seconds", "ticks_per_second", "ticks_per_second_without_detector", "detection_cache"):
         out.pop(key)
-    first_pass = ("recall", "decode", "detect", "cloud", "measure")
-    out["stages"] = [stage["stage"] for stage in out["stages"] if stage["stage"] not in first_pass]
+    once = ("recall", "decode", "detect", "cloud", "measure", "pictures")
+    out["stages"] = [stage["stage"] for stage in out["stages"] if stage["stage"] not in once]
     for step in out["plan"]:
         step.pop("saved_s"), step.pop("saved_how")
     return out
@@ -138,19 +141,19 @@ def assert_same_observations(one: Observations, other: Observations) -> None:
 
 def test_runs_with_and_without_the_cache_give_the_same(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
     reads: list[int] = []
-    log = counted(open_log(tiny_folder), reads)
-    without = reconstruct(log, config(), cache=False)
+    log, settings = counted(open_log(tiny_folder), reads), config(map={"lanes": True}, calibration={"check": True})
+    without = reconstruct(log, settings, cache=False)
     assert not folder.exists()
-    first = reconstruct(log, config())
+    first = reconstruct(log, settings)
     reads.clear()
-    second = reconstruct(log, config())
+    second = reconstruct(log, settings)
     ticks = without.report["ticks"]
     assert [len(detector.seen) for detector in made] == [ticks, ticks, 0]
     assert reads == []  # nothing was decoded
     assert [r.report["detection_cache"] for r in (without, first, second)] == [
         None,
-        {"found": 0, "kept": ticks, "problem": None},
-        {"found": ticks, "kept": 0, "problem": None},
+        {"found": 0, "kept": ticks, "problem": None, "stages": []},
+        {"found": ticks, "kept": 0, "problem": None, "stages": ["calibration", "map-poses", "map"]},
     ]
     for result in (first, second):
         assert result.scenario.to_dict() == without.scenario.to_dict()
@@ -171,7 +174,7 @@ def test_another_setting_of_the_detector_searches_everything(
     monkeypatch.setitem(STATED, "cache_key", "seeing 2")
     look(log)
     assert len(made[-1].seen) == TICKS
-    monkeypatch.setattr(first_pass_cache, "software_key", lambda: "another version")
+    monkeypatch.setattr(run_cache, "software_key", lambda *_: "another version")
     look(log)
     assert len(made[-1].seen) == TICKS
 
@@ -258,7 +261,7 @@ def test_detectors_that_do_not_say_what_they_depend_on_are_asked_again(
     runs = [look(log)[0], look(log)[0], look(log, config(detect={"name": "labels"}))[0]]
     assert [len(d.seen) for d in made] == [TICKS, TICKS]
     assert [run.detectors.cache for run in runs] == [None, None, None]
-    assert not folder.exists()
+    assert not list(folder.glob("?/seeing*"))
 
 
 def test_a_function_is_asked_once_where_it_states_what_it_depends_on(tiny_folder: Path, folder: Path) -> None:
@@ -295,7 +298,7 @@ def test_a_folder_that_cannot_be_used_costs_the_cache_alone(
 def test_damaged_entries_are_made_again(tiny_folder: Path, folder: Path, made: list[Seeing]) -> None:
     log = open_log(tiny_folder)
     _, before = look(log)
-    paths = entries(folder)
+    paths = sorted(folder.glob("?/seeing*"))
     contents = [path.read_bytes() for path in paths]
     for k, (path, content) in enumerate(zip(paths, contents, strict=True)):
         middle = len(content) // 2
@@ -304,7 +307,7 @@ def test_damaged_entries_are_made_again(tiny_folder: Path, folder: Path, made: l
     _, after = look(log)
     assert (len(made[-1].seen), len(paths)) == (TICKS, TICKS // PART)
     assert_same_observations(before, after)
-    assert [path.read_bytes() for path in entries(folder)] == contents
+    assert [path.read_bytes() for path in paths] == contents
 
 
 def test_a_run_that_was_interrupted_goes_on_where_it_was(
@@ -349,6 +352,52 @@ def test_a_run_that_was_killed_goes_on_where_it_was(tiny_folder: Path, folder: P
     assert (run.detectors.cache.found, len(made[-1].seen)) == (PART, TICKS - PART)
 
 
+# --- stages
+
+
+def a_stage(shown: dict[int, Any], of: Any = 1) -> tuple[float, list[str]]:
+    """Run a stage that adds up the first two of three records; its result and what was known."""
+
+    def read(i: int) -> Any:
+        if isinstance(shown[i], str):
+            raise RecordError(shown[i])
+        return np.full((1, 1, 3), shown[i], np.uint8)
+
+    stream = Stream("front", np.arange(3), read)
+    earlier = StageCache(Log("few", "test", {}, {}, {"front": stream}), open_store(), StageClock())
+
+    def add() -> float:
+        records = RecordSource(earlier.log)
+        return sum(0.0 if (image := records.get("front", i)) is None else float(image.sum()) for i in (0, 1))
+
+    return earlier.known("sum", earlier.log, of, (), add), earlier.found
+
+
+def test_a_stage_is_known_while_what_it_read_and_was_told_is_the_same(folder: Path) -> None:
+    assert a_stage({0: 1, 1: 2, 2: 3}) == (9.0, [])
+    assert a_stage({0: 1, 1: 2, 2: 3}) == (9.0, ["sum"])
+    assert a_stage({0: 1, 1: 2, 2: 9}) == (9.0, ["sum"])  # it did not look at the last one
+    assert a_stage({0: 1, 1: 3, 2: 3}) == (12.0, [])
+    assert a_stage({0: 1, 1: 3, 2: 3}, 2) == (12.0, [])
+    for _ in range(2):  # what cannot be read is told each time
+        assert a_stage({0: 1, 1: "cut", 2: 3}) == (3.0, [])
+
+
+def test_damaged_and_foreign_results_of_stages_are_made_again(folder: Path) -> None:
+    good = {0: 1, 1: 2, 2: 3}
+    a_stage(good)
+    (own,) = entries(folder)
+    a_stage(good, 2)
+    other = next(path for path in entries(folder) if path != own)
+    name, content = own.name, own.read_bytes()
+    strange: list[Any] = [None, 7, [], [name, [["front", 7]], "", 0.0], [name, [["rear", 0]], "", 0.0], [name, 1, 2, 3]]
+    for bad in (b"", content[:-1], bytes([*content[:-1], content[-1] ^ 1]), other.read_bytes(), *map(pack, strange)):
+        own.write_bytes(bad)
+        assert a_stage(good) == (9.0, [])
+        assert own.read_bytes() == content
+    assert a_stage(good) == (9.0, ["sum"])
+
+
 # --- keys
 
 
@@ -374,9 +423,9 @@ def test_the_key_of_a_network_changes_with_its_weights_and_settings(
     model.graph.initializer.append(big)
     onnx.save(model, tmp_path / "d.onnx", save_as_external_data=True, location="d.bin", size_threshold=0)
     assert key(tmp_path / "d.onnx") is None  # its weights are in another file
-    assert open_cache(create_detector(str(tmp_path / "d.onnx"), LOG), None) is None
+    assert open_cache(open_store(), create_detector(str(tmp_path / "d.onnx"), LOG), None) is None
 
 
 def test_the_keys_hold_the_code_that_they_are_named_after() -> None:
-    package = Path(first_pass_cache.__file__).resolve().parents[1]
-    assert all(list(package.glob(pattern)) for pattern in first_pass_cache.SOURCES)
+    package = Path(run_cache.__file__).resolve().parents[1]
+    assert all(list(package.glob(pattern)) for pattern in run_cache.STAGE_SOURCES)

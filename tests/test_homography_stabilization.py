@@ -19,7 +19,7 @@ from log2sim.perception.homography import estimate, pitch_roll
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions
 from log2sim.pipeline import reconstruct
-from log2sim.tracking.tracker import track_ends
+from log2sim.tracking.tracker import track
 
 T0_NS = 1_700_000_000_000_000_000
 TICKS = 40
@@ -93,12 +93,12 @@ class Outcome:
 def outcome(log: Log, monkeypatch: pytest.MonkeyPatch) -> Outcome:
     placed: list[Measurements] = []
 
-    def spy(ends: list[list[Measurements]], *rest: Any, **options: Any) -> Any:
-        placed.extend(measurements for of_end in ends for measurements in of_end)
-        return track_ends(ends, *rest, **options)
+    def spy(fused: list[Measurements], *rest: Any, **options: Any) -> Any:
+        placed.extend(fused)
+        return track(fused, *rest, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(log2sim.pipeline, "track_ends", spy)
+        patch.setattr(log2sim.pipeline, "track", spy)
         scenario = reconstruct(log, Config.load(detect={"name": "labels"}, **AGENTS_ALONE)).scenario
     rows = Measurements.join(placed)
     rows = rows.take(rows.source == "topdown")

@@ -147,6 +147,14 @@ def test_crosswalk_stop_line_and_arrow_are_told_from_lane_lines() -> None:
     assert abs(cv2.contourArea(other.points_m[:, :2].astype(np.float32)) - 1.0) < 0.25
 
 
+def test_dashes_that_a_camera_sees_blurred_are_no_symbols() -> None:
+    painter = Painter(EXTENT)
+    painter.lines([np.array([[x, 0.0], [x + 3.0, 0.0]]) for x in (3.0, 9.0, 15.0)], 0.15)
+    ground = painter.ground(lidar=False)
+    blurred = cv2.GaussianBlur(ground.color_bgr, (0, 0), sigmaX=10.0, sigmaY=2.0)
+    assert [m.kind for m in find_markings(replace(ground, color_bgr=blurred))[0]] == ["dashed"]
+
+
 def test_markings_turn_with_the_map() -> None:
     painter = Painter((0.0, 30.0, -15.0, 15.0))
     painter.lines([line_of(lambda x: 0.3 * x - 2, 0, 30)])

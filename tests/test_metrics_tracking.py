@@ -7,9 +7,10 @@ import warnings
 import numpy as np
 import pytest
 
-from log2sim.evaluation.metrics.comparison import assign, associate, mota, near_pairs, switches
+from log2sim.evaluation.metrics.comparison import associate, mota, near_pairs, switches
 from log2sim.evaluation.metrics.correctness import normalized_errors, reliability
 from log2sim.evaluation.metrics.evaluator import hota
+from log2sim.geometry import choose_pairs
 
 
 def random_tracks(seed, truths=8, others=9, ticks=40, arena_m=14.0):
@@ -113,7 +114,7 @@ def test_assignment_equals_the_dense_solver():
     for _ in range(20):
         dense = np.where(rng.random((12, 9)) < 0.25, rng.random((12, 9)), 0.0)
         rows, cols = np.nonzero(dense)
-        chosen = assign(rows, cols, dense[rows, cols])
+        chosen = choose_pairs(rows, cols, -dense[rows, cols], 0.0)
         assert len(np.unique(rows[chosen])) == len(np.unique(cols[chosen])) == len(chosen)
         assert dense[rows[chosen], cols[chosen]].sum() == pytest.approx(dense[linear_sum_assignment(-dense)].sum())
 

@@ -17,7 +17,7 @@ from worlds import tiny_log
 
 from log2sim.cli import app
 from log2sim.files.plugins import BUILT_IN
-from log2sim.version import FALLBACK
+from log2sim.files.version import FALLBACK
 
 ROOT = Path(__file__).resolve().parents[1]
 GIT = ("git", "-c", "user.name=test", "-c", "user.email=test@example.org", "-c", "commit.gpgsign=false")

@@ -131,6 +131,3 @@ def test_ten_thousand_kilometers_away_everything_is_the_same(category):
     np.testing.assert_allclose(far.x_m - 1e7, near.x_m, atol=1e-6, rtol=0)
     np.testing.assert_allclose(far.y_m + 1e7, near.y_m, atol=1e-6, rtol=0)
     np.testing.assert_allclose(far.yaw_rad, near.yaw_rad, atol=1e-6)
-
-
-# Long lives.

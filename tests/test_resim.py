@@ -15,6 +15,7 @@ from log2sim.geometry import NS_PER_S
 from log2sim.logs.opening import open_log
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
+from log2sim.resim.sightings import sighting, with_sightings
 from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
 from log2sim.resim.surfels import Surfels, smallest_axis
 from log2sim.resim.world import World, body_of, build_world, ground_below
@@ -265,3 +266,58 @@ def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], worl
     np.testing.assert_allclose(ahead, 10 + 1.8, atol=0.3)
     with pytest.raises(ConfigError, match="no sensors are simulated"):
         replay(truth, ego=lambda observation: observation.sweep(name), dt_s=0.05)  # type: ignore[arg-type,return-value]
+
+
+def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scenario]) -> None:
+    """Two legs of 0.1 m, 0.3 m apart, 10 m ahead: their picture is sampled again by rays between those that saw them."""
+    half = np.array([0.3, 0.3, 0.9])
+    step = np.deg2rad(0.2)
+
+    def fan(shift: float) -> np.ndarray:
+        a, e = np.meshgrid((np.arange(-20, 21) + shift) * step, (np.arange(-30, 31) + shift) * step)
+        return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1).reshape(-1, 3)
+
+    def on_legs(at: np.ndarray) -> np.ndarray:
+        """Whether points on the plane of the legs are on them."""
+        return (np.abs(np.abs(at[:, 1]) - 0.15) < 0.05) & (np.abs(at[:, 2]) < 0.9)
+
+    ray = fan(0.0)
+    at = ray * (10 / ray[:, :1])
+    ends = on_legs(at)
+    away = np.where(ends, 10 / ray[:, 0], 30).astype(np.float32)
+    away[at[:, 2] < -0.5] = 5.0  # a wall before the feet
+    ends &= at[:, 2] >= -0.5
+    lost = ends & (np.abs(at[:, 2] - 0.3) < 0.06)  # a dark stripe of three rays
+    away[lost], ends[lost] = np.nan, False
+    seen = sighting(
+        0.0, np.array([-10.0, 0, 0]), ray, range_m=away, on=ends, intensity=np.ones(len(ray), np.float32), half_m=half,
+        cell_rad=np.full(2, step),
+    )  # fmt: skip
+    assert seen is not None
+    w = recorded[1].others[0].waypoints.take([0])
+    zero = np.zeros(1)
+    still = replace(w, t_s=zero, x_m=zero + 10, y_m=zero, z_m=zero, yaw_rad=zero, speed_mps=zero)
+    person = replace(recorded[1].others[0], category="pedestrian", size_m=tuple(2 * half), static=True, waypoints=still)
+    now = replace(recorded[1], agents=(person,), t0_ns=0)
+    shots = shots_toward(fan(0.37))
+    rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
+    body = disc_surfels(np.array([[10.0, 0, -0.7], [10, 0, 0.5]]), np.tile([-1.0, 0, 0], (2, 1)), 0.15)
+    met = meetings(rays, grid_of(rays), body, body.center_m, body.normal)
+    met, discs = with_sightings(
+        met, body, first=np.array([0, 0, 2]), ids=[person.id], rays=rays, scenario=now, sightings={person.id: [seen]}
+    )
+    hits = first_hits(met, discs, len(shots.t_ns), np.random.default_rng(0))
+    ended = hits.range_m
+    at = shots.direction * (10 / shots.direction[:, :1])
+    high = (at[:, 2] > -0.48) & (np.abs(at[:, 2] - 0.3) > 0.1)
+    legs = on_legs(at)
+    stripe = (np.abs(np.abs(at[:, 1]) - 0.15) < 0.02) & (np.abs(at[:, 2] - 0.3) < 0.07)
+    assert (hits.returned[stripe] == 0).sum() >= 3
+    assert not (hits.returned[stripe] > 0).any()
+    assert (hits.returned[np.isfinite(ended) & high] == 1).all()
+    assert (np.isfinite(ended) & high).sum() == pytest.approx((legs & high).sum(), rel=0.1)
+    # Not further from a leg than half the gap between rays, 3.5 cm, and not on the disc between the legs.
+    wide = np.abs(np.abs(at[:, 1]) - 0.15)
+    assert np.all(wide[np.isfinite(ended) & high] < 0.09)
+    np.testing.assert_allclose(ended[np.isfinite(ended)], np.linalg.norm(at, axis=1)[np.isfinite(ended)], atol=0.02)
+    assert np.isfinite(ended[(np.abs(at[:, 1]) < 0.05) & (np.abs(at[:, 2] + 0.7) < 0.1)]).all()

@@ -120,13 +120,19 @@ def test_a_size_that_is_not_seen_is_the_typical_one():
 
 
 @pytest.mark.parametrize(("shift", "angle"), [((5e5, 5e6, 0.0), 0.0), ((-30.0, 8.0, 0.0), 1.3), ((0, 0, 0), -2.4)])
-def test_a_standing_shape_moves_and_turns_with_the_map(shift, angle):
+def test_shapes_move_and_turn_with_the_map(shift, angle):
     track = measured([(12, 5, 0.3)] * 15, sensors=PASSING[:15])
     here, there = static_geometry(track), static_geometry(moved(track, np.array(shift), angle))
     # Cells that tell persistent points from stray ones lie fixed in the map.
     np.testing.assert_allclose(there.size_m, here.size_m, atol=0.08)
     np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=0.08)
     assert apart(there.yaw_rad, here.yaw_rad + angle) < np.deg2rad(1.5)
+    track, yaw = measured(oncoming(12)), np.full(12, np.pi)
+    here, there = moving_geometry(track, yaw), moving_geometry(moved(track, np.array(shift), angle), yaw + angle)
+    np.testing.assert_allclose(there.size_m, here.size_m, atol=1e-4)
+    np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=1e-4)
+    r = rotation_from_rpy(0, 0, angle)[:2, :2]
+    np.testing.assert_allclose(there.covariance, r @ here.covariance @ r.T, atol=1e-4)
 
 
 def test_points_that_one_tick_lent_from_a_neighbor_are_left_out():
@@ -191,17 +197,6 @@ def test_a_long_car_seen_whole_once_is_long_all_along():
     shape = moving_geometry(measured(states, size), np.full(len(states), np.pi))
     assert shape.size_m[0] == pytest.approx(5.4, abs=0.25)
     assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.35
-
-
-@pytest.mark.parametrize(("shift", "angle"), [((5e5, 5e6, 0.0), 0.0), ((10.0, -8.0, 0.0), 2.0)])
-def test_a_moving_shape_moves_and_turns_with_the_map(shift, angle):
-    states = oncoming()
-    track, yaw = measured(states), np.full(len(states), np.pi)
-    here, there = moving_geometry(track, yaw), moving_geometry(moved(track, np.array(shift), angle), yaw + angle)
-    np.testing.assert_allclose(there.size_m, here.size_m, atol=1e-4)
-    np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=1e-4)
-    r = rotation_from_rpy(0, 0, angle)[:2, :2]
-    np.testing.assert_allclose(there.covariance, r @ here.covariance @ r.T, atol=1e-4)
 
 
 def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():

@@ -15,10 +15,10 @@ from scipy.signal import savgol_filter
 from log2sim.datatypes import TAGS, MapFeatures, Scenario
 from log2sim.edit import Remove, edit
 from log2sim.errors import ScenarioError
-from log2sim.geometry import wrap_angle
+from log2sim.geometry import fit_windows, wrap_angle
 from log2sim.scenarios import criticality as c
 from log2sim.scenarios import criticality_table, find_tags, tag
-from log2sim.scenarios.traffic import Traffic, fitted, latched, runs
+from log2sim.scenarios.traffic import Traffic, latched, runs
 
 # What has to be reached on the truth.
 LEAST_F1 = {"cut_in": 0.95, "overtaking": 0.97}
@@ -284,7 +284,7 @@ def test_speeds_and_headings_of_labels_that_jump_are_no_braking_and_no_turning_b
 def test_polynomials_through_windows_are_those_of_savitzky_and_golay(window, order):
     values = np.random.default_rng(5).normal(size=(2, 60)).cumsum(axis=1)
     expected = savgol_filter(values, window, order)
-    np.testing.assert_allclose(fitted(values[0] + 1j * values[1], window, order), expected[0] + 1j * expected[1])
+    np.testing.assert_allclose(fit_windows(values[0] + 1j * values[1], window, order), expected[0] + 1j * expected[1])
     np.testing.assert_allclose(
-        fitted(values[0, :window], window, order), savgol_filter(values[0, :window], window, order)
+        fit_windows(values[0, :window], window, order), savgol_filter(values[0, :window], window, order)
     )

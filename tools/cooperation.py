@@ -84,20 +84,17 @@ def run_overlap(choices: Choices) -> dict[str, Any]:
     """Test C, box by box and as a scenario."""
 
     def measure(world: World, log: Log, way: str, found: Found) -> dict[str, Any]:
-        row = {"scenario": overlap.of_scenario(world, found)}
-        # Tracks join after detection: their boxes are those of each end.
-        return row if way == "tracks" else {**row, "boxes": overlap.from_boxes(world, *detect(log, way))}
+        return {"scenario": overlap.of_scenario(world, found), "boxes": overlap.from_boxes(world, *detect(log, way))}
 
     rows = [r for _, r in measured("overlap", choices, measure)]
     return {
-        of: overlap.figures([{way: r[way][of] for way in choices.ways if of in r[way]} for r in rows])
-        for of in ("boxes", "scenario")
+        of: overlap.figures([{way: r[way][of] for way in choices.ways} for r in rows]) for of in ("boxes", "scenario")
     }
 
 
 def run_ap(choices: Choices) -> dict[str, Any]:
     """AP in random traffic, of all road users that both ends together have points of; too short to register."""
-    rows: dict[str, list[Any]] = {way: [] for way in choices.ways if way != "tracks"}
+    rows: dict[str, list[Any]] = {way: [] for way in choices.ways}
     for seed in choices.seeds:
         view = hidden_traffic.seen(hidden_traffic.draw_hidden_traffic(seed))
         log = choices.disturbed(view.log, seed)

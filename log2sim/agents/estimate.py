@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +14,6 @@ from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
 from log2sim.agents.static import static_candidates
-from log2sim.config import Config
 from log2sim.datatypes import (
     ENDS,
     STANDSTILL_DRIFT_M,
@@ -30,12 +27,9 @@ from log2sim.datatypes import (
     Waypoints,
 )
 from log2sim.files.processes import map_in_processes
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, undistort, yaw_of
-from log2sim.perception.homography_stage import CameraHomography
-from log2sim.perception.records import RecordSource
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, yaw_of
 from log2sim.perception.sync import Schedule
 from log2sim.tracking.forward import MAX_MISSES
-from log2sim.version import __version__
 
 
 def estimate_agents(
@@ -159,6 +153,16 @@ def ego_path(log: Log, schedule: Schedule) -> Array:
     return np.column_stack([poses[:, :2, 3], yaw_of(poses)])
 
 
+def ego_velocity(log: Log, schedule: Schedule) -> Array:
+    """Return the velocity (T, 2) of the ego in the map at every tick, m/s; 0 where it is not known."""
+    if log.ego is None or len(schedule) < 2:
+        return np.zeros((len(schedule), 2))
+    map_T_ego, valid = log.ego.at(schedule.t_ns)
+    xy = np.where(valid[:, None], map_T_ego[:, :2, 3], np.nan)
+    t_s = (schedule.t_ns - schedule.t_ns[0]) / NS_PER_S
+    return np.asarray(np.nan_to_num(np.gradient(xy, t_s, axis=0)), dtype=np.float64)
+
+
 def with_observers(candidate: AgentCandidate, agent: Agent, timeline: Timeline) -> Agent:
     """Return an agent with the spans of time in which each end measured the candidate that it was made of."""
     spans: dict[str, tuple[Span, ...]] = {}
@@ -232,97 +236,3 @@ def _is_linear(t: Array, columns: Array, tolerances: Array, start: int, end: int
     share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])
     line = columns[start] + share[:, None] * (columns[end] - columns[start])
     return bool((np.abs(columns[start + 1 : end] - line) <= tolerances[start + 1 : end]).all())
-
-
-def provenance_of(log: Log, config: Config, detector: str, poses: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a scenario was made from and how: log, version, name of the detector, source of the poses, settings, seed."""
-    return {
-        "log": {"name": log.name, "format": log.format, "digest": log.digest},
-        "log2sim_version": __version__,
-        "detector": detector,
-        "poses": dict(poses),
-        "config": config.to_dict(),
-        "seed": config.seed,
-        "history": ["reconstruct"],
-    }
-
-
-# Neighboring directions of LiDARs are less than a degree apart; a mast next to one hides a few degrees more.
-MIN_BLIND_RAD = math.radians(5.0)
-# Sweeps of which directions are taken, over the whole log.
-VIEW_SWEEPS = 3
-
-
-def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
-    """Return the sensors that are fixed in the map, as a scenario states them.
-
-    A camera looks where the rays of its middle row and column go, a LiDAR where it measured points.
-    """
-    mounts = [(name, "camera", c.mount_T_cam) for name, c in log.cameras.items() if c.mount == "map"]
-    mounts += [(name, "lidar", lidar.mount_T_lidar) for name, lidar in log.lidars.items() if lidar.mount == "map"]
-    entries = []
-    for name, kind, map_T_sensor in mounts:
-        rays_map = (_camera_rays(log, name) if kind == "camera" else _lidar_rays(log, name)) @ map_T_sensor[:3, :3].T
-        yaw_rad, fov_rad = _view_of(np.arctan2(rays_map[:, 1], rays_map[:, 0]))
-        place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
-        look = {"yaw_rad": yaw_rad, "fov_rad": fov_rad, "range_m": range_m}
-        entries.append({"name": name, "kind": kind, **place, **look})
-    return tuple(entries)
-
-
-def _camera_rays(log: Log, name: str) -> Array:
-    """Return rays (N, 3), cam frame, of pixels in the middle row and column that the lens model explains."""
-    camera = log.cameras[name]
-    u, v = np.linspace([0.0, 0.0], [camera.width_px, camera.height_px], 65).T
-    row = np.column_stack([u, np.full_like(u, camera.height_px / 2)])
-    column = np.column_stack([np.full_like(v, camera.width_px / 2), v])
-    xy = undistort(camera, np.concatenate([row, column]))
-    xy = xy[np.isfinite(xy).all(axis=1)]
-    return np.column_stack([xy, np.ones(len(xy))])
-
-
-def _lidar_rays(log: Log, name: str) -> Array:
-    """Return rays (N, 3), lidar frame, to the points of some sweeps of a LiDAR that is fixed in the map."""
-    records, count = RecordSource(log), len(log.streams[name].t_ns)
-    lidar_T_map = inverse(log.lidars[name].mount_T_lidar)
-    rays = [np.zeros((0, 3))]
-    for i in np.unique(np.linspace(0, count, VIEW_SWEEPS, endpoint=False).astype(int))[:count]:
-        sweep = records.get(name, int(i))
-        if sweep is None:
-            continue  # the stages before have reported it
-        xyz = np.asarray(sweep.xyz_m, dtype=np.float64)
-        rays.append(apply(lidar_T_map, xyz) if sweep.frame == "map" else xyz)
-    return np.concatenate(rays)
-
-
-def _view_of(azimuth_rad: Array) -> tuple[float, float]:
-    """Return middle and width, rad, of the narrowest field of view that holds azimuths (N,); all around where there are not two."""
-    azimuth = np.unique(azimuth_rad % (2 * math.pi))
-    if len(azimuth) < 2:
-        return 0.0, 2 * math.pi
-    gap = np.diff(azimuth, append=azimuth[0] + 2 * math.pi)
-    widest = int(gap.argmax())
-    if gap[widest] < MIN_BLIND_RAD:
-        return 0.0, 2 * math.pi
-    middle = azimuth[widest] + gap[widest] / 2 + math.pi
-    return math.remainder(float(middle), 2 * math.pi), float(2 * math.pi - gap[widest])
-
-
-def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:
-    """Return the cameras of a log with their homographies, as a scenario states them."""
-    entries = []
-    for name in log.cameras:
-        ground, homography = homographies.get(name), None
-        if ground is not None and ground.fit.ok:
-            fit = ground.fit
-            homography = {
-                "ground_H_image": fit.ground_H_image.tolist(),
-                "source": ground.source,
-                "inliers": int(fit.inliers.sum()),
-                "correspondences": len(fit.inliers),
-                "error_m": float(fit.error_m) if np.isfinite(fit.error_m) else None,
-                "condition": float(fit.condition),
-                "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
-            }
-        entries.append({"name": name, "used": name in used, "homography": homography})
-    return entries

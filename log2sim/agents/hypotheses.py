@@ -22,11 +22,11 @@ from log2sim.agents.smooth.fixed_interval import (
     marginal_likelihood,
     noise_of,
 )
-from log2sim.datatypes import GROUP_OF, MIN_SIZE_M, TYPICAL_SIZE_M, Track
-from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, MIN_SIZE_M, TYPICAL_SIZE_M, Track
+from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import UNIFORM_SIGMA, rotate
 from log2sim.perception.lidar.clusters import MIN_CLUSTER_POINTS
-from log2sim.tracking.forward import ACCELERATION_MPS2, CENTER_SIGMA_M, CHI2_2DOF_99, FIRST_SPEED_MPS
+from log2sim.tracking.forward import ACCELERATION_MPS2, CENTER_SIGMA_M
 
 # Error of an observed end: rounded corners, gaps between rays.
 END_SIGMA_M = 0.25

@@ -36,9 +36,9 @@ from log2sim.datatypes import (
     Waypoints,
 )
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
-from log2sim.geometry import NS_PER_S, Array, wrap_angle
+from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import align_to
-from log2sim.tracking.forward import CENTER_SIGMA_M, CHI2_2DOF_999
+from log2sim.tracking.forward import CENTER_SIGMA_M
 from log2sim.tracking.tracker import VELOCITY_WINDOW_S, track, velocities
 
 # A probability nearer to 1 is not believed: networks are surer than right.

@@ -24,7 +24,7 @@ from log2sim.config import Config
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import first_problem, read_json, replaced, write_json
 from log2sim.files.outputs import claim, is_left_over, is_temporary, remove, replaced_folder
-from log2sim.version import __version__
+from log2sim.files.version import __version__
 
 MAX_NAME_CHARS = 80  # of a folder; file systems take 255 bytes, and temporary names are longer
 HASH_DIGITS = 8

@@ -40,11 +40,11 @@ from log2sim.files.documents import write_json
 from log2sim.files.inputs import following_links, follows_links
 from log2sim.files.outputs import replaced_folder
 from log2sim.files.stages import peak_memory_mib, thread_limits, usable_threads
+from log2sim.files.version import __version__
 from log2sim.logs.opening import open_log
 from log2sim.perception.run_detectors import check_detectors
 from log2sim.pipeline import reconstruct
 from log2sim.simulation.runner import replay
-from log2sim.version import __version__
 
 if TYPE_CHECKING:
     from distributed import Client, Future

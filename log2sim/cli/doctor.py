@@ -23,7 +23,7 @@ from log2sim.cli import options as opt
 from log2sim.cli.shared import format_rows
 from log2sim.errors import ConfigError, Log2SimError, install_command
 from log2sim.files.plugins import nearest
-from log2sim.version import __version__
+from log2sim.files.version import __version__
 
 if TYPE_CHECKING:
     from log2sim.files.cache import DiskCache

@@ -23,7 +23,7 @@ from log2sim.cli.shared import (
 from log2sim.errors import Log2SimError
 from log2sim.files.inputs import OPTION, following_links
 from log2sim.files.outputs import holding_claims
-from log2sim.version import __version__
+from log2sim.files.version import __version__
 
 INTERRUPTED = 130
 

@@ -138,7 +138,7 @@ def reconstruct(
         "--ends", "both|vehicle|road", "Use only the sensors on the vehicle, or only those at the road.",
         default="both")] = None,
     fusion: Annotated[str | None, opt.choose(
-        "--fusion", "points|boxes|tracks", "What of the vehicle's and the road's LiDARs is joined.",
+        "--fusion", "points|boxes", "What of the vehicle's and the road's LiDARs is joined.",
         default="see log2sim config")] = None,
     corrections: Annotated[Path | None, opt.option(
         "Corrections by hand to apply to the result, see log2sim correct.", "FILE.json")] = None,

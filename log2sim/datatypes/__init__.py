@@ -19,11 +19,13 @@ from log2sim.datatypes.agent_table import AgentTable
 from log2sim.datatypes.categories import (
     CATEGORIES,
     CATEGORY,
+    FIRST_SPEED_MPS,
     GROUP_OF,
     GROUPS,
     MAX_SIZE_M,
     MAX_SPEED_MPS,
     MIN_SIZE_M,
+    RELATED_GROUPS,
     TYPICAL_SIZE_M,
 )
 from log2sim.datatypes.detections import (
@@ -75,9 +77,9 @@ from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Si
 from log2sim.datatypes.tag import TAGS, Tag
 
 __all__ = [
-    "BORDER_KINDS", "CATEGORIES", "CATEGORY", "COLOR_NAMES", "EGO", "ENDS", "GROUPS", "GROUP_OF", "KINDS",
-    "LANE_LINE_KINDS", "LANE_ORIGINS", "MARGIN_S", "MARKING_KINDS", "MAX_SIZE_M", "MAX_SPEED_MPS", "MIN_SIZE_M",
-    "MIN_TRUSTED_CONFIDENCE", "ROAD", "SIGNAL_STATES", "STANDSTILL_DRIFT_M", "STANDSTILL_MPS", "TAGS", "TUPLES",
+    "BORDER_KINDS", "CATEGORIES", "CATEGORY", "COLOR_NAMES", "EGO", "ENDS", "FIRST_SPEED_MPS", "GROUPS",
+    "GROUP_OF", "KINDS", "LANE_LINE_KINDS", "LANE_ORIGINS", "MARGIN_S", "MARKING_KINDS", "MAX_SIZE_M", "MAX_SPEED_MPS", "MIN_SIZE_M",
+    "MIN_TRUSTED_CONFIDENCE", "RELATED_GROUPS", "ROAD", "SIGNAL_STATES", "STANDSTILL_DRIFT_M", "STANDSTILL_MPS", "TAGS", "TUPLES",
     "TYPICAL_SIZE_M", "VEHICLE", "VERSION", "Agent", "AgentTable", "BoxEvidence", "Boxes3D", "Deferred", "Detections",
     "EgoVehicle", "Finding", "Frame", "IgnoreRegions", "ImageLabels", "ImageRegions", "LabelView", "Labels", "Lidar",
     "Log", "MapFeatures", "MapFrame", "MapLane", "Marking", "Measurements", "Obstacles", "OtherView", "Rays",

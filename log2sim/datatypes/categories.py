@@ -70,3 +70,9 @@ TYPICAL_SIZE_M: Mapping[str, Size] = {name: category.typical_size_m for name, ca
 MIN_SIZE_M: Mapping[str, Size] = {name: category.min_size_m for name, category in CATEGORY.items()}
 MAX_SPEED_MPS: Mapping[str, float] = {name: category.max_speed_mps for name, category in CATEGORY.items()}
 MAX_SIZE_M: Mapping[str, Size] = {name: category.max_size_m for name, category in CATEGORY.items()}
+
+# Groups of which a detector takes one for the other now and then: a rider for a pedestrian.
+RELATED_GROUPS = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
+# Standard deviation of the speed of an object of which no more than the group is known. A bicycle without a rider stands, but for
+# those whose rider the detector missed.
+FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0, "bicycle": 1.0}

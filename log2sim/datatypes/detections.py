@@ -200,10 +200,8 @@ class Measurements(BoxEvidence):
         )  # fmt: skip
 
     @classmethod
-    def unplaced(
-        cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array, end: str = ""
-    ) -> Measurements:
-        """Return a row a detection (M,) of a frame of a camera at an end, without LiDAR points and without a position."""
+    def unplaced(cls, detections: Detections, *, t_ns: int, camera: str, sensor_m: Array) -> Measurements:
+        """Return a row a detection (M,) of a frame of a camera, without LiDAR points and without a position."""
         m = len(detections)
         return cls(
             t_ns=np.full(m, t_ns, dtype=np.int64),
@@ -226,7 +224,7 @@ class Measurements(BoxEvidence):
             box_size_m=np.full((m, 3), np.nan),
             box_yaw_rad=np.full(m, np.nan),
             heading_score=np.full(m, np.nan),
-            seen_by=seen_from(end, m),
+            seen_by=seen_from("", m),
             center_m=np.full((m, 3), np.nan),
             covariance=np.full((m, 2, 2), np.nan),
             source=np.full(m, "", dtype="<U16"),

@@ -43,6 +43,14 @@ from log2sim.geometry.rectangles import (
     separating_axes,
     upright_box_iou,
 )
+from log2sim.geometry.statistics import (
+    CHI2_2DOF_99,
+    CHI2_2DOF_999,
+    CHI2_4DOF_999,
+    choose_pairs,
+    fit_windows,
+    weighted_quantile,
+)
 from log2sim.geometry.transforms import (
     NS_PER_S,
     Array,
@@ -58,16 +66,15 @@ from log2sim.geometry.transforms import (
     shift_poses,
     slerp,
     transform,
-    weighted_quantile,
     whole_kilometers,
     wrap_angle,
     yaw_of,
 )
 
 __all__ = [
-    "DISTORTION_LENGTHS", "MIN_DEPTH_M", "NS_PER_S", "Array", "Camera", "Mount", "PoseTrack", "ProjectedBoxes",
-    "RollingShutter", "apply", "apply_homography", "box_corners", "box_corners_bev", "box_iou", "box_lines", "cos_sin",
-    "cross_slab", "distort", "fold_radius", "ground_homography", "homography_jacobian", "inverse", "line_time_s",
+    "CHI2_2DOF_99", "CHI2_2DOF_999", "CHI2_4DOF_999", "DISTORTION_LENGTHS", "MIN_DEPTH_M", "NS_PER_S", "Array", "Camera", "Mount", "PoseTrack", "ProjectedBoxes",
+    "RollingShutter", "apply", "apply_homography", "box_corners", "box_corners_bev", "box_iou", "box_lines", "choose_pairs",
+    "cos_sin", "cross_slab", "distort", "fit_windows", "fold_radius", "ground_homography", "homography_jacobian", "inverse", "line_time_s",
     "nearest_index", "nearest_rotation", "outline", "overlap_of_smaller", "period_of", "points_in_box", "project",
     "project_boxes", "project_moving", "quaternion_from_rotation", "rectangle_iou", "rectangle_overlap",
     "rectangles_overlap", "rotation_from_quaternion", "rotation_from_rpy", "separating_axes", "shift_poses", "slerp",

@@ -35,14 +35,6 @@ def nearest_index(stamps: NDArray[Any], t: ArrayLike) -> NDArray[np.int64]:
 
 Array = NDArray[np.float64]
 
-
-def weighted_quantile(values: Array, weight: Array, share: float) -> float:
-    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
-    order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weight[order])
-    return float(values[order[min(int(np.searchsorted(reached, reached[-1] * share)), len(order) - 1)]])
-
-
 FLOAT32_MILLIMETER_M = 8192.0
 """From here on neighboring float32 values are 1 mm apart."""
 

@@ -143,7 +143,7 @@ def localize(log: Log, config: Config, *, progress: Progress | None = None) -> t
     return _localize(_Request(log, config.poses.source, during_ns(log, config), progress, check=config.poses.check))
 
 
-def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress | None = None) -> Log:
+def localize_like(log: Log, provenance: Mapping[str, Any]) -> Log:
     """Return a log with the poses that something was made with, as its provenance states them under "poses", else its own."""
     entry = provenance.get("poses")
     entry = entry if isinstance(entry, Mapping) else {}
@@ -154,7 +154,7 @@ def localize_like(log: Log, provenance: Mapping[str, Any], *, progress: Progress
     if isinstance(during, Sequence) and len(during) == 2 and all(type(t) is int for t in during):
         window = (int(during[0]), int(during[1]))
     check = entry.get("check") is not False
-    return _localize(_Request(log, source, window, progress or (lambda *_: None), check=check))[0]
+    return _localize(_Request(log, source, window, lambda *_: None, check=check))[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
-from log2sim.geometry import NS_PER_S, Array, rectangle_iou, wrap_angle
+from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import oriented_covariance, rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.boxes import suppress
@@ -30,9 +30,6 @@ from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_de
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.measure import measure
 from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_level, network_for
-from log2sim.tracking.forward import CHI2_2DOF_99, FIRST_SPEED_MPS
-from log2sim.tracking.stitch import choose_pairs
-from log2sim.tracking.tracker import POSE_SIGMA_M
 
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
 # Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
@@ -100,8 +97,8 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
 MIN_CLASS_IOU = 0.3
 # Road users do not share ground: boxes of one group that overlap by more are one object, whatever their errors.
 MIN_GROUP_IOU = 0.1
-# Standard deviation of how the road's sensors are turned after registration, rad.
-POSE_SIGMA_RAD = np.deg2rad(0.3)
+# Standard deviations of where the road's sensors are and how they are turned after registration, m and rad.
+POSE_SIGMA_M, POSE_SIGMA_RAD = 0.1, np.deg2rad(0.3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +150,7 @@ def match_by_overlap(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     i, j = _touching(a, b)
     iou = rectangle_iou(a.take(i).rectangles, b.take(j).rectangles)
     allowed = (iou >= MIN_CLASS_IOU) & (a.boxes.category[i] == b.boxes.category[j])
-    return choose_pairs(i[allowed], j[allowed], 1 - iou[allowed])
+    return _best(i, j, 1 - iou, allowed)
 
 
 def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -171,7 +168,14 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
     overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
     allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
-    return choose_pairs(i[allowed], j[allowed], np.minimum(squared, CHI2_2DOF_99)[allowed])
+    return _best(i, j, np.minimum(squared, CHI2_2DOF_99), allowed)
+
+
+def _best(i: NDArray[np.intp], j: NDArray[np.intp], cost: Array, allowed: NDArray[np.bool_]) -> Pairs:
+    """Choose pairs (P,) one to one, as many as possible and of these the cheapest, among those that are allowed."""
+    i, j = i[allowed], j[allowed]
+    chosen = choose_pairs(i, j, cost[allowed])
+    return i[chosen], j[chosen]
 
 
 def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
@@ -536,8 +540,8 @@ def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     passed_s = np.maximum((b.t_ns[:, None] - a.t_ns) / NS_PER_S, 1.0 / NS_PER_S)
     distance = np.hypot(away[..., 0], away[..., 1])
     allowed = (distance <= MAX_SPEED_MPS * passed_s) & (b.category[:, None] == a.category)
-    first, second = np.nonzero(allowed)
-    i, j = choose_pairs(first, second, distance[allowed])
+    first, second = np.indices(allowed.shape)
+    i, j = _best(first, second, distance, allowed)
     local = rotate(away[i, j], -b.yaw_rad[i])
     speed = local[:, 0] / passed_s[i, j]
     moves = (np.abs(speed) >= MIN_SPEED_MPS) & (np.abs(local[:, 1]) <= MAX_ACROSS_SHARE * np.abs(local[:, 0]))
@@ -567,7 +571,7 @@ class EndsDetector:
 
     vehicle: LidarDetector  # `vehicle`, `road`: for the clouds of each end
     road: LidarDetector | None  # without it the points of both ends are searched together, by the vehicle's
-    method: Method | None  # how boxes of the ends are joined; without it each end keeps its own
+    method: Method | None  # how boxes of the ends are joined; None without a detector of the road's
 
     @property
     def name(self) -> str:
@@ -586,25 +590,18 @@ class EndsDetector:
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in the cloud of each viewpoint and join them; `earlier` clouds are those of the same viewpoint."""
-        if self.road is None:
+        road, method = self.road, self.method
+        if road is None or method is None:
             return refine_by_views(self.vehicle.detect(cloud, earlier), cloud.parts)
-        parts = [self._search(view, earlier) for view in cloud.views]
-        if self.method is None:
-            out = join(parts).boxes
-        else:
-            method = self.method
-            out = reduce(lambda a, b: fuse_boxes(a, b, method), parts).boxes
+        parts = []
+        for view in cloud.views:
+            before = [other for cloud in earlier for other in cloud.views if _is_same_view(view, other)]
+            found = (road if view.end == ROAD else self.vehicle).detect(view, before)
+            found = refine_boxes(found, view) if method.refines else found
+            found = replace(found, seen_by=seen_from(view.end, len(found)))
+            parts.append(SeenBoxes.of(found, view.sensor.astype(np.float64) + view.origin))
+        out = reduce(lambda a, b: fuse_boxes(a, b, method), parts).boxes
         return out.take(np.argsort(-out.score, kind="stable"))
-
-    def _search(self, view: Cloud, earlier: Sequence[Cloud]) -> SeenBoxes:
-        """Search the cloud of one viewpoint."""
-        detector = (self.road if view.end == ROAD else None) or self.vehicle
-        before = [other for cloud in earlier for other in cloud.views if _is_same_view(view, other)]
-        found = detector.detect(view, before)
-        if self.method is not None and self.method.refines:
-            found = refine_boxes(found, view)
-        found = replace(found, seen_by=seen_from(view.end, len(found)))
-        return SeenBoxes.of(found, view.sensor.astype(np.float64) + view.origin)
 
 
 def _is_same_view(one: Cloud, other: Cloud) -> bool:
@@ -629,7 +626,7 @@ def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None
     chosen = config.cooperation.road_detector
     road_name = detector_by_mounting(log, name) if chosen == AUTO else chosen
     road = vehicle if road_name == name else create_lidar_detector(road_name, log, config.lidar)
-    return EndsDetector(vehicle, road, METHODS[config.cooperation.matching] if level is FusionLevel.BOXES else None)
+    return EndsDetector(vehicle, road, METHODS[config.cooperation.matching])
 
 
 def detector_by_mounting(log: Log, name: str) -> str:

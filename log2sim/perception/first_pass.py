@@ -457,15 +457,9 @@ class FirstPass:
             if camera in found and (view := self._view(camera, tick)) is not None:
                 end = end_of(view.camera)
                 frames[end].append((view, found[camera], parts[id(cloud), end]))
-        groups = [(list(chain(*frames.values())), boxes, reference)]
-        if self.plan.fusion is FusionLevel.TRACKS and boxes is not None and boxes.seen_by is not None:
-            groups = [
-                (frames[end], boxes.take(seen), parts[id(reference), end]) for end, seen in zip(ENDS, boxes.seen_by.T)
-            ]
-        rows = Measurements.join([
-            measure(shown, None if of is None else outside_ego(self.log, of), cloud, mode=settings.mode)
-            for shown, of, cloud in groups
-        ])  # fmt: skip
+        shown = list(chain(*frames.values()))
+        boxes = None if boxes is None else outside_ego(self.log, boxes)
+        rows = measure(shown, boxes, reference, mode=settings.mode)
         origin, _ = cloud_origin(self.log, int(self.schedule.t_ns[tick]))
         with np.errstate(invalid="ignore"):  # of rows without a position, which a homography may still place
             far = np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > settings.max_range_m

@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ENDS, GROUP_OF, TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
 from log2sim.files.arrays import array_lengths
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import CHI2_2DOF_99, NS_PER_S
 from log2sim.perception.boxes import fit_extents, place_boxes, provisional_sizes, rotate, top_of
-from log2sim.plan import FusionLevel, Plan, Stage
-from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Clusters are one object when this share of the points of either is inside the extents of the other.
 MIN_SHARED_POINTS = 0.4
@@ -24,14 +22,6 @@ MIN_DRIVER_SHARE = 0.8
 TRUNCATED_SCORE_FACTOR = 0.7
 # What a detector in LiDAR sweeps adds to a row.
 BOX_COLUMNS = ("box_center_m", "box_size_m", "box_yaw_rad", "heading_score")
-
-
-def fuse_by_end(placed: Sequence[Measurements], plan: Plan) -> list[list[Measurements]]:
-    """Fuse what is tracked together, by tick: of each end where its tracks are joined later, else of all sensors."""
-    across = plan.keeps(Stage.FUSION) or plan.keeps(Stage.FUSION_WITH_LIDAR)
-    if plan.fusion is not FusionLevel.TRACKS:
-        return [fuse(placed, across=across)]
-    return [fuse([rows.take(rows.seen_by[:, k]) for rows in placed], across=across) for k in range(len(ENDS))]
 
 
 def fuse(measurements: Sequence[Measurements], *, across: bool = True) -> list[Measurements]:

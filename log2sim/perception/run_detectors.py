@@ -11,12 +11,13 @@ import numpy as np
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Labels, Log
 from log2sim.files import plugins
+from log2sim.files.cache import DiskCache
 from log2sim.files.plugins import DETECT_IN_CLOUD, find_call_defect
 from log2sim.perception.cooperative import create_for_ends
 from log2sim.perception.detect.detectors import CheckedDetector, Detector, FunctionDetector, checked, create_detector
 from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
 from log2sim.perception.detect3d.detectors import checked as checked_lidar
-from log2sim.perception.first_pass_cache import FirstPassCache, open_cache
+from log2sim.perception.run_cache import FirstPassCache, open_cache
 
 EXPECTED = (
     "a function of a picture that returns rows, an object with name, default_min_score and detect(frame) or, for LiDAR "
@@ -111,14 +112,14 @@ class Detectors:
         return "+".join(detector.name for detector in (self.images, self.sweeps) if detector is not None)
 
 
-def create_detectors(log: Log, config: Config, given: GivenDetectors, *, cache: bool = True) -> Detectors:
+def create_detectors(log: Log, config: Config, given: GivenDetectors, *, store: DiskCache | None = None) -> Detectors:
     """Create the detectors that the settings name, but for those that were given.
 
-    `cache`: whether what earlier runs of the first pass found is taken from the user's cache, and kept there.
+    `store`: where what earlier runs of the first pass found is taken from, and kept.
     """
     images = given.images or create_image_detector(log, config) if config.detect.in_images else None
     sweeps = create_for_ends(log, config, given.sweeps) if config.detect.in_sweeps else None
-    return Detectors(images, sweeps, open_cache(images, sweeps) if cache else None)
+    return Detectors(images, sweeps, open_cache(store, images, sweeps))
 
 
 def create_image_detector(log: Log, config: Config) -> Detector:

@@ -170,11 +170,6 @@ class Predictions:
         k = next((k for k, a in enumerate(self.table.agents) if a.id == agent), -1)
         return np.flatnonzero(self.row == k)
 
-    def rows_at(self, t_s: float) -> NDArray[np.intp]:
-        """Return the indices (K,) of the predictions made at the last tick up to a time."""
-        ticks = self.table.t_s
-        return np.flatnonzero(self.tick == np.searchsorted(ticks, t_s + self.table.tick_s * 1e-3, side="right") - 1)
-
 
 def leads_of(horizon_s: float) -> Array:
     """Return the leads (H,), s, up to a horizon, which is rounded to ticks: every `LEAD_STEP_S`, and the horizon itself.

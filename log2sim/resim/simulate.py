@@ -21,6 +21,7 @@ from log2sim.perception.records import RecordSource
 from log2sim.resim.cameras import Image, Pictures
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, poses_of, rays_in_map, recorded_shots
+from log2sim.resim.sightings import with_sightings
 from log2sim.resim.surfels import Surfels
 from log2sim.resim.world import Progress, World, body_of, build_world, place
 from log2sim.simulation.policy import Controls, Observation, Policy, reset_policy
@@ -115,10 +116,21 @@ class Simulation:
         rays = rays_in_map(shots, poses, moment)
         placed = place(self.world, self.scenario, rays, self.agents)
         met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
-        hits = first_hits(met, placed.surfels, len(shots.t_ns), rng)
+        met, surfels = with_sightings(
+            met,
+            placed.surfels,
+            first=placed.first,
+            ids=placed.ids,
+            rays=rays,
+            scenario=self.scenario,
+            sightings=self.world.sightings,
+        )
+        hits = first_hits(met, surfels, len(shots.t_ns), rng)
         back = rng.random(len(shots.t_ns), dtype=np.float32) < hits.returned
         back &= hits.range_m < model.max_range_m
-        distance = hits.range_m[back] + model.noise_m * rng.standard_normal(int(back.sum()), dtype=np.float32)
+        # Ranges of sightings have their noise.
+        noise_m = np.where(hits.surfel[back] < len(placed.surfels), np.float32(model.noise_m), np.float32(0))
+        distance = hits.range_m[back] + noise_m * rng.standard_normal(int(back.sum()), dtype=np.float32)
         intensity = None
         if np.isfinite(model.intensity):
             intensity = np.clip(hits.intensity[back] * model.intensity, 0, model.max_intensity).astype(np.float32)

@@ -32,6 +32,7 @@ from log2sim.resim.rays import (
     rays_in_map,
     recorded_shots,
 )
+from log2sim.resim.sightings import Sighting, frame_at, is_non_rigid, sighting
 from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
 from log2sim.synth import shapes
 
@@ -78,6 +79,8 @@ class World:
     background : Surfels
     agents : mapping of str to Surfels
         By id, in the frame of the agent.
+    sightings : mapping of str to list of Sighting
+        Of people and riders, by id.
     models : mapping of str to Model
         By LiDAR.
     notes : tuple of str
@@ -89,6 +92,7 @@ class World:
     refined: PoseTrack | None
     background: Surfels
     agents: Mapping[str, Surfels]
+    sightings: Mapping[str, list[Sighting]]
     models: Mapping[str, Model]
     notes: tuple[str, ...]
 
@@ -187,6 +191,7 @@ def build_world(
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
     background, own = SurfelGrid(), {agent.id: SurfelGrid() for agent in scenario.others}
+    sightings: dict[str, list[Sighting]] = {agent.id: [] for agent in scenario.others if is_non_rigid(agent)}
     refined = refine_poses(log)
     surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
@@ -206,7 +211,9 @@ def build_world(
                 scale = float(known.mean()) if len(known) and known.mean() > 0 else np.nan
                 top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
             far = max(far, float(shots.range_m.max()))
-            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, own))
+            noise.append(
+                _add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, own, sightings)
+            )
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
         if name in models:
             level = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
@@ -221,7 +228,7 @@ def build_world(
     notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
     standing = background.surfels()
     standing = joined([standing, *(ground_below(a, standing, shift) for a in scenario.others if a.static)])
-    world = World(shift, log.ego if refined is not None else None, refined, standing, agents, models, notes)
+    world = World(shift, log.ego if refined is not None else None, refined, standing, agents, sightings, models, notes)
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
     for _ in range(2):
@@ -285,6 +292,7 @@ def _add_sweep(
     shift: Array,
     background: SurfelGrid,
     own: Mapping[str, SurfelGrid],
+    sightings: Mapping[str, list[Sighting]],
 ) -> float:
     """Share out the points of a sweep to the background and the agents; return the noise of its ranges, m."""
     surface = local_surface(shots, pattern)
@@ -295,7 +303,7 @@ def _add_sweep(
     intensity = (shots.intensity / scale).astype(np.float32)
     free = ~_on_ego(log, name, shots, points)
     t_s = (shots.t_ns - scenario.t0_ns) / NS_PER_S
-    middle_s = np.array([t_s.mean()])
+    middle_s, people = np.array([t_s.mean()]), list[tuple[Agent, NDArray[np.intp]]]()
     for agent in scenario.others:
         half = np.array(agent.size_m) / 2
         x, y, _, _, speed = (v[0] for v in agent.trajectory.at(middle_s))
@@ -319,6 +327,10 @@ def _add_sweep(
         if len(rows):
             axes = local(normal[near])[taken].astype(np.float32)
             own[agent.id].add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
+            if agent.id in sightings:
+                people.append((agent, rows))
+    if people:
+        _add_sightings(log, scenario, name, all_shots(shots, pattern), pattern, scale, people, sightings)
     poses, moment, _ = poses_of(surveyed, name, shots.t_ns[free])
     rotation = poses[moment, :3, :3]
     points = np.einsum("nij,nj->ni", rotation, shots.direction[free] * shots.range_m[free, None])
@@ -326,6 +338,36 @@ def _add_sweep(
     normal = np.einsum("nij,nj->ni", rotation, surface.normal[free])
     background.add(points, normal.astype(np.float32), surface.radius_m[free], intensity[free])
     return surface.noise_m
+
+
+def _add_sightings(
+    log: Log,
+    scenario: Scenario,
+    name: str,
+    shots: Shots,
+    pattern: Pattern,
+    scale: float,
+    people: list[tuple[Agent, NDArray[np.intp]]],
+    sightings: Mapping[str, list[Sighting]],
+) -> None:
+    """Add what the rays of a sweep, those that did not come back included, met around agents, of which rows of `shots` are."""
+    poses, moment, _ = poses_of(log, name, shots.t_ns)
+    direction = np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction)
+    intensity = (shots.intensity / scale).astype(np.float32)
+    cell_rad = np.array([pattern.step_rad, pattern.gap_rad])
+    for agent, rows in people:
+        middle = rows[len(rows) // 2]
+        t_s = (int(shots.t_ns[middle]) - scenario.t0_ns) / NS_PER_S
+        agent_R_map, center = frame_at(agent, t_s)
+        view = agent_R_map @ (poses[moment[middle], :3, 3] - center)
+        on = np.zeros(len(shots.t_ns), dtype=bool)
+        on[rows] = True
+        half = np.array(agent.size_m) / 2
+        seen = sighting(
+            t_s, view, direction @ agent_R_map.T, range_m=shots.range_m, on=on, intensity=intensity, half_m=half, cell_rad=cell_rad
+        )  # fmt: skip
+        if seen is not None:
+            sightings[agent.id].append(seen)
 
 
 def _on_ego(log: Log, name: str, shots: Shots, points: Array) -> NDArray[np.bool_]:

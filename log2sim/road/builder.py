@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -180,6 +181,12 @@ class GroundMapBuilder:
         self._standing: dict[str, tuple[View, StandingPictures]] = {}
         self._colors = ColorRaster(self.raster) if any(len(i) for i in self._frames.values()) else None
 
+    def inputs(self) -> list[Any]:
+        """Return what the map depends on besides the log: its cells, which records it takes, what is known of them, and road users."""
+        known = [self._records.watch.known(name) for name in (*self._log.cameras, *self._log.lidars)]
+        places = [self.raster.resolution_m, self.raster.extent_m, self._anchors, self._z0_m, self.notes]
+        return [*places, self._frames, self._sweeps, known, *self._users.inputs()]
+
     def frames(self) -> Mapping[str, NDArray[np.int64]]:
         """Return the indices of the frames that the map is made of, by camera."""
         return self._frames
@@ -203,9 +210,9 @@ class GroundMapBuilder:
         if warp is None:
             return
         kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
-        kept &= self._likely_ground[warp.rows, warp.columns] > 0
+        kept &= self._likely_ground.ravel().take(warp.cell) > 0
         if view.camera.mount == "ego":
-            kept &= ~covered([self._users.ego_at(view.t_ns)], self.raster, warp.rows, warp.columns)
+            kept &= ~covered([self._users.ego_at(view.t_ns)], self.raster, warp.cell)
             hiding = self._hiding_at(view.t_ns)
             if hiding is not None:
                 kept &= ~find_hidden(view, warp, hiding)
@@ -305,7 +312,8 @@ class GroundMapBuilder:
         away = cv2.distanceTransform((~surface.known & ~blind).astype(np.uint8), cv2.DIST_L2, 3)
         near = (away * surface.raster.resolution_m <= MAX_AWAY_M).astype(np.uint8)
         factor = round(surface.raster.resolution_m / self.raster.resolution_m)
-        return np.repeat(np.repeat(near, factor, axis=0), factor, axis=1)
+        rows, columns = self.raster.shape
+        return np.ascontiguousarray(np.repeat(np.repeat(near, factor, axis=0), factor, axis=1)[:rows, :columns])
 
     def _hiding_at(self, t_ns: int) -> Array | None:
         """Return points (H, 3), m, map frame, of what stood above the ground at a time; None where no sweep is near."""

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from log2sim.config import MapConfig
-from log2sim.datatypes import Log, MapFeatures, Scenario, Signal
+from log2sim.datatypes import Log, MapFeatures, Marking, RoadBorder, Scenario, Signal
 from log2sim.errors import LogError
 from log2sim.files.processes import in_background
 from log2sim.files.stages import StageClock
@@ -23,6 +23,7 @@ from log2sim.localization.replaced import replace_poses
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import give_pictures
 from log2sim.perception.records import RecordSource
+from log2sim.perception.run_cache import StageCache
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
@@ -39,6 +40,7 @@ def describe(
     *,
     settings: MapConfig,
     for_map: PoseTrack | None,
+    earlier: StageCache | None,
     jobs: int,
     clock: StageClock,
     progress: Callable[[str, int, int], None],
@@ -46,7 +48,8 @@ def describe(
     """Add what the plan keeps of lanes, colors and traffic lights to a scenario; with what the stages did, and figures of the report.
 
     `observations`: what the first pass found of the records. `for_map`: poses by which the ground is drawn, None for those of the
-    log. `jobs`: with more than one, vehicles and lights are looked at in a process of their own while the ground is drawn.
+    log. `earlier`: where maps of earlier runs are known. `jobs`: with more than one, vehicles and lights are looked at in a process of
+    their own while the ground is drawn.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if for_map is None else replace_poses(log, for_map)
@@ -60,13 +63,11 @@ def describe(
     look = partial(_appearance, scenario, log, plan, observations, records)
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         if builder is not None:
-            with clock.stage("pictures", progress):
-                give_pictures(records, [builder], lambda done, total: progress("pictures", done, total))
-            with clock.stage("lanes", progress):
-                ground = builder.build()
-                markings, borders, notes = find_markings(ground)
-                features = MapFeatures(markings, borders, notes=(*ground.notes, *notes))
-                features = features.moved(lambda points_m: place_as_given(points_m, drawn, log))
+            draw, of = partial(_draw, builder, records, clock, progress), [*builder.inputs(), drawn.ego]
+            features = (
+                draw() if earlier is None else earlier.known("map", log, of, (MapFeatures, Marking, RoadBorder), draw)
+            )
+            features = features.moved(lambda points_m: place_as_given(points_m, drawn, log))
         if features is not None:
             with clock.stage("lanes", progress):
                 lanes, notes = infer_lanes(features.markings, features.borders, scenario)
@@ -88,6 +89,18 @@ def describe(
         "signals": len(signals),
     }
     return described, decisions, figures
+
+
+def _draw(
+    builder: GroundMapBuilder, records: RecordSource, clock: StageClock, progress: Callable[[str, int, int], None]
+) -> MapFeatures:
+    """Draw the ground and find markings and borders on it."""
+    with clock.stage("pictures", progress):
+        give_pictures(records, [builder], lambda done, total: progress("pictures", done, total))
+    with clock.stage("lanes", progress):
+        ground = builder.build()
+        markings, borders, notes = find_markings(ground)
+        return MapFeatures(markings, borders, notes=(*ground.notes, *notes))
 
 
 def _appearance(

@@ -420,8 +420,8 @@ def _lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
     flat = Surface(raster, np.zeros(raster.shape, np.float32), np.ones(raster.shape, bool))
     warp = warp_onto(View(camera, camera.mount_T_cam), flat, 0.0, raster, COARSEST_M)
     if warp is not None:
-        color[warp.rows, warp.columns] = sample_at(image_bgr, warp.u, warp.v, warp.scale)
-        alpha[warp.rows, warp.columns] = np.rint(255 * warp.opacity)
+        color.reshape(-1, 3)[warp.cell] = sample_at(image_bgr, warp.u, warp.v, warp.scale)
+        alpha.reshape(-1)[warp.cell] = np.rint(255 * warp.opacity)
     ground = GroundMap(color, alpha, unknown, unknown, raster.resolution_m, raster.extent_m)
     return keep_road(ground, float(x), float(y))
 

@@ -45,6 +45,8 @@ MAX_LANE_LINE_WIDTH_M = 0.35
 ALONE = -1.0  # log-odds of a stop line beside which no lane line is seen
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
 MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
+# A plain stroke fills its rectangle, also where it is blurred; an arrow of as many widths length half of it.
+PLAIN_SHARE, PLAIN_ASPECT = 0.6, 6.0
 MAX_SYMBOLS, SYMBOL_STEP_M, SAME_SYMBOL_M = 3, 20.0, 0.3  # in a row, from one to the next, and parts of one
 MAX_ACROSS_M = 2.5  # within a lane
 ROAD_AROUND_M = 4.0  # whose mean is nearly that of the road
@@ -230,7 +232,7 @@ def _outline_around(ground: GroundMap, line: PaintedLine, xy: Array) -> Array | 
     fits = MIN_SYMBOL_M2 <= area <= MAX_SYMBOL_M2 and extent.max() <= MAX_SYMBOL_M and extent.min() <= MAX_ACROSS_M
     if not fits or len(contour) < 4:
         return None
-    if extent.min() < 0.3 and area > 0.7 * extent.prod():  # a plain stroke
+    if area > PLAIN_SHARE * extent.prod() and (extent.min() < 0.3 or extent.max() > PLAIN_ASPECT * extent.min()):
         return None
     simple = cv2.approxPolyDP(contour, OUTLINE_ERROR_M / res, True).reshape(-1, 2).astype(np.float64)
     outline = np.stack(

@@ -65,8 +65,7 @@ Pixel = TypeVar("Pixel", np.uint8, np.float32)
 class Warp:
     """Where the cells of a map that are in view appear in a picture, N cells."""
 
-    rows: NDArray[np.int64]  # `rows`, `columns`: (N,): of the cells in the map
-    columns: NDArray[np.int64]
+    cell: NDArray[np.int64]  # (N,): number of the cell in the map, row by row
     u: NDArray[np.float32]  # `u`, `v`: (N,), px
     v: NDArray[np.float32]
     scale: NDArray[np.float32]  # (N,): pixels along a cell's edge, geometric mean of both directions
@@ -75,7 +74,8 @@ class Warp:
 
     def take(self, kept: NDArray[np.bool_]) -> Warp:
         """Choose cells by a mask (N,)."""
-        return Warp(*(getattr(self, f.name)[kept] for f in fields(self)))
+        chosen = np.flatnonzero(kept)
+        return Warp(*(getattr(self, f.name).take(chosen) for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,14 +125,15 @@ def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster, coarses
         min(columns.stop * factor, raster.shape[1]) - columns.start * factor,
     )
     fine_opacity = upsample(opacity, factor, shape)
-    row, column = np.nonzero(fine_opacity > MIN_OPACITY)
+    seen = np.flatnonzero(fine_opacity > MIN_OPACITY)
     nodes = np.where(np.isfinite(uv), uv, -1e4).astype(np.float32)
     u, v, fine_scale, fine_depth = (
-        upsample(np.ascontiguousarray(layer, np.float32), factor, shape)[row, column]
+        upsample(np.ascontiguousarray(layer, np.float32), factor, shape).ravel().take(seen)
         for layer in (nodes[..., 0], nodes[..., 1], scale, depth)
     )
-    place = (row + rows.start * factor, column + columns.start * factor)
-    return Warp(*place, u, v, fine_scale, fine_opacity[row, column], fine_depth)
+    corner = rows.start * factor * raster.shape[1] + columns.start * factor
+    cell = seen // shape[1] * raster.shape[1] + seen % shape[1] + corner
+    return Warp(cell, u, v, fine_scale, fine_opacity.ravel().take(seen), fine_depth)
 
 
 def _window(view: View, surface: Surface, z0_m: float, coarsest_m: float) -> tuple[slice, slice] | None:
@@ -250,14 +251,13 @@ class ColorRaster:
         """Add a picture of a camera, as far as a warp shows it."""
         color = sample_at(image, warp.u, warp.v, warp.scale).astype(np.float32)
         weight = warp.opacity * np.minimum(warp.scale, MAX_SCALE) ** 4
-        cell = warp.rows * self.raster.shape[1] + warp.columns
-        gain = self._gain(camera, color, weight, warp, cell)
+        gain = self._gain(camera, color, weight, warp)
         color *= weight[:, None] * gain.astype(np.float32)
         # Each cell is there once.
-        self._sum.reshape(-1, 3)[cell] += color
-        self._weight.reshape(-1)[cell] += weight
+        self._sum.reshape(-1, 3)[warp.cell] += color
+        self._weight.reshape(-1)[warp.cell] += weight
         opacity = self._opacity.reshape(-1)
-        opacity[cell] = np.maximum(opacity[cell], np.rint(255 * warp.opacity).astype(np.uint8))
+        opacity[warp.cell] = np.maximum(opacity.take(warp.cell), np.rint(255 * warp.opacity).astype(np.uint8))
 
     def image(self) -> tuple[Image, Image]:
         """Return colors (R, C, 3) and opacity (R, C)."""
@@ -274,12 +274,11 @@ class ColorRaster:
         color: NDArray[np.float32],
         weight: NDArray[np.float32],
         warp: Warp,
-        cell: NDArray[np.int64],
     ) -> Array:
         """Gains (3,) of a picture's channels that fit it to what is mapped so far."""
-        some = np.flatnonzero(
-            (warp.rows % STEP == 0) & (warp.columns % STEP == 0) & (warp.opacity > MIN_COMMON_OPACITY) & (weight > 0)
-        )
+        cell, width = warp.cell, self.raster.shape[1]
+        some = np.flatnonzero((warp.opacity > MIN_COMMON_OPACITY) & (weight > 0))
+        some = some[(cell[some] // width % STEP == 0) & (cell[some] % width % STEP == 0)]
         some = some[self._opacity.reshape(-1)[cell[some]] > 255 * MIN_COMMON_OPACITY]
         some = some[np.all((color[some] > DARKEST) & (color[some] < BRIGHTEST), axis=1)]
         last = self.gains.setdefault(camera, [])

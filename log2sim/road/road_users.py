@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,6 +48,10 @@ class RoadUsers:
         t_s = (self._t_ns - scenario.t0_ns) / NS_PER_S
         self._rows = np.stack([_rows_of(agent, t_s) for agent in self._agents], axis=1) if self._agents else None
         self._ego = _ego_rows(log, self._t_ns)
+
+    def inputs(self) -> list[Any]:
+        """Return all boxes at all times, and who never moves."""
+        return [self._t_ns, self._rows, [agent.static for agent in self._agents], self._ego]
 
     def at(self, t_ns: int) -> Boxes:
         """Return the boxes of the agents that are there at one of the times, without the ego's."""
@@ -111,16 +116,15 @@ def draw_footprints(
     return mask
 
 
-def covered(
-    boxes: Sequence[Boxes], raster: Raster, rows: NDArray[np.int64], columns: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Tell which cells (N,) of a raster are under boxes; takes the time of the part that they are in, however large the raster is."""
-    if not len(rows):
+def covered(boxes: Sequence[Boxes], raster: Raster, cell: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which cells (N,), counted row by row, are under boxes; takes the time of the part that they are in, however large the raster."""
+    if not len(cell):
         return np.zeros(0, dtype=bool)
+    rows, columns = np.divmod(cell, raster.shape[1])
     corner = (int(rows.min()), int(columns.min()))
     shape = (int(rows.max()) - corner[0] + 1, int(columns.max()) - corner[1] + 1)
     mask = draw_footprints(boxes, raster, corner, shape)
-    return np.asarray(mask[rows - corner[0], columns - corner[1]] > 0)
+    return np.asarray(mask.ravel().take((rows - corner[0]) * shape[1] + columns - corner[1]) > 0)
 
 
 def draw_outlines(boxes: Boxes, camera: Camera, map_T_cam: Array) -> NDArray[np.uint8]:

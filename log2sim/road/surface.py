@@ -90,7 +90,7 @@ def take_sweep(
     near = near[:: -(-len(near) // most)] if len(near) > most else near
     cell, inside = raster.index_of(xyz[near, :2])
     near, cell = near[inside], cell[inside]
-    near = near[~covered(users, raster, *np.divmod(cell, raster.shape[1]))]
+    near = near[~covered(users, raster, cell)]
     away = (xyz[near] - sensor) @ (map_T_lidar[0, :3, :3] if known[0] else np.eye(3))
     range_m = np.linalg.norm(away, axis=1)
     usable = range_m > 0

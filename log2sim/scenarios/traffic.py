@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import STANDSTILL_MPS, Agent, MapLane, Scenario
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, fit_windows, wrap_angle
 from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
 from log2sim.prediction.prediction import MOVING, drift_variance
 from log2sim.road.polyline import Polyline
@@ -228,7 +228,7 @@ class Traffic:
             rows = np.flatnonzero(np.isfinite(self.course_rad[k]))
             window = min(round(LANE_CHANGE_S / TICK_S) | 1, len(rows) - (len(rows) + 1) % 2)
             if window > 2:
-                own = fitted(np.unwrap(self.course_rad[k, rows]), window, 1)
+                own = fit_windows(np.unwrap(self.course_rad[k, rows]), window, 1)
                 road[k, rows] = np.where(np.isnan(road[k, rows]), own, road[k, rows])
             for lane in np.unique(self.lane_of[k][self.lane_of[k] >= 0]).tolist():
                 inside = np.flatnonzero(self.lane_of[k] == lane)
@@ -240,7 +240,7 @@ class Traffic:
         for k in np.flatnonzero(self.wheeled).tolist():
             rows = np.flatnonzero(np.isfinite(drift[k]))
             if len(rows) > DRIFT_TICKS:
-                drift[k, rows] = fitted(drift[k, rows], DRIFT_TICKS, 1)
+                drift[k, rows] = fit_windows(drift[k, rows], DRIFT_TICKS, 1)
         return drift
 
     def _common_course(self) -> Array:
@@ -340,26 +340,9 @@ def smoothed(table: MotionTable) -> tuple[Complex, Complex]:
             window = min(2 * round(half_s / TICK_S) + 1, len(rows) - (len(rows) + 1) % 2)
             if window > 3:
                 start = place[k, rows[0]]
-                place[k, rows] = start + fitted(place[k, rows] - start, window, 2)
-                velocity[k, rows] = fitted(velocity[k, rows], window, 2)
+                place[k, rows] = start + fit_windows(place[k, rows] - start, window, 2)
+                velocity[k, rows] = fit_windows(velocity[k, rows], window, 2)
     return place, velocity
-
-
-def fitted(values: Array | Complex, window: int, order: int) -> Any:
-    """Replace values by those of the polynomial through the window around each; at either end, of the last whole window.
-
-    Savitzky and Golay (1964): `scipy.signal.savgol_filter`, which fits both ends anew for each call.
-    """
-    half, projection = window // 2, _projection(window, order)
-    inside = np.convolve(values, projection[half, ::-1], "valid")
-    return np.concatenate([projection[:half] @ values[:window], inside, projection[half + 1 :] @ values[-window:]])
-
-
-@cache
-def _projection(window: int, order: int) -> Array:
-    """Matrix (W, W) from values to those of the polynomial nearest to them."""
-    q = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, window), order + 1))[0]
-    return np.asarray(q @ q.T)
 
 
 def out_of_sight(seen: Mask) -> list[tuple[int, Index]]:

@@ -9,19 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, GROUPS, Measurements
-from log2sim.geometry import NS_PER_S, Array, period_of
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, RELATED_GROUPS, Measurements
+from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, period_of
 
-# By degrees of freedom and probability: 99 % and 99.9 %.
-CHI2_2DOF_99 = 9.21
-CHI2_2DOF_999 = 13.8
-CHI2_4DOF_999 = 18.5
-
-
-# Standard deviations of the initial velocity and of the change of the velocity in 1 s, by group. A bicycle without a rider
-# stands, but for those whose rider the detector missed.
-FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0, "bicycle": 1.0}
+# Standard deviation of the change of the velocity in 1 s, by group.
 ACCELERATION_MPS2 = {"vehicle": 2.5, "two_wheeler": 1.5, "pedestrian": 1.0, "other": 1.5}
+# Of the vehicles and riders that move so many drive about as fast as the ego, and as many towards it as fast: about its velocity and
+# about that turned round theirs spreads as it does about standstill. Where the ego is slow, all three are one.
+ON_ROAD, FLOW_SHARE = ("vehicle", "two_wheeler"), 1 / 3
 # A vehicle moves along its axis: lateral share of the initial velocity.
 ACROSS_SHARE = {"vehicle": 0.4, "two_wheeler": 0.4, "pedestrian": 1.0, "other": 1.0, "bicycle": 0.4}
 # Displacement of the box center when other sides of the object become visible.
@@ -102,7 +97,6 @@ def first_velocity(axis_rad: Array, groups: NDArray[Any]) -> Array:
 NOT_ALLOWED = 1e6
 # A rider is taken for a pedestrian now and then and the other way round; it costs as much as 2.4 sigma.
 OTHER_GROUP_COST = 6.0
-RELATED = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
 # A bicycle without a rider stands while riders pass it; one whose rider a detection missed costs as much as 2 sigma. Of bicycles
 # that look so nearly all are parked.
 RIDERLESS_COST, RIDERLESS_STANDING_PRIOR = 4.0, 0.95
@@ -127,8 +121,9 @@ _NAMES = tuple(GROUPS)
 _NAME_ARRAY = np.array(_NAMES)
 _INDEX = {category: _NAMES.index(group) for category, group in GROUP_OF.items()}
 _ACCELERATION = np.array([ACCELERATION_MPS2[g] for g in _NAMES])
+_ON_ROAD = np.isin(_NAMES, ON_ROAD)
 _GROUP_COST = np.array([
-    [0.0 if a == b else OTHER_GROUP_COST if (a, b) in RELATED else NOT_ALLOWED for b in _NAMES] for a in _NAMES
+    [0.0 if a == b else OTHER_GROUP_COST if (a, b) in RELATED_GROUPS else NOT_ALLOWED for b in _NAMES] for a in _NAMES
 ])  # fmt: skip
 
 Index = NDArray[np.intp]
@@ -136,17 +131,27 @@ _Costs = tuple[Array, Array, NDArray[np.bool_]]
 
 
 def track_forward(
-    measurements: Sequence[Measurements], t_ns: NDArray[np.int64], *, birth_score: float, whole_boxes: bool = False
+    measurements: Sequence[Measurements],
+    t_ns: NDArray[np.int64],
+    *,
+    birth_score: float,
+    whole_boxes: bool = False,
+    flow_mps: Array | None = None,
 ) -> list[tuple[Index, Index]]:
-    """Assign the measurements of T ticks (stamps (T,)) to tracks, in the order of their births: the ticks and rows (n,) of each."""
+    """Assign the measurements of T ticks (stamps (T,)) to tracks, in the order of their births: the ticks and rows (n,) of each.
+
+    `flow_mps`: (T, 2): velocity of the ego in the map, by which others drive that are first seen; zeros without.
+    """
     if not len(measurements):
         return []
     tracker = ForwardTracker(birth_score=birth_score, period_s=period_of(t_ns), whole_boxes=whole_boxes)
     count = [len(found) for found in measurements]
     everything = _Columns.of(Measurements.join(measurements), np.repeat(t_ns, count), whole_boxes=whole_boxes)
     first = np.searchsorted(everything.row, np.cumsum([0, *count]))
+    flow = np.zeros((len(t_ns), 2)) if flow_mps is None else flow_mps
     log = [
-        tracker.advance(everything.take(slice(first[k], first[k + 1])), int(now_ns)) for k, now_ns in enumerate(t_ns)
+        tracker.advance(everything.take(slice(first[k], first[k + 1])), int(now_ns), flow[k])
+        for k, now_ns in enumerate(t_ns)
     ]
     rows, number = (np.concatenate(column) for column in zip(*log))
     ticks = np.repeat(np.arange(len(log)), [len(taken) for taken, _ in log])
@@ -196,14 +201,15 @@ class ForwardTracker:
         """
         return self.advance(_Columns.of(found, np.full(len(found), now_ns), whole_boxes=self.whole_boxes), now_ns)
 
-    def advance(self, columns: _Columns, now_ns: int) -> tuple[Index, Index]:
-        """Do what `step` does, with the columns of a tick."""
+    def advance(self, columns: _Columns, now_ns: int, flow_mps: Array | None = None) -> tuple[Index, Index]:
+        """Do what `step` does, with the columns of a tick and the velocity of the ego (2,)."""
         self._predict(now_ns)
         if len(columns.row) == 0:
             return columns.row, np.zeros(0, dtype=np.intp)
         strong = columns.score >= self.birth_score
-        costs = self._costs(columns)
+        costs, flows = self._costs(columns, np.zeros(2) if flow_mps is None else flow_mps, now_ns)
         tracks, taken = self._choose(columns, strong, costs)
+        self.mean[tracks] += flows[tracks, taken]
         self._update(tracks, columns, taken, costs)
         self.seen_ns[tracks] = now_ns
         self.hits[tracks] += 1
@@ -265,14 +271,32 @@ class ForwardTracker:
         tracks, taken = (np.concatenate(c) for c in zip(*chosen))
         return tracks, taken
 
-    def _costs(self, columns: _Columns) -> _Costs:
-        """Return minus twice the log-likelihoods (A, M) if tracks move, if they stand, and which are inside a gate."""
+    def _costs(self, columns: _Columns, flow_mps: Array, now_ns: int) -> tuple[_Costs, Array]:
+        """Return minus twice the log-likelihoods (A, M) if tracks move, if they stand, and which are inside a gate.
+
+        Also what to add to the states (A, M, 4) of those measured once, which may drive with the ego or towards it.
+        """
         squared, log_determinant = innovation(self.mean, self.covariance, columns.xy, columns.r, columns.age_s)
+        moving, added = squared + log_determinant, np.zeros((*squared.shape, 4))
+        fresh = np.flatnonzero((self.hits == 1) & _ON_ROAD[self._group]) if flow_mps.any() else np.zeros(0, np.intp)
+        if len(fresh):
+            shares, best = [moving[fresh]], squared[fresh]
+            for flow in (flow_mps, -flow_mps):
+                age_s = (now_ns - self.seen_ns[fresh, None]) / NS_PER_S
+                shift = np.concatenate([flow * age_s, np.broadcast_to(flow, (len(fresh), 2))], axis=1)
+                apart, _ = innovation(
+                    self.mean[fresh] + shift, self.covariance[fresh], columns.xy, columns.r, columns.age_s
+                )
+                shares.append(apart + log_determinant[fresh])
+                added[fresh] = np.where((apart < best)[..., None], shift[:, None], added[fresh])
+                best = np.minimum(best, apart)
+            moving[fresh] = -2 * np.logaddexp.reduce(np.log(FLOW_SHARE) - np.array(shares) / 2, axis=0)
+            squared[fresh] = best
         squared_at_rest, log_determinant_at_rest = innovation(
             self.place_m, self.place_covariance, columns.xy, columns.r, np.zeros(len(columns.xy))
         )
         inside = (squared <= CHI2_2DOF_999) | (self.standing[:, None] > 0) & (squared_at_rest <= CHI2_2DOF_999)
-        return squared + log_determinant, squared_at_rest + log_determinant_at_rest, inside
+        return (moving, squared_at_rest + log_determinant_at_rest, inside), added
 
     def _update(self, tracks: Index, columns: _Columns, taken: Index, costs: _Costs) -> None:
         if len(tracks) == 0:

@@ -9,15 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, Measurements, Track
-from log2sim.geometry import NS_PER_S, Array
-from log2sim.tracking.forward import (
-    ACCELERATION_MPS2,
-    CHI2_4DOF_999,
-    first_velocity,
-    measurement_noise,
-    predict,
-    update,
-)
+from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs
+from log2sim.tracking.forward import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
 
 # People run at up to 3 m/s in traffic; the speed is measured over this time, in which noise moves a center little.
 MAX_PEDESTRIAN_SPEED_MPS = 3.0
@@ -99,7 +92,6 @@ def _speed_mps(m: Measurements) -> float:
     return float(np.quantile(distance / (t[later] - t[start]), SPEED_QUANTILE))
 
 
-FORBIDDEN = 1e6
 # Largest standard deviation of the position difference; above it agreement is no evidence.
 MAX_POSITION_SIGMA_M = 2.0
 # A stationary object is joined across a gap of any length if its position stays within the offset.
@@ -139,10 +131,11 @@ def stitch(
     current = list(tracks)
     ends = _ends(current, whole_boxes=whole_boxes) if len(current) > 1 else None
     while ends is not None:
-        i, j = choose_pairs(*_joining_costs(ends, max_gap_s))
-        if not len(i):
+        i, j, cost = _joining_costs(ends, max_gap_s)
+        chosen = choose_pairs(i, j, cost)
+        if not len(chosen):
             break
-        following = dict(zip(i.tolist(), j.tolist()))
+        following = dict(zip(i[chosen].tolist(), j[chosen].tolist()))
         chains = [[head] for head in sorted(set(range(len(current))) - set(following.values()))]
         for chain in chains:
             while chain[-1] in following:
@@ -155,38 +148,6 @@ def stitch(
         ends = ends.join(_ends(joined, whole_boxes=whole_boxes)).take(rows)
         current = [everyone[k] for k in rows]
     return current
-
-
-def choose_pairs(
-    first: NDArray[np.intp], second: NDArray[np.intp], cost: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the best assignment among possible pairs (P,): as many as possible, and of those the cheapest.
-
-    What no chain of possible pairs connects does not compete: each group of the others is assigned on its own, so that a long
-    log with many tracks takes no table of all pairs.
-    """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    if not len(first):
-        return first, second
-    count = int(max(first.max(), second.max())) + 1
-    graph = coo_array((np.ones(len(first)), (first, second + count)), shape=(2 * count, 2 * count))
-    group = connected_components(graph, directed=False)[1][first]
-    order = np.argsort(group, kind="stable")
-    chosen = []
-    for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        ends, row = np.unique(first[pairs], return_inverse=True)
-        starts, column = np.unique(second[pairs], return_inverse=True)
-        table = np.full((len(ends), len(starts)), FORBIDDEN)
-        table[row, column] = cost[pairs]
-        i, j = linear_sum_assignment(table)
-        possible = table[i, j] < FORBIDDEN
-        chosen.append((ends[i[possible]], starts[j[possible]]))
-    i, j = (np.concatenate(side) for side in zip(*chosen))
-    order = np.argsort(i)
-    return i[order], j[order]
 
 
 def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -226,7 +187,7 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     last, first = ends.last[a], ends.first[b]
     offset_m = np.hypot(*(last - first)[:, :2].T)
     same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M)
-    cost = np.where(same_place, offset_m, FORBIDDEN)
+    cost = np.where(same_place, offset_m, np.inf)
     half = gap_s[:, None] / 2
     midpoint_offset_m = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
     # Beyond this distance no allowed uncertainty passes the gate.
@@ -244,7 +205,7 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     good = certain & (squared <= CHI2_4DOF_999)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
     cost[near[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
-    possible = cost < FORBIDDEN
+    possible = np.isfinite(cost)
     return a[possible], b[possible], cost[possible]
 
 

@@ -1,23 +1,16 @@
-"""Tracking in the map frame: forward assignment, stitching, one category a track, and tracks of vehicle and road joined.
-
-Each end tracks on its own clock and with its own gaps. Before tracks are compared, a measurement is moved to the time of the
-other by the velocity of its own track, as "time compensation late fusion" does with detections (Yu et al., "DAIR-V2X", CVPR
-2022, section 5).
-"""
+"""Tracking in the map frame: forward assignment, stitching, one category a track."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.config import TrackConfig
-from log2sim.datatypes import GROUP_OF, Measurements, OtherView, Track
+from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
-from log2sim.tracking.forward import CHI2_2DOF_99, RELATED, measurement_noise, track_forward
+from log2sim.tracking.forward import track_forward
 from log2sim.tracking.stitch import decide_category, stitch
 
 SWEEPS = ""
@@ -49,24 +42,24 @@ def track(
     max_gap_s: float,
     min_life_s: float,
     whole_boxes: bool = False,
+    flow_mps: Array | None = None,
 ) -> list[Track]:
     """Turn the measurements of T ticks into tracks, sorted by their first tick.
 
     `t_ns`: (T,). `birth_score`: lowest score that can start a track. `max_gap_s`: longest occlusion that is bridged, s.
     `whole_boxes`: whether the measurements come from a 3D detector: centers that do not move with the view, yaw along the
-    motion. `min_life_s`: shorter tracks, after stitching, are dropped as false alarms, unless the log itself is as short.
+    motion. `flow_mps`: (T, 2): velocity of the ego, as others may drive. `min_life_s`: shorter tracks,
+    after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     everything = Measurements.join(measurements)
     first_row = np.cumsum([0, *(len(m) for m in measurements)])
     tracks = []
-    for ticks, rows in track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes):
+    for ticks, rows in track_forward(
+        measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps
+    ):
         found = everything.take(first_row[ticks] + rows)
         tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
-    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes), t_ns, min_life_s)
-
-
-def _long_enough(tracks: Sequence[Track], t_ns: NDArray[np.int64], min_life_s: float) -> list[Track]:
-    """Return the tracks with enough measurements, sorted by their first tick."""
+    tracks = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
     kept = [t for t in tracks if len(t) >= min_hits(t_ns, min_life_s)]
     return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
@@ -80,91 +73,6 @@ def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
 
 # Velocities are those of lines through the measurements within this time of each.
 VELOCITY_WINDOW_S = 0.5
-# Standard deviation of where the road's sensors are after registration, m.
-POSE_SIGMA_M = 0.1
-# Tracks of one object may both be seen at so many of the ticks at which another track of it is, by a mistake of either tracker.
-MAX_SHARED_TICKS = 1
-
-
-def track_ends(ends: Sequence[Sequence[Measurements]], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Track]:
-    """Track the measurements of each end on their own and merge the tracks.
-
-    `ends`: of each end, by tick; those of a single one are tracked and no more. `t_ns`: (T,). `config`: as for `track`; what
-    both ends have of an object counts as its life.
-    """
-    birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
-    if len(ends) == 1:
-        return track(ends[0], t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=min_life_s)
-    tracks: list[Track] = []
-    for measurements in ends:
-        found = track(measurements, t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=0.0)
-        tracks = merge_tracks(tracks, found) if tracks else found
-    return _long_enough(stitch(tracks, t_ns, max_gap_s=max_gap_s), t_ns, min_life_s)
-
-
-def merge_tracks(a: Sequence[Track], b: Sequence[Track]) -> list[Track]:
-    """Merge the tracks of two ends that are the same objects; the others stay as they are.
-
-    Pairs are taken in the order of how well they agree. Several tracks of one end may belong to one of the other, which followed
-    the object through a gap.
-    """
-    tracks, velocity = [*a, *b], [velocities(t) for t in (*a, *b)]
-    costs = {
-        (i, j): cost
-        for i in range(len(a))
-        for j in range(len(a), len(tracks))
-        if (cost := compare(tracks[i], tracks[j], velocity[i], velocity[j])) is not None
-    }
-    owner, members = list(range(len(tracks))), {k: [k] for k in range(len(tracks))}
-    for i, j in sorted(costs, key=lambda pair: costs[pair]):
-        one, other = owner[i], owner[j]
-        if one != other and _can_join(members[one], members[other], tracks, len(a)):
-            for k in members[other]:
-                owner[k] = one
-            members[one] += members.pop(other)
-    return [_merge([tracks[k] for k in group], [velocity[k] for k in group]) for group in members.values()]
-
-
-def _can_join(one: Sequence[int], other: Sequence[int], tracks: Sequence[Track], of_first: int) -> bool:
-    """Return whether neither end, the first of which has so many of the tracks, sees two of them at the same ticks."""
-    for first_end in (True, False):
-        mine, theirs = ([tracks[k].tick for k in group if (k < of_first) == first_end] for group in (one, other))
-        if mine and theirs and len(np.intersect1d(np.concatenate(mine), np.concatenate(theirs))) > MAX_SHARED_TICKS:
-            return False
-    return True
-
-
-def compare(one: Track, other: Track, velocity: Array, velocity_other: Array) -> float | None:
-    """Return the median squared Mahalanobis distance of two tracks at their common ticks, less for many; None if they differ.
-
-    `velocity`, `velocity_other`: (n, 2), (m, 2): velocities of the tracks at their measurements, m/s.
-    """
-    groups = GROUP_OF[one.category], GROUP_OF[other.category]
-    if groups[0] != groups[1] and groups not in RELATED:
-        return None
-    if one.tick[0] > other.tick[-1] or other.tick[0] > one.tick[-1]:
-        return None
-    _, i, j = np.intersect1d(one.tick, other.tick, assume_unique=True, return_indices=True)
-    if not len(i):
-        return None
-    m, n = one.measurements.take(i), other.measurements.take(j)
-    group = np.full(len(i), groups[0])
-    late_s = ((m.t_ns - n.t_ns) / NS_PER_S)[:, None]
-    away = n.center_m[:, :2] + late_s * velocity_other[j] - m.center_m[:, :2]
-    c = measurement_noise(m.covariance + n.covariance, group) + POSE_SIGMA_M**2 * np.eye(2)
-    squared = np.einsum("ni,ni->n", away, np.linalg.solve(c, away[..., None])[..., 0])
-    middle = float(np.median(squared))
-    # They go together: an object that only passes the other is as near for a moment.
-    parted = away + np.median(late_s) * (velocity[i] - velocity_other[j])
-    if middle > CHI2_2DOF_99 or float(np.median(np.hypot(*parted.T))) > _reach(m, n):
-        return None
-    return middle - float(np.log(len(i)))
-
-
-def _reach(m: Measurements, n: Measurements) -> float:
-    """Return how far apart the centers of one object can be, m: half of both boxes, or what the errors allow without boxes."""
-    lengths = np.concatenate([m.box_size_m[:, 0], n.box_size_m[:, 0]])
-    return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else np.inf
 
 
 def velocities(track_: Track) -> Array:
@@ -177,57 +85,3 @@ def velocities(track_: Track) -> Array:
         if t @ t > 0:
             out[k] = t @ xy[begin:end] / (t @ t)
     return out
-
-
-def _merge(tracks: Sequence[Track], velocity: Sequence[Array]) -> Track:
-    """Merge tracks of one object; at ticks where several have a measurement, these become one."""
-    if len(tracks) == 1:
-        return tracks[0]
-    rows, moving = Measurements.join([t.measurements for t in tracks]), np.concatenate(velocity)
-    tick = np.concatenate([t.tick for t in tracks])
-    # At a tick the one with most points comes first.
-    order = np.lexsort((-rows.points, tick))
-    tick, rows, moving = tick[order], rows.take(order), moving[order]
-    first = np.flatnonzero(np.diff(tick, prepend=tick[:1] - 1))
-    second = first + 1
-    pair = np.flatnonzero((second < len(tick)) & (tick[np.minimum(second, len(tick) - 1)] == tick[first]))
-    merged = merge_rows(rows.take(first[pair]), rows.take(second[pair]), moving[second[pair]])
-    out = rows.take(first)
-    columns: dict[str, Any] = {}
-    for name in ("center_m", "covariance", "score", "points", "seen_by"):
-        columns[name] = getattr(out, name).copy()
-        columns[name][pair] = getattr(merged, name)
-    others = list(out.others or (None,) * len(out))
-    for k, view in zip(pair.tolist(), merged.others):
-        others[k] = view
-    out = replace(out, **columns, others=tuple(others))
-    return Track(decide_category(out), tick[first], out)
-
-
-def merge_rows(a: Measurements, b: Measurements, velocity_b: Array) -> Measurements:
-    """Merge measurements (P,) of two ends row by row, moved to the times of the first: centers by inverse covariance.
-
-    Scores are independent evidence. What else was seen is that of the first, beside which the view of the second is kept.
-    """
-    late_s = ((a.t_ns - b.t_ns) / NS_PER_S)[:, None]
-    moved = b.center_m[:, :2] + late_s * velocity_b
-    ca, cb = a.covariance, b.covariance
-    gain = ca @ np.linalg.inv(ca + cb)
-    xy = a.center_m[:, :2] + (gain @ (moved - a.center_m[:, :2])[..., None])[..., 0]
-    return replace(
-        a,
-        center_m=np.column_stack([xy, a.center_m[:, 2]]),
-        covariance=ca - gain @ ca,
-        score=1 - (1 - a.score) * (1 - b.score),
-        points=a.points + b.points,
-        seen_by=a.seen_by | b.seen_by,
-        others=tuple(_other_view(b, k, -float(late_s[k, 0])) for k in range(len(b))),
-    )
-
-
-def _other_view(m: Measurements, k: int, late_s: float) -> OtherView | None:
-    """Return what measurement `k` shows, as the second view of one that is so much earlier; None without points."""
-    if not len(m.cluster[k]):
-        return None
-    t_s = m.cluster[k][:, 3:4] if m.cluster[k].shape[1] > 3 else np.zeros((len(m.cluster[k]), 1))
-    return OtherView(m.sensor_m[k], m.ends_visible[k], np.column_stack([m.cluster[k][:, :3], t_s + late_s]))

@@ -48,16 +48,19 @@ STEP_NS, STEP_M = 10**12, 7.0
 SHIFTED = {"t_ns": STEP_NS, "x_m": STEP_M, "y_m": -STEP_M}
 
 
-def main(folder: Path, logs: int = 10_000, jobs: int = 2, damaged: int = 10, detector: str = "lidar:labels") -> None:
-    """Write the logs, of which `damaged` have an index that is cut off, run them and print a table."""
+DAMAGED = 10
+
+
+def main(folder: Path, logs: int = 10_000, jobs: int = 2) -> None:
+    """Write the logs, of which ten have an index that is cut off, run them and print a table."""
     root = folder / "logs"
     if not root.exists():
-        write_logs(root, logs, damaged)
-    for name, value in measure(root, folder / "out", jobs, detector).items():
+        write_logs(root, logs)
+    for name, value in measure(root, folder / "out", jobs).items():
         print(f"{name:32}  {value}")
 
 
-def write_logs(root: Path, count: int, damaged: int) -> None:
+def write_logs(root: Path, count: int) -> None:
     """Write so many logs, of which some are damaged."""
     began, unfinished, base = time.perf_counter(), root.with_name(f"{root.name}.part"), root.with_name("drive")
     for left in (unfinished, base):
@@ -66,7 +69,7 @@ def write_logs(root: Path, count: int, damaged: int) -> None:
     write_log(log, base)
     tables = {path.relative_to(base): path.read_text() for path in base.rglob("*.csv")}
     records = [path.relative_to(base) for path in base.rglob("*") if path.suffix in (".npz", ".jpg")]
-    spoiled = set(range(count - 1, -1, -max(count // damaged, 1))[:damaged]) if damaged else set[int]()
+    spoiled = set(range(count - 1, -1, -max(count // DAMAGED, 1))[:DAMAGED])
     for k in range(count):
         target = unfinished / f"drive-{k:06d}"
         for name, text in tables.items():
@@ -96,10 +99,10 @@ def _moved(name: str, text: str, steps: int) -> str:
     return str(int(text) + steps * STEP_NS) if name == "t_ns" else repr(float(text) + steps * SHIFTED[name])
 
 
-def measure(root: Path, out: Path, jobs: int, detector: str) -> dict[str, str]:
+def measure(root: Path, out: Path, jobs: int) -> dict[str, str]:
     """Run the batch: what ran, how fast, and what it cost beside the logs themselves."""
     began = time.perf_counter()
-    batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": detector}))
+    batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": "lidar:labels"}))
     found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
     before = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
     with progress(quiet=False) as report:

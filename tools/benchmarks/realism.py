@@ -2,7 +2,7 @@
 
     python tools/bench.py realism SCENARIO.json ...
 
-From moments every `--every` seconds all agents are simulated, of whom the second before is known. Each row is the mean over moments; the
+From moments every 8 s all agents are simulated, of whom the second before is known. Each row is the mean over moments; the
 last says what "drivers" reaches above "idm". Components of the map are left out where a scenario has no lanes.
 """
 
@@ -19,24 +19,25 @@ from log2sim.simulation.drivers import MODELS, roll_out
 from log2sim.simulation.metrics.realism import COMPONENTS, Realism, Road, realism
 from log2sim.simulation.present import judged, moments, recorded
 
+COUNT, HORIZON_S, EVERY_S = 32, 8.0, 8.0
 
-def main(scenarios: list[Path], count: int = 32, horizon: float = 8.0, every: float = 8.0, seed: int = 0) -> None:
-    """Measure all models by `count` rollouts of `horizon` seconds and print the table."""
+
+def main(scenarios: list[Path]) -> None:
+    """Measure all models by 32 rollouts of 8 s and print the table."""
     found: dict[str, list[Realism]] = {model: [] for model in MODELS}
     spent, agents = dict.fromkeys(MODELS, 0.0), 0
     for path in scenarios:
         scenario = Scenario.load(path)
         lanes = scenario.map_features.lanes if scenario.map_features else ()
         road = Road(lanes) if lanes else None
-        for now_s in moments(scenario, every, horizon):
-            log, now = recorded(scenario, now_s, horizon)
+        for now_s in moments(scenario, EVERY_S, HORIZON_S):
+            log, now = recorded(scenario, now_s, HORIZON_S)
             who = judged(log, now)
             agents += len(who)
             for model in MODELS if who else ():
                 begin = time.process_time()
-                drawn = roll_out(
-                    scenario, now_s, model, horizon_s=horizon, count=count, rng=np.random.default_rng(seed)
-                )
+                rng = np.random.default_rng(0)
+                drawn = roll_out(scenario, now_s, model, horizon_s=HORIZON_S, count=COUNT, rng=rng)
                 spent[model] += time.process_time() - begin
                 found[model].append(realism(log, drawn, who, now, road))
     columns, lines = {}, []
@@ -44,7 +45,7 @@ def main(scenarios: list[Path], count: int = 32, horizon: float = 8.0, every: fl
         known = [[r.likelihood[name] for r in results if name in r.likelihood] for name in COMPONENTS]
         columns[model] = np.array([np.mean(values) if values else np.nan for values in known])
         whole = f"{np.mean([r.realism for r in results]):.3f}", f"{np.mean([r.min_ade_m for r in results]):.2f}"
-        ms = f"{1000 * spent[model] / (count * len(results)):.1f}"
+        ms = f"{1000 * spent[model] / (COUNT * len(results)):.1f}"
         lines.append((model, *(f"{v:.3f}" for v in columns[model]), *whole, ms))
     if columns:
         lines.append(("drivers - idm", *(f"{v:+.3f}" for v in columns["drivers"] - columns["idm"]), "", "", ""))

@@ -1,9 +1,11 @@
 """Precision and recall of tags in worlds whose maneuvers are known in closed form.
 
-    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=SCENE.toml]
+    python tools/bench.py tags [--worlds 48] [--noise 0.2] [--write FOLDER] [--pair RECONSTRUCTION.json=LOG/truth.json] [--motorway SEED]
 
 `--write` writes the random traffic as scenarios, for `log2sim find` and `vary`. `--pair` compares the tags of what was reconstructed of a
-rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other.
+rendered scene with those of its truth: the same tag within 1.5 s whose agents are within 3 m of each other. `--motorway` renders
+the random traffic of a seed around a car with a LiDAR and reconstructs it first, by `lidar:vehicle`. "where seen" leaves out
+what is missed of agents that no sensor shows meanwhile; a scene file (`=SCENE.toml`) knows nothing of that.
 
 Random traffic on straight and bent roads with three lanes, on both sides of the road, at 2 to 20 Hz, with and without a map, and
 junctions with turns, crossings and people who step out between parked cars. The truth comes from the stations and lanes of the
@@ -13,6 +15,7 @@ vehicles on their road alone. Events whose quantities are within a tenth of the 
 from __future__ import annotations
 
 import itertools
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -22,12 +25,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import markdown
+from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Agent, AgentTable, MapFeatures, MapLane, Marking, Scenario, Signal, Tag, Waypoints
 from log2sim.geometry import wrap_angle
 from log2sim.scenarios.tagging import find_tags
 from log2sim.scenarios.traffic import UNSEEN_S
-from log2sim.synth.scene import load_scene
-from log2sim.synth.synthesis import synthesize
+from log2sim.synth.scene import Scene, load_scene, scene_from_table
+from log2sim.synth.synthesis import synthesize, write_synthetic
 
 LANE_M, LANES = 3.5, 3
 CAR, PERSON = (4.4, 1.8, 1.5), (0.6, 0.6, 1.7)
@@ -86,7 +90,7 @@ def quintic(u: np.ndarray) -> np.ndarray:
 
 
 def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_right: bool = True, lanes: bool = False,
-            noise_m: float = 0.0, duration_s: float = 14.0, count: int = 10) -> World:  # fmt: skip
+            noise_m: float = 0.0, duration_s: float = 14.0, count: int = 10, braking: float = 0.25) -> World:  # fmt: skip
     """Make random traffic with lane changes and hard braking on a road with three lanes in one direction."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration_s + FINE_S / 2, FINE_S)
@@ -99,7 +103,7 @@ def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_ri
         base = rng.uniform(18.0, 30.0) + 2.0 * lane
         accel = np.zeros(len(t))
         brakes = []
-        if rng.random() < 0.25:
+        if rng.random() < braking:
             at, hard = rng.uniform(2.0, duration_s - 4.0), rng.uniform(4.2, 7.0)
             # It builds up and decays within 0.4 s, as brakes do, and lasts for a second and more.
             lasts = rng.uniform(1.2, 1.8)
@@ -128,6 +132,41 @@ def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_ri
     scenario = Scenario(name, 0, duration_s, agents, map_features=features)
     tags = ("cut_in", "cut_out", "overtaking", "hard_braking", *(("lane_change",) if lanes else ()))
     return World(scenario, list(_road_events(vehicles, t, lanes=lanes)), tags)
+
+
+def motorway(seed: int) -> Scene:
+    """Make a scene of random traffic for 8 s around a car with a LiDAR: its rate, the bend and the side follow from the seed."""
+    rates, bends = (10.0, 10.0, 5.0, 20.0, 2.0, 10.0, 5.0, 2.0), (0.0, 1 / 400, 0.0, 0.0, 0.0, WINDING, 1 / 400, 0.0)
+    kind = seed % len(rates)
+    bend, right = bends[kind], kind in (0, 3, 4, 5, 6)
+    # A scene's vehicles brake with up to 3 m/s2.
+    world = traffic(seed, rate_hz=20.0, bend_1pm=bend, keeps_right=right, duration_s=8.0, count=14, braking=0.0)
+
+    def driver(agent: Agent, axle_m: float) -> dict[str, object]:
+        w = agent.waypoints
+        way = (w.x_m - axle_m * np.cos(w.yaw_rad), w.y_m - axle_m * np.sin(w.yaw_rad), w.speed_mps)
+        return {"size_m": CAR, "waypoints": np.column_stack(way)[::10].round(3).tolist(), "rounding_m": 12.0}
+
+    ego, *others = world.scenario.agents
+    s = np.arange(-200.0, 700.0, 10.0)
+    middle = np.column_stack(_on_road(s, np.full(len(s), LANE_M if right else -LANE_M), bend))
+    return scene_from_table({
+        "name": f"motorway {seed}", "duration_s": 8.0, "traffic": "right" if right else "left", "ego": driver(ego, 1.4),
+        "agent": [{"id": a.id, "category": "car", **driver(a, 0.3 * CAR[0])} for a in others],
+        "road": [{"line": middle.round(2).tolist(), "width_m": LANES * LANE_M + 1.5, "lanes": LANES, "lanes_back": 0, "side_inset_m": 0.75,
+                  "sidewalk_m": 0.0}],
+        "lidar": [{"name": "roof", "position_m": [1.2, 0.0, 1.9], "elevation_deg": [-16.0, 4.0], "channels": 40, "rate_hz": rates[kind],
+                   "offset_s": 0.08, "range_m": 100.0}],
+    })  # fmt: skip
+
+
+def reconstructed(seed: int, folder: Path) -> tuple[Scenario, Scenario]:
+    """Render a motorway below a folder, unless it is there, and return what is reconstructed of it and its truth."""
+    log = folder / f"motorway_{seed}"
+    if not log.exists():
+        write_synthetic(motorway(seed), log, seed=seed)
+    made = reconstruct(open_log(log), Config.load(detect={"name": "lidar:vehicle"})).scenario
+    return made, Scenario.load(log / "truth.json")
 
 
 def _touch(a: Vehicle, b: Vehicle) -> bool:
@@ -510,7 +549,7 @@ def describe(tag: Tag) -> str:
 
 
 def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
-    """List the tags that a reconstruction shares with its truth, has alone, and lacks, by kind, with why those are missed.
+    """List the tags that a reconstruction shares with its truth, has alone, and lacks of agents seen and unseen, by kind, with why.
 
     What begins or ends within `EDGE_S` of either end of the reconstruction counts neither way: whether it is whole there is decided by
     centimeters.
@@ -540,7 +579,15 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
             and all(apart_m(*pair, times) < 3.0 for pair in ((g.agent, e.agent), (g.other, e.other)))
         )
 
+    def unseen(e: Tag) -> list[str]:
+        """List who is shown by no sensor from the begin to the end of a tag."""
+        ways = {id: agents[1][id].waypoints for id in (e.agent, e.other) if id}
+        during = {id: (w.t_s >= e.start_s - EDGE_S) & (w.t_s <= e.end_s + EDGE_S) for id, w in ways.items()}
+        return [id for id, w in ways.items() if w.visible is not None and not w.visible[during[id]].any()]
+
     def reason(e: Tag) -> str:
+        if unseen(e):
+            return f"not seen: {', '.join(unseen(e))}"
         doubted = [g for g in ours if same(g, e)]
         if doubted:
             sure = [agents[0][id].confidence for id in (doubted[0].agent, doubted[0].other) if id]
@@ -553,7 +600,7 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
         ]
         return f"not reconstructed: {', '.join(gone)}" if gone else "other motion"
 
-    out: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
+    out: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], [], []])
     left = list(theirs)
     for g in (g for g in ours if g.probability >= LEAST):
         found = next((e for e in left if same(g, e)), None)
@@ -564,26 +611,38 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[str]]]:
             left.remove(found)
     for e in left:
         if e.probability >= LEAST and min(e.t_s, last_s - e.t_s, last_s - e.end_s) >= EDGE_S:
-            out[e.tag][2].append(f"{describe(e)}: {reason(e)}")
+            out[e.tag][3 if unseen(e) else 2].append(f"{describe(e)}: {reason(e)}")
     return out
 
 
 def main(
-    worlds: int = 48, noise: float = 0.0, write: Path | None = None, pair: list[str] = [], wrong: bool = False
+    worlds: int = 48,
+    noise: float = 0.0,
+    write: Path | None = None,
+    pair: list[str] = [],
+    motorway: list[int] = [],
+    wrong: bool = False,
 ) -> None:
-    """Print a table of random worlds and of a quarter as many of each scripted scene, whose places have noise, m; `wrong` lists what was."""
+    """Print a table of random worlds and of a quarter as many of each scripted scene, whose places have noise, m; `wrong` lists what was wrong."""
     drawn = [*variants(worlds, noise), *scripted(worlds // 4, noise)]
     for k, world in enumerate(drawn if write is not None else ()):
         world.scenario.save(write / f"{k:04}" / "scenario.json")
-    sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], []])
-    for made, scene in (map(Path, text.split("=", 1)) for text in pair):
-        for tag, lists in compare(Scenario.load(made), synthesize(load_scene(scene), observe=False)[1]).items():
-            sums[tag] = [[*a, *(f"{made.name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
+    sums: dict[str, list[list[str]]] = defaultdict(lambda: [[], [], [], []])
+    pairs = []
+    for made, of in (map(Path, text.split("=", 1)) for text in pair):
+        truth = Scenario.load(of) if of.suffix == ".json" else synthesize(load_scene(of), observe=False)[1]
+        pairs.append((made.name, Scenario.load(made), truth))
+    with tempfile.TemporaryDirectory() as temporary:
+        pairs += [(f"motorway {seed}", *reconstructed(seed, write or Path(temporary))) for seed in motorway]
+    for name, made, truth in pairs:
+        for tag, lists in compare(made, truth).items():
+            sums[tag] = [[*a, *(f"{name}: {line}" for line in b)] for a, b in zip(sums[tag], lists)]
     rows, lines = [], []
-    for tag, (true, invented, missed) in sorted(sums.items()):
-        counts = len(true), len(invented), len(missed)
-        rows.append([f"{tag}, reconstructed", *map(str, counts), *shares(*counts), ""])
-        lines += [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed]
+    for tag, (true, invented, missed, unseen) in sorted(sums.items()):
+        for where, lacks in (("reconstructed", missed + unseen), ("where seen", missed)):
+            counts = len(true), len(invented), len(lacks)
+            rows.append([f"{tag}, {where}", *map(str, counts), *shares(*counts), ""])
+        lines += [f"alone {t}" for t in invented] + [f"missed {t}" for t in missed + unseen]
     begin = time.process_time()
     found = [find_tags(w.scenario) for w in drawn]
     spent = time.process_time() - begin

@@ -19,7 +19,7 @@ from log2sim.geometry import NS_PER_S
 from log2sim.pipeline import reconstruct, start
 
 ALONE = ("vehicle", "road")
-LEVELS = ("points", "boxes", "tracks")
+LEVELS = ("points", "boxes")
 WAYS = (*ALONE, *LEVELS)
 # Both LiDARs stand level, so both are searched by the network for such ones, as the ends are where their boxes are joined.
 DETECTOR = "lidar:vehicle"
@@ -79,7 +79,7 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
 
 
 NAMES = {
-    "vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes", "tracks": "both, tracks",
+    "vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes",
 }  # fmt: skip
 # Title, figure and format of the columns of tests B and C.
 BLIND_AREA = (

@@ -388,7 +388,7 @@ def _case(log: Log, scene: TrafficScene, true: PoseTrack | None, truth: Scenario
     observations.records = None
     kept = run.log.changed(streams={k: Stream(k, np.asarray(s.t_ns), silent) for k, s in run.log.streams.items()})
     named = [None if d is None else Named(d.name) for d in (images, run.detectors.sweeps)]
-    run = replace(run, log=kept, detectors=Detectors(*named), clock=None, progress=silent)
+    run = replace(run, log=kept, detectors=Detectors(*named), clock=None, progress=silent, earlier=None)
     kind = detector.replace("labels", "images") + ("" if log.lidars else ", no LiDAR")
     return Case(f"{log.name} ({kind})", run, observations, truth)
 

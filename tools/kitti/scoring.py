@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from kitti.boxes import Boxes, Index, Mask, in_areas, is_ignorable, is_small, overlap_3d, same_frame, with_neighbors
-from log2sim.evaluation.metrics.comparison import AgentPairs, assign
+from log2sim.evaluation.metrics.comparison import AgentPairs
 from log2sim.evaluation.metrics.evaluator import hota
-from log2sim.geometry import Array
+from log2sim.geometry import Array, choose_pairs
 
 RECALL_STEPS, IOU = 40, 0.25
 
@@ -149,7 +149,7 @@ class Matcher:
                 rows = a + np.flatnonzero(keep[a:b])
                 # One more pair must always be worth more than any overlap.
                 self.known[key] = rows[
-                    assign(self.scene.row[rows], self.scene.col[rows], len(rows) + self.scene.iou[rows])
+                    choose_pairs(self.scene.row[rows], self.scene.col[rows], -len(rows) - self.scene.iou[rows], 0.0)
                 ]
             chosen = self.known[key]
             match[self.scene.row[chosen]] = self.scene.col[chosen]

@@ -36,8 +36,7 @@ from log2sim.agents.smooth.quadratic import (
     weighted_sum,
     zero_motion,
 )
-from log2sim.geometry import Array, nearest_index
-from log2sim.tracking.forward import CHI2_2DOF_99
+from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index
 
 __all__ = ["smooth_interval"]
 

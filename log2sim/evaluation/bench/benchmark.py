@@ -36,8 +36,8 @@ from log2sim.evaluation.bench.scores import EVERYTHING, ScoreScope
 from log2sim.evaluation.metrics.evaluator import rounded_tree
 from log2sim.evaluation.road import cell
 from log2sim.files.documents import check
+from log2sim.files.version import __version__
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.version import __version__
 from log2sim.visualization.plot.style import (
     CROWD_COLOR,
     FONT,

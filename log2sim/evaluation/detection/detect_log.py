@@ -21,7 +21,6 @@ from log2sim.perception.lidar.measure import outside_ego
 from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import Schedule, sweep_middle_ns
 from log2sim.pipeline import start
-from log2sim.plan import FusionLevel
 from log2sim.report import Run, unreadable_records
 
 
@@ -72,8 +71,7 @@ def detect_log(
     Parameters
     ----------
     config : Config, optional
-        `detect.name` is a LiDAR detector, "lidar:vehicle" by default; its settings are in the section `lidar`. Where vehicle and
-        road are joined as tracks, their boxes are joined as boxes.
+        `detect.name` is a LiDAR detector, "lidar:vehicle" by default; its settings are in the section `lidar`.
     progress : callable, optional
         Called with (sweeps done, all sweeps).
     """
@@ -83,9 +81,6 @@ def detect_log(
             f"detector '{config.detect.name}': 3D boxes are detected in LiDAR sweeps alone; expected a name that begins with "
             "'lidar:', such as lidar:vehicle"
         )
-    if FusionLevel(config.cooperation.fusion) is FusionLevel.TRACKS:
-        # Before they are tracked, what both ends find would be there twice.
-        config = config.changed(cooperation={"fusion": "boxes"})
     run = start(log, config)
     records, detector = RecordSource(run.log), run.detectors.sweeps
     of_sweeps, stamps, boxes = run.schedule.t_ns - middle_ns(run), [], []

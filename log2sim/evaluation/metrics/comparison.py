@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, AgentTable, IgnoreRegions, LabelView, Scenario
 from log2sim.evaluation.metrics.truth import MIN_POINTS, image_samples
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse, nearest_index
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, choose_pairs, inverse, nearest_index
 
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -72,35 +72,6 @@ def near_pairs(truth_xy: Array, other_xy: Array, gates_m: Array, same_group: Mas
     return AgentPairs(tick, truth, other, distance_m, similarity, same)
 
 
-def assign(rows: Index, cols: Index, score: Array) -> Index:
-    """Choose pairs one to one so that the sum of their scores is greatest.
-
-    `rows`, `cols` (P,): the candidate pairs, each once. `score` (P,): greater than 0 for a pair that may be chosen.
-    Returns (K,) indices of the chosen candidates.
-
-    Pairs whose row and column have no other candidate, nearly all in a sparse scene, are chosen without the solver.
-    """
-    usable = np.flatnonzero(score > 0)
-    if len(usable) == 0:
-        return usable
-    row_names, r = np.unique(rows[usable], return_inverse=True)
-    col_names, c = np.unique(cols[usable], return_inverse=True)
-    alone = (np.bincount(r)[r] == 1) & (np.bincount(c)[c] == 1)
-    if np.all(alone):
-        return usable
-    from scipy.optimize import linear_sum_assignment
-
-    contested = usable[~alone]
-    row_names, r = np.unique(rows[contested], return_inverse=True)
-    col_names, c = np.unique(cols[contested], return_inverse=True)
-    matrix = np.zeros((len(row_names), len(col_names)))
-    place = np.full(matrix.shape, -1, dtype=np.int64)
-    matrix[r, c], place[r, c] = score[contested], contested
-    i, j = linear_sum_assignment(matrix, maximize=True)
-    chosen = place[i, j]
-    return np.sort(np.concatenate([usable[alone], chosen[chosen >= 0]]))
-
-
 def associate(pairs: AgentPairs, truths: int, others: int, ticks: int) -> tuple[Index, Mask, Mask]:
     """Match agents tick by tick, keeping what was matched before while it is within the gate.
 
@@ -142,7 +113,7 @@ def _nearest(near: AgentPairs, rows: Index, last: Index) -> Index:
     distance = near.distance_m[rows]
     # One more pair always outweighs any saving in distance.
     bonus = 1.0 + distance.sum()
-    return rows[assign(near.truth[rows], near.other[rows], bonus - distance)]
+    return rows[choose_pairs(near.truth[rows], near.other[rows], distance, bonus)]
 
 
 def switches(match: NDArray[np.int64], counted: Mask) -> Mask:

@@ -22,6 +22,7 @@ from log2sim.files.plugins import nearest
 from log2sim.geometry import (
     NS_PER_S,
     Array,
+    choose_pairs,
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_rpy,
@@ -66,7 +67,7 @@ def hota(
     score = alignment[pairs.truth, pairs.other] * pairs.similarity
     parts = pairwise(pairs.bounds(ticks))
     matched = pairs.take(
-        np.concatenate([a + comparison.assign(pairs.truth[a:b], pairs.other[a:b], score[a:b]) for a, b in parts])
+        np.concatenate([a + choose_pairs(pairs.truth[a:b], pairs.other[a:b], -score[a:b], 0.0) for a, b in parts])
     )
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())

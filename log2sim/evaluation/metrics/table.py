@@ -228,7 +228,7 @@ def _values(figures: Mapping[str, Any]) -> list[str]:
     return [cell(found[key], n, scale.get(key, 1)) if key in found else "" for key, _, n in _COLUMNS]
 
 
-def columns_text(cells: Sequence[Sequence[str]], heads: int = 1, columns: int = MAX_COLUMNS) -> list[str]:
+def columns_text(cells: Sequence[Sequence[str]], heads: int = 1) -> list[str]:
     """Format rows, the first of titles, within a number of characters.
 
     Columns of dashes alone are left out. What does not fit goes into a further table below, which repeats the
@@ -240,12 +240,12 @@ def columns_text(cells: Sequence[Sequence[str]], heads: int = 1, columns: int = 
     widths = {k: max(len(row[k]) for row in cells) for k in used}
     # A name may be of any length; it takes half of a line at most.
     for k in range(heads):
-        widths[k] = min(widths[k], columns // (2 * heads))
+        widths[k] = min(widths[k], MAX_COLUMNS // (2 * heads))
     first = used[:heads]
     rest, blocks = used[heads:], list[list[int]]()
     while rest or not blocks:
         block, width = list(first), sum(widths[k] + 2 for k in first) - 2
-        while rest and (width + 2 + widths[rest[0]] <= columns or len(block) == heads):
+        while rest and (width + 2 + widths[rest[0]] <= MAX_COLUMNS or len(block) == heads):
             width += 2 + widths[rest[0]]
             block.append(rest.pop(0))
         blocks.append(block)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.files.documents import rounded
-from log2sim.geometry import Array, apply_homography
+from log2sim.geometry import CHI2_2DOF_99, Array, apply_homography
 from log2sim.perception.homography.normalized import (
     Linearization,
     NormalizedCorrespondences,
@@ -18,7 +18,6 @@ from log2sim.perception.homography.normalized import (
     scale_free_basis,
 )
 from log2sim.perception.homography.ransac import RobustFit
-from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Ratio of the eighth to the first singular value of the normalized DLT matrix: about 0.3 for points that spread over the
 # view, 1e-17 for collinear points.

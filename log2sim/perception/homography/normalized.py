@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
-from log2sim.tracking.forward import CHI2_2DOF_99
+from log2sim.geometry import CHI2_2DOF_99, Array
 
 # `CHI2_2DOF_99` is the inlier gate on a squared whitened error, and the value at which the bounded loss is cut.
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit, PitchRoll
 from log2sim.perception.homography.normalized import (
@@ -29,7 +29,6 @@ from log2sim.perception.homography.normalized import (
     scale_free_basis,
 )
 from log2sim.perception.homography.ransac import RobustFit
-from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Standard deviations of pitch, as a shift along v, and of roll, before they are estimated.
 PITCH_SIGMA_PX = 4.0

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.normalized import (
     Linearization,
     NormalizedCorrespondences,
@@ -21,7 +21,6 @@ from log2sim.perception.homography.normalized import (
     refine_many,
     squared_errors,
 )
-from log2sim.tracking.forward import CHI2_2DOF_99
 
 # No three of four points may be collinear: twice the area of their smallest triangle, for data of spread 1.
 MIN_TRIANGLE_AREA = 1e-7

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, apply_homography
+from log2sim.geometry import CHI2_2DOF_99, Array, apply_homography
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
     FOOT_SIGMA_M,
@@ -41,7 +41,6 @@ from log2sim.perception.homography.rig import (
     linearize_feet,
     tilt_of_ticks,
 )
-from log2sim.tracking.forward import CHI2_2DOF_99
 
 # Standard deviations before anything is fitted. A box ends within some pixels of its object. Overhangs of cars are
 # 0.7 to 1 m, which is as much as 0.1 m in height where a camera 1.6 m high sees them 12 m away.

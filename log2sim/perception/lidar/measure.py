@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import (
     GROUP_OF,
     MAX_SIZE_M,
+    RELATED_GROUPS,
     TYPICAL_SIZE_M,
     Boxes3D,
     Detections,
@@ -59,7 +60,6 @@ from log2sim.perception.lidar.clusters import (
     region_grow,
 )
 from log2sim.perception.lidar.projection import View, points_in_image_boxes, project_boxes_in_view, project_points
-from log2sim.tracking.forward import RELATED
 
 Frame = tuple[View, Detections, "Cloud | None"]
 """A frame with its image boxes, and the cloud nearest in time, None without one."""
@@ -219,7 +219,7 @@ def _may_be_same(boxes: NDArray[np.str_], images: NDArray[np.str_]) -> NDArray[n
     """Mark the pairs (M, N) whose categories are of one group or confused with each other."""
     a, b = (np.array([GROUP_OF[str(c)] for c in category], dtype="<U16") for category in (boxes, images))
     same = a[:, None] == b
-    for one, other in RELATED:
+    for one, other in RELATED_GROUPS:
         same |= (a[:, None] == one) & (b == other)
     return np.asarray(same)
 

@@ -6,7 +6,6 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO, STANDSTILL_MPS, Trajectory
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.files.plugins import nearest
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, fit_windows, wrap_angle
 from log2sim.simulation.corridors import PathTable
 from log2sim.simulation.groups import StepClock
 from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, BoxTracks, collisions
@@ -159,21 +158,8 @@ def _derivative(values: Array, order: int, window_s: float, spacing_s: float) ->
     """Return the derivative (S,) of cubics fitted to a window around each row; near an end, of the window at the end."""
     longest = len(values) - (len(values) + 1) % 2
     half = min(max(round(window_s / spacing_s / 2), MIN_ROWS // 2), longest // 2)
-    weights = _weights(half, order, spacing_s)
-    values = values - values[0]  # far map offsets would cost digits
-    begin, end = weights[:half] @ values[: 2 * half + 1], weights[half + 1 :] @ values[-2 * half - 1 :]
-    return np.concatenate([begin, np.correlate(values, weights[half], mode="valid"), end])
-
-
-@lru_cache(maxsize=64)
-def _weights(half: int, order: int, spacing_s: float) -> Array:
-    """Return weights (W, W) of the values of a window of W = 2 half + 1 rows in the derivative at each of its rows."""
-    at_s = np.arange(-half, half + 1) * spacing_s
-    fit = np.linalg.pinv(np.vander(at_s, 4, increasing=True))
-    return sum(
-        (math.perm(k, order) * np.outer(at_s ** (k - order), fit[k]) for k in range(order, 4)),
-        start=np.zeros((len(at_s), len(at_s))),
-    )
+    # Far map offsets would cost digits.
+    return np.asarray(fit_windows(values - values[0], 2 * half + 1, 3, order, spacing_s))
 
 
 MAX_PAIRS = 100_000  # pairs of boxes whose distance is computed at once, which bounds memory

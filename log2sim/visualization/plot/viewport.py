@@ -197,8 +197,9 @@ def footprints(agent: Agent, xy_m: ArrayLike, yaw_rad: ArrayLike) -> Array:
     return box_corners_bev(xy_m, agent.size_m[0], agent.size_m[1], yaw_rad)
 
 
-def heading_triangles(corners: Array, depth: float = 0.42) -> Array:
-    """Compute triangles (M, 3, 2) at the front of footprints (M, 4, 2); `depth` is a fraction of the length."""
+def heading_triangles(corners: Array) -> Array:
+    """Compute triangles (M, 3, 2) at the front of footprints (M, 4, 2)."""
+    depth = 0.42  # of the length
     front_left, rear_left, rear_right, front_right = np.moveaxis(corners, 1, 0)
     left, right = front_left + depth * (rear_left - front_left), front_right + depth * (rear_right - front_right)
     inset = 0.2  # narrower than deep, so that it cannot be read as pointing sideways

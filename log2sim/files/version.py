@@ -16,4 +16,4 @@ def read_version(file: Path) -> str:
         return FALLBACK
 
 
-__version__ = read_version(Path(__file__).with_name("version.txt"))
+__version__ = read_version(Path(__file__).parents[1] / "version.txt")

@@ -1,0 +1,186 @@
+"""People and riders as a sweep saw them: limbs move, so that points of their whole life together make a body without legs.
+
+A sighting is what the rays around an agent met, in its own frame. Rays that are cast near it end where their neighbors in the
+picture of the sighting did, so that outlines are neither wider nor smoother than recorded. For bodies that do not change
+their shape, surfels show more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from log2sim.datatypes import GROUP_OF, Agent, Scenario
+from log2sim.geometry import NS_PER_S, Array
+from log2sim.resim.caster import Meetings
+from log2sim.resim.rays import Floats, Rays, bin_of
+from log2sim.resim.surfels import Surfels, joined
+
+# Turned by 20 degrees a person shows a third of a width that was hidden. From 1.5 times as far the gaps are half as wide again.
+MIN_TURN_COS, MAX_FARTHER = np.cos(np.deg2rad(20.0)), 1.5
+AROUND_M = 0.35  # around the box, rays that passed the agent tell its outline
+OUTLINE_CELLS = 3.0  # twice as many as rays are apart in a sighting from that far
+PASSED, ENDED, HIDDEN, LOST = range(4)
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What rays around an agent met in one sweep.
+
+    Attributes
+    ----------
+    t_s : float
+        Time of the scenario.
+    view_m : (3,) float64, m
+        The sensor in the frame of the agent.
+    point_m : (N, 3) float32, m
+        In the frame of the agent: where rays ended on it; of others a point as far away as its middle.
+    state : (N,) int8
+        Whether the ray passed the agent, ended on it, was stopped before, or was lost where its neighbors ended on it.
+    intensity : (N,) float32
+        Relative; NaN where unknown.
+    cell_rad : (2,) float64
+        Between rays, of azimuth and elevation.
+    """
+
+    t_s: float
+    view_m: Array
+    point_m: Floats
+    state: NDArray[np.int8]
+    intensity: Floats
+    cell_rad: Array
+
+    def angles(self, offset: Array | Floats) -> Array:
+        """Return azimuth and elevation (N, 2) of vectors (N, 3) from a sensor, in steps between rays."""
+        middle = np.arctan2(-self.view_m[1], -self.view_m[0])
+        c, s = np.cos(middle), np.sin(middle)
+        ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
+        return (
+            np.column_stack([np.arctan2(left, ahead), np.arctan2(offset[:, 2], np.hypot(ahead, left))]) / self.cell_rad
+        )
+
+
+def is_non_rigid(agent: Agent) -> bool:
+    """Tell whether an agent changes its shape."""
+    return GROUP_OF[agent.category] in ("pedestrian", "two_wheeler")
+
+
+def sighting(
+    t_s: float, view_m: Array, offset: Array, *, range_m: Floats, on: NDArray[np.bool_], intensity: Floats,
+    half_m: Array, cell_rad: Array,
+) -> Sighting | None:  # fmt: skip
+    """Take what rays around an agent met; None where none ended on it.
+
+    Parameters
+    ----------
+    view_m : (3,) float64, m
+        The sensor in the frame of the agent.
+    offset : (N, 3) float64
+        Unit vectors of rays from there.
+    range_m : (N,) float32
+        NaN where nothing came back.
+    on : (N,) bool
+        Whether the ray ended on the agent.
+    half_m : (3,) float64, m
+        Of its size.
+    """
+    away = float(np.linalg.norm(view_m))
+    near = np.flatnonzero(on | (np.abs(view_m + away * offset) < half_m + AROUND_M).all(axis=1))
+    range_m, on = range_m[near], on[near]
+    back = np.isfinite(range_m)
+    if not on.any():
+        return None
+    state = np.where(on, ENDED, np.where(range_m < away - np.hypot(*half_m[:2]), HIDDEN, PASSED)).astype(np.int8)
+    length = np.where(on, range_m, away)[:, None]
+    point = (view_m + length * offset[near]).astype(np.float32)
+    seen = Sighting(t_s, view_m, point, state, intensity[near], cell_rad)
+    at = seen.angles(offset[near])
+    if not back.all():
+        neighbor = cKDTree(at[back]).query(at[~back])[1]
+        state[~back] = np.where(on[back][neighbor], LOST, PASSED)
+    # Beyond the next rays, no outline is told.
+    beside = np.isfinite(cKDTree(at[on]).query(at, distance_upper_bound=OUTLINE_CELLS)[0]) | (state == HIDDEN)
+    return replace(seen, point_m=point[beside], state=state[beside], intensity=intensity[near][beside])
+
+
+def frame_at(agent: Agent, t_s: float) -> tuple[Array, Array]:
+    """Return the rotation from the map to an agent's frame (3, 3) and its middle (3,), m, in the map."""
+    at = agent.trajectory.at(np.array([t_s]))
+    c, s = np.cos(at.yaw_rad[0]), np.sin(at.yaw_rad[0])
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]), np.array([at.x_m[0], at.y_m[0], at.z_m[0]])
+
+
+def choose_sighting(sightings: Sequence[Sighting], t_s: float, view_m: Array) -> Sighting | None:
+    """Choose the one nearest in time of those that looked from a like side and not from much farther away."""
+    away = float(np.linalg.norm(view_m))
+    alike = []
+    for s in sightings:
+        other = float(np.linalg.norm(s.view_m))
+        if other < MAX_FARTHER * away and s.view_m @ view_m > MIN_TURN_COS * away * other:
+            alike.append(s)
+    return min(alike, key=lambda s: abs(s.t_s - t_s), default=None)
+
+
+def with_sightings(
+    met: Meetings, surfels: Surfels, *, first: NDArray[np.int64], ids: Sequence[str], rays: Rays, scenario: Scenario,
+    sightings: Mapping[str, Sequence[Sighting]],
+) -> tuple[Meetings, Surfels]:  # fmt: skip
+    """Let rays end on people and riders as in their sightings; where those were hidden, on their discs.
+
+    `first` (A + 2,) are the first discs of the background and of the agents `ids`, and the end. Each ray that ends on a
+    sighting gets a disc of its own, after the others.
+    """
+    bounds = np.searchsorted(met.surfel, first)
+    keep = np.ones(len(met.ray), dtype=bool)
+    parts, discs, total = [], [], len(surfels)
+    for k, id in enumerate(ids):
+        some = sightings.get(id, ())
+        if not some:
+            continue
+        agent = scenario[id]
+        # Where the agent is when the sensor looks there.
+        t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
+        bin = len(t_s) // 2
+        for _ in range(2):
+            agent_R_map, center = frame_at(agent, float(t_s[bin]))
+            center -= rays.shift_m
+            seen = rays.bin_T_map[bin, :3, :3] @ center + rays.bin_T_map[bin, :3, 3]
+            bin = int(bin_of(np.arctan2(seen[1:2], seen[:1]))[0])
+        sensor = -rays.bin_T_map[bin, :3, :3].T @ rays.bin_T_map[bin, :3, 3]
+        view = agent_R_map @ (sensor - center)
+        away, reach = float(np.linalg.norm(view)), float(np.linalg.norm(np.array(agent.size_m) / 2 + AROUND_M))
+        chosen = choose_sighting(some, float(t_s[bin]), view)
+        if chosen is None or away < 2 * reach:
+            continue
+        toward = ((center - sensor) / away).astype(np.float32)
+        ray = np.flatnonzero(rays.direction @ toward > np.sqrt(1 - (reach / away) ** 2))
+        # In the picture from here; rays that nothing was sent beside of passed.
+        offset = chosen.point_m - view
+        scale = max(1.0, float(np.linalg.norm(chosen.view_m)) / away)
+        distance, near = cKDTree(chosen.angles(offset)).query(
+            chosen.angles(rays.direction[ray] @ agent_R_map.T.astype(np.float32)), distance_upper_bound=scale
+        )
+        state = np.append(chosen.state, np.int8(PASSED))[near]
+        hidden = np.zeros(len(rays.direction), dtype=bool)
+        hidden[ray[state == HIDDEN]] = True
+        own = slice(bounds[k + 1], bounds[k + 2])
+        keep[own] = hidden[met.ray[own]]
+        stops = (state == ENDED) | (state == LOST)
+        ray, near = ray[stops], near[stops]
+        one = np.ones(len(ray), np.float32)
+        distance = np.linalg.norm(offset[near], axis=1).astype(np.float32)
+        parts.append(Meetings(ray, np.arange(total, total + len(ray), dtype=np.int32), distance, one, one))
+        total += len(ray)
+        back = (chosen.state[near] == ENDED).astype(np.float32)
+        discs.append(
+            Surfels(chosen.point_m[near], np.zeros((len(ray), 3), np.float32), one, chosen.intensity[near], one, back)
+        )
+    if not parts:
+        return met, surfels
+    kept = np.flatnonzero(keep)
+    columns = {k: [getattr(met, k)[kept], *(getattr(p, k) for p in parts)] for k in Meetings.__dataclass_fields__}
+    return Meetings(**{k: np.concatenate(v) for k, v in columns.items()}), joined([surfels, *discs])
