@@ -116,8 +116,10 @@ def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud
 REACH_M = 60.0
 OWN_CAR_M = (4.4, 1.8, 1.5)
 WALKING_MPS, RIDING_MPS = 1.4, 5.0
-# Shares of what stands before a wall, of people's width.
-AT_WALLS = {"stand": 0.35, "bin": 0.25, "pole": 0.15, "planter": 0.1, "corner": 0.1, "sign board": 0.05}
+# Shares of what stands before a wall.
+AT_WALLS = {
+    "person": 0.15, "bicycle": 0.12, "motorcycle": 0.13, "stand": 0.2, "bin": 0.15, "pole": 0.1, "planter": 0.05, "corner": 0.07, "sign board": 0.03,
+}  # fmt: skip
 # Shares of what drives on a lane.
 LANE_SHARES = {"car": 0.71, "truck": 0.08, "bus": 0.04, "motorcycle": 0.07, "cyclist": 0.1}
 
@@ -240,7 +242,9 @@ def _close(out: _Layout, road: Road) -> None:
         for _ in range(rng.choice(3, p=[0.4, 0.4, 0.2])):
             category = str(rng.choice(["truck", "bus", "car"], p=[0.5, 0.35, 0.15]))
             away = rng.choice([-1, 1]) * rng.uniform(2.5, 4.5)
-            s, d = (rng.uniform(-9, 9), away) if beside else (rng.choice([-1, 1]) * rng.uniform(10, 40), rng.normal(0, 2))
+            s, d = (
+                (rng.uniform(-9, 9), away) if beside else (rng.choice([-1, 1]) * rng.uniform(10, 40), rng.normal(0, 2))
+            )
             xy, direction = road.at(float(s), own + float(d))
             yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.03)
             out.add_user(category, xy, yaw, speed=float(rng.uniform(0, 12) * (rng.random() < 0.6)), margin=0.1)
@@ -397,7 +401,7 @@ def _roadside(out: _Layout, road: Road) -> None:
 
 
 def _fronts(out: _Layout, road: Road) -> None:
-    """Line the road with houses, fences, hedges and open ground in pieces; people and slim things stand before some."""
+    """Line the road with houses, fences, hedges and open ground in pieces; people, parked two-wheelers and slim things stand before some."""
     rng = out.rng
     at_walls = rng.random() < 0.5
     for side in (-1, 1):
@@ -415,10 +419,21 @@ def _fronts(out: _Layout, road: Road) -> None:
                     out.add_thing("fence", xy, yaw, clutter.fence(length, rng))
                 for _ in range(rng.poisson(1.0) if at_walls else 0):
                     place, _ = road.at(s + rng.uniform(0, length), side * (edge - rng.uniform(0.25, 1.2)))
-                    if rng.random() < 0.5:
+                    kind = out.one_of(AT_WALLS)
+                    if kind == "person":
                         out.add_user("pedestrian", place, rng.uniform(-np.pi, np.pi), margin=0.0)
+                    elif kind in ("bicycle", "motorcycle"):
+                        lean = (
+                            yaw
+                            + np.pi * rng.integers(2)
+                            + rng.normal(0, 0.3)
+                            + (np.pi / 2 if rng.random() < 0.3 else 0.0)
+                        )
+                        out.add_user(
+                            kind, place, lean, margin=-0.2, kinds="parked motorcycle" if kind == "motorcycle" else ""
+                        )
                     else:
-                        out.add_small(out.one_of(AT_WALLS), place, yaw, 0.5)
+                        out.add_small(kind, place, yaw, 0.5)
             s += length + (rng.uniform(1, 9) if rng.random() < 0.4 else 0.0)
 
 
