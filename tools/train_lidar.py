@@ -66,6 +66,8 @@ START_BATCHES, START_RATE = 4, 1.5e-3
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
 CELLS = {"vehicle": 256, "roadside": 192}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
+# Largest distance of a grid's middle from the sensor along an axis: with half a grid, as far as the network is to look.
+SHIFT_M = {"vehicle": 22.0, "roadside": 10.0}
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ ROUNDS = {
     "roadside": (Round(1, 3_000, 4_500), Round(2, 400, 5_000, rate=1.2e-3), Round(3, 3_000, 9_000, rate=1.5e-3)),
 }
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
-RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
+RANGE_M = {"vehicle": 54.0, "roadside": 30.0}
 
 
 def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
@@ -179,7 +181,7 @@ def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
     samples, lows, grids = [], [], []
     for _ in range(BATCH):
         sample = augmented(pool.draw(rng), rng)
-        low = window_of(rng, cells, cell_m)
+        low = window_of(rng, cells, cell_m, SHIFT_M[mount])
         samples.append(sample)
         lows.append(low)
         grids.append(grid_of(sample, low, cells, cell_m))
