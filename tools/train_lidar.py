@@ -9,10 +9,11 @@
     python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
 
 The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close beside the sensor's car, end-on and at
-walls, and are means with them:
+walls, and are means with what they went on from:
 
     python tools/train_lidar.py vehicle B --scenes 6000 --steps 15000 --seed 3 --start A.onnx --blend A.onnx --share 0.5
     python tools/train_lidar.py vehicle C --scenes 6000 --steps 12000 --seed 4 --start B/vehicle.onnx --blend A.onnx --share 0.25
+    python tools/train_lidar.py vehicle D --scenes 2500 --steps 5000 --seed 5 --start C/vehicle.onnx --blend C/vehicle.onnx --share 0.25
 
 --data, of which every n-th sweep is taken, may be given several times; --only does one of generate, fit and finish; --seed holds with --scenes or
 --steps; --bfloat16 takes a third less time where the processor has it; the weights are averaged with those of --blend, which count --share; scores
