@@ -16,11 +16,11 @@ from log2sim.logs.opening import open_log
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.sightings import sighting, with_sightings
-from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
-from log2sim.resim.surfels import Surfels, smallest_axis
+from log2sim.resim.simulate import Simulation, resimulate, seeing, simulate, with_sensors
+from log2sim.resim.surfels import Surfels, joined, smallest_axis
 from log2sim.resim.world import World, body_of, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
-from log2sim.simulation.runner import replay
+from log2sim.simulation.runner import open_world, replay
 from log2sim.synth import Scene, load_scene, synthesize
 from log2sim.visualization.plot.encoding import choose_film_file
 from log2sim.visualization.sensor_film import write_film
@@ -57,6 +57,48 @@ def test_a_plane_of_discs_is_met_where_the_plane_is() -> None:
     expected = -1.8 * normal[2] / (ray @ normal)
     near = (expected > 0) & (expected < 15)
     np.testing.assert_allclose(cast(shots_toward(ray[near]), plane)[:], expected[near], rtol=1e-4)
+
+
+def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do() -> None:
+    """Of an ego that turns: LiDARs that spin, and one that looks everywhere all the time."""
+    grid = np.stack(np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25)), -1).reshape(-1, 2)
+    plane = disc_surfels(np.column_stack([grid, -1.8 + 0 * grid[:, 0]]), np.tile([0.0, 0, 1], (len(grid), 1)), 0.25)
+    wall = np.stack(np.meshgrid(np.arange(-20, 20, 0.1), np.arange(-1.8, 4, 0.1)), -1).reshape(-1, 2)
+    wall = np.column_stack([wall[:, 0], 0 * wall[:, 0] + 6, wall[:, 1]])
+    plane = joined([plane, disc_surfels(wall, np.tile([0.0, -1, 0], (len(wall), 1)), 0.1)])
+    rng = np.random.default_rng(2)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(-0.6, 0.1, 6000)
+    ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
+    spinning = (azimuth + np.pi) / (2 * np.pi) * 0.1
+    for speed_mps, t_s, tolerance_m in (
+        (15, spinning, 0.01),
+        (30, spinning, 1e-4),
+        (30, rng.uniform(0, 0.1, 6000), 1e-4),
+    ):
+        moment = (t_s / 0.0002).astype(int)
+        poses = np.tile(np.eye(4), (501, 1, 1))
+        yaw, x = 0.3 * np.arange(501) * 0.0002, speed_mps * np.arange(501) * 0.0002
+        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = (
+            np.cos(yaw),
+            -np.sin(yaw),
+            np.sin(yaw),
+            np.cos(yaw),
+        )
+        poses[:, 0, 3] = x
+        shots = replace(shots_toward(ray), t_ns=(t_s * NS_PER_S).astype(np.int64))
+        rays = rays_in_map(shots, poses, moment)
+        met = meetings(rays, grid_of(rays), plane, plane.center_m - rays.shift_m.astype(np.float32), plane.normal)
+        found = first_hits(met, plane, len(ray), rng).range_m
+        world = np.einsum("nij,nj->ni", poses[moment, :3, :3], ray)
+        with np.errstate(divide="ignore"):
+            down, left = -1.8 / world[:, 2], 6 / world[:, 1]
+        expected = np.minimum(np.where(down > 0, down, np.inf), np.where(left > 0, left, np.inf))
+        there = (expected < 12) & (np.abs(x[moment] + world[:, 0] * expected) < 19)
+        there &= np.abs(azimuth) < np.deg2rad(178)  # what the first and the last rays see has two places
+        assert there.sum() > 2000
+        off = np.abs(found[there] - expected[there])
+        assert np.isfinite(off).mean() > 0.98
+        assert np.quantile(off, 0.97) < tolerance_m
 
 
 def test_the_nearer_of_two_discs_stops_a_ray_and_one_of_a_fence_its_share() -> None:
@@ -252,17 +294,22 @@ def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], worl
     log, truth = recorded
     (name,) = log.lidars
     ahead: list[float] = []
+    first: list[np.ndarray] = []
 
     def drive(observation: Observation) -> Controls:
         if len(ahead) < 2 and observation.t_s >= len(ahead) * 1.5:
             # The house beside the street: 10 m to the left of the path, wherever along it the ego is.
             points = observation.sweep(name).xyz_m
+            first.append(points)
             beside = (np.abs(points[:, 0]) < 5) & (points[:, 1] > 3) & (points[:, 2] > 0)
             ahead.append(float(np.median(points[beside, 1])))
         return Controls(0.0, 0.0)
 
-    replay(truth, ego=with_sensors(drive, Simulation(log, world, truth)), dt_s=0.05)
+    simulation = Simulation(log, world, truth)
+    replay(truth, ego=with_sensors(drive, simulation), dt_s=0.05)
     assert len(ahead) == 2
+    stepped = open_world(truth, dt_s=0.05)
+    np.testing.assert_array_equal(seeing(stepped.observe(), simulation).sweep(name).xyz_m, first[0])
     np.testing.assert_allclose(ahead, 10 + 1.8, atol=0.3)
     with pytest.raises(ConfigError, match="no sensors are simulated"):
         replay(truth, ego=lambda observation: observation.sweep(name), dt_s=0.05)  # type: ignore[arg-type,return-value]

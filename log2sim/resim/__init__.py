@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from log2sim.resim.simulate import Simulation, resimulate, simulate, with_sensors
+from log2sim.resim.simulate import Simulation, resimulate, seeing, simulate, with_sensors
 
-__all__ = ["Simulation", "resimulate", "simulate", "with_sensors"]
+__all__ = ["Simulation", "resimulate", "seeing", "simulate", "with_sensors"]

@@ -6,6 +6,7 @@ Splatting of surfels (Zwicker et al., SIGGRAPH 2001) with the plane of each disc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,15 @@ from log2sim.resim.rays import Floats, Rays, bin_of
 from log2sim.resim.surfels import Surfels
 
 CELL_RAD, ROW_RAD = np.float32(np.deg2rad(0.1)), np.float32(np.deg2rad(0.2))  # of azimuth and of elevation
-MARGIN_RAD = np.float32(np.deg2rad(0.05))  # around what a disc covers, for what angles leave out
+MARGIN = np.float32(
+    1.1
+)  # of half the angles that a disc covers: meanwhile a fast ego comes a tenth nearer to what is beside it
 MAX_HALF_WIDTH_RAD = np.float32(np.deg2rad(20.0))  # of a disc in the sensor's picture
 MIN_RANGE_M = 0.5
-CHUNK = 150_000  # discs at a time: their columns stay in the cache
+CHUNK = 30_000  # discs at a time: their columns stay in the cache
+SAME_START_M = np.float32(
+    0.005
+)  # rays that look one way start there, a quarter of the usual noise; those of some LiDARs do not
 THICKNESS_M = 0.08  # discs this far behind the first one, across their plane, are the same surface
 MIN_FACING = 0.02
 
@@ -29,6 +35,7 @@ class RayGrid:
     ray: NDArray[np.intp]  # (E,): index of a ray
     azimuth: Floats  # (E,)
     elevation: Floats  # (E,)
+    direction: Floats  # (3, E): in the axes of the map
     start: NDArray[np.int32]  # (R * C + 1,): first entry of each cell
     columns: int
     # (B + 1,): how many of the B rows of `ROW_RAD` from `low_el` up to each have a ray; others are left out
@@ -61,7 +68,9 @@ def grid_of(rays: Rays) -> RayGrid:
     order = np.argsort(cell, kind="stable")
     start = np.zeros(rows * columns + 1, np.int32)
     np.cumsum(np.bincount(cell, minlength=rows * columns), out=start[1:])
-    return RayGrid(index[order], azimuth[order], elevation[order], start, columns, rank, low_az, np.float32(low_el))
+    index = index[order]
+    direction = np.ascontiguousarray(rays.direction[index].T)
+    return RayGrid(index, azimuth[order], elevation[order], direction, start, columns, rank, low_az, np.float32(low_el))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +98,12 @@ def meetings(rays: Rays, grid: RayGrid, surfels: Surfels, center: Floats, normal
 def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floats, first: int) -> Meetings:
     to_sensor = rays.bin_T_map.astype(np.float32)
     middle = to_sensor[len(to_sensor) // 2]
-    seen = center @ middle[:3, :3].T + middle[:3, 3]
-    bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
-    # Where the sensor is when it looks there.
-    turn = to_sensor[:, :3].reshape(-1, 12).take(bins, axis=0)
-    x, y, z = (_along(turn, axis, center) + turn[:, 4 * axis + 3] for axis in range(3))
+    bins = bin_of(np.arctan2(_row(middle, 1, center.T), _row(middle, 0, center.T)))
+    # Where the sensor is when it looks there, and the discs from there.
+    start = -np.einsum("bji,bj->bi", rays.bin_T_map[:, :3, :3], rays.bin_T_map[:, :3, 3]).astype(np.float32)
+    offset = np.stack([center[:, axis] - start[:, axis].take(bins) for axis in range(3)])
+    turn = [[to_sensor[:, i, j].take(bins) for j in range(3)] for i in range(3)]
+    x, y, z = (_dot(turn[axis], offset) for axis in range(3))
     flat_m = np.sqrt(x * x + y * y)
     distance = np.sqrt(flat_m * flat_m + z * z)
     elevation = np.arctan2(z, flat_m)
@@ -102,51 +112,56 @@ def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floa
     low_row, high_row = grid.rows_of(elevation, np.minimum((radius + rays.spread_m) / free, MAX_HALF_WIDTH_RAD))
     own = np.flatnonzero((high_row > low_row) & (distance > MIN_RANGE_M / 2))
     x, y, z, flat_m, distance, elevation, free, radius = (
-        v[own] for v in (x, y, z, flat_m, distance, elevation, free, radius)
+        v.take(own) for v in (x, y, z, flat_m, distance, elevation, free, radius)
     )
-    center, normal, turn = center[own], normal[own], turn[own]
+    offset, turn = offset.take(own, axis=1), [[v.take(own) for v in row] for row in turn]
+    normal = normal.take(own, axis=0).T.copy()
+    # What has no plane faces the sensor.
+    rough = ~normal.any(axis=0)
+    normal[:, rough] = offset[:, rough] / distance[rough]
     azimuth = np.arctan2(y, x)
     # Half the angles that a disc covers: less for one that is seen from its side.
-    nx, ny, nz = (_along(turn, axis, normal) for axis in range(3))
+    nx, ny, nz = (_dot(turn[axis], normal) for axis in range(3))
     across = (x * ny - y * nx) / np.maximum(flat_m, 0.01)
     upward = (flat_m * nz - z * (x * nx + y * ny) / np.maximum(flat_m, 0.01)) / np.maximum(distance, 0.01)
     half_az = (radius * np.sqrt(np.maximum(1 - across**2, 0)) + rays.spread_m) / np.maximum(
         free * flat_m / np.maximum(distance, 0.01), 0.1
     )
     half_el = (radius * np.sqrt(np.maximum(1 - upward**2, 0)) + rays.spread_m) / free
-    half_az, half_el = np.minimum(half_az, MAX_HALF_WIDTH_RAD), np.minimum(half_el, MAX_HALF_WIDTH_RAD)
+    half_az, half_el = (np.minimum(half * MARGIN, MAX_HALF_WIDTH_RAD) for half in (half_az, half_el))
     low_row, high_row = grid.rows_of(elevation, half_el)
     disc, row = _expanded(np.arange(len(own)), low_row, high_row)
+    row *= grid.columns
     low = ((azimuth - half_az - grid.low_az) / CELL_RAD).astype(np.int64)
-    high = ((azimuth + half_az - grid.low_az) / CELL_RAD).astype(np.int64)
-    begin = grid.start[row * grid.columns + low[disc]].astype(np.int64)
-    end = grid.start[row * grid.columns + high[disc] + 1].astype(np.int64)
-    some = end > begin
-    disc, entry = _expanded(disc[some], begin[some], end[some])
+    high = ((azimuth + half_az - grid.low_az) / CELL_RAD).astype(np.int64) + 1
+    begin = grid.start.take(row + low.take(disc)).astype(np.int64)
+    end = grid.start.take(row + high.take(disc)).astype(np.int64)
+    some = np.flatnonzero(end > begin)
+    disc, entry = _expanded(disc.take(some), begin.take(some), end.take(some))
     # Cells are wider than what a disc covers of them.
-    inside = np.abs(grid.azimuth.take(entry) - azimuth.take(disc)) < (half_az + MARGIN_RAD).take(disc)
-    inside &= np.abs(grid.elevation.take(entry) - elevation.take(disc)) < (half_el + MARGIN_RAD).take(disc)
+    inside = np.abs(grid.azimuth.take(entry) - azimuth.take(disc)) < half_az.take(disc)
+    inside &= np.abs(grid.elevation.take(entry) - elevation.take(disc)) < half_el.take(disc)
     kept = np.flatnonzero(inside)
-    disc, ray = disc.take(kept), grid.ray.take(entry.take(kept))
+    disc, entry = disc.take(kept), entry.take(kept)
     # Column by column: sums over three axes by einsum take three times as long.
-    slope, along, plane, away2 = np.zeros((4, len(ray)), np.float32)
-    for axis in range(3):
-        d, n = rays.direction[:, axis].take(ray), normal[:, axis].take(disc)
-        offset = center[:, axis].take(disc) - rays.origin[:, axis].take(ray)
-        slope += n * d
-        along += offset * d
-        plane += n * offset
-        away2 += offset * offset
-    rough = ((nx == 0) & (ny == 0) & (nz == 0)).take(disc)
+    ray = [grid.direction[axis].take(entry) for axis in range(3)]
+    facing = [normal[axis].take(disc) for axis in range(3)]
+    apart = [offset[axis].take(disc) for axis in range(3)]
+    plane, away2 = _dot(normal, offset).take(disc), (distance * distance).take(disc)
+    if rays.spread_m > SAME_START_M:
+        whose, begins = grid.ray.take(entry), start[bins[own]]
+        apart = [apart[k] + begins[:, k].take(disc) - rays.origin[:, k].take(whose) for k in range(3)]
+        plane, away2 = _dot(facing, apart), _dot(apart, apart)
+    slope, along = _dot(ray, facing), _dot(ray, apart)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(rough, along, plane / slope)
+        t = plane / slope
     # From the middle of the disc to where the ray meets its plane.
     off2 = t * (t - 2 * along) + away2
     weight = np.asarray(1 - off2 / (radius * radius).take(disc), np.float32)
-    facing = np.where(rough, np.float32(1), np.abs(slope))
-    met = np.flatnonzero((weight > 0) & (t > MIN_RANGE_M) & (facing > MIN_FACING))
+    slope = np.abs(slope)
+    met = np.flatnonzero((weight > 0) & (t > MIN_RANGE_M) & (slope > MIN_FACING))
     surfel = (own.take(disc.take(met)) + first).astype(np.int32)
-    return Meetings(ray.take(met), surfel, t.take(met), facing.take(met), weight.take(met))
+    return Meetings(grid.ray.take(entry.take(met)), surfel, t.take(met), slope.take(met), weight.take(met))
 
 
 def _expanded(
@@ -160,10 +175,15 @@ def _expanded(
     return np.repeat(index, count), number
 
 
-def _along(turn: Floats, axis: int, vector: Floats) -> Floats:
-    """Return a coordinate (N,) of vectors (N, 3) that rows (N, 12) of poses turn."""
-    first = 4 * axis
-    out: Floats = turn[:, first] * vector[:, 0] + turn[:, first + 1] * vector[:, 1] + turn[:, first + 2] * vector[:, 2]
+def _dot(a: Any, b: Any) -> Floats:
+    """Return the products (N,) of vectors whose three columns are given."""
+    out: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return out
+
+
+def _row(pose: Floats, axis: int, points: Any) -> Floats:
+    """Return a coordinate (N,) of points, whose three columns are given, moved by a pose (4, 4)."""
+    out: Floats = _dot(pose[axis], points) + pose[axis, 3]
     return out
 
 

@@ -280,14 +280,17 @@ def rays_in_map(shots: Shots, map_T_sensor: Array, moment: NDArray[np.intp]) -> 
     local = map_T_sensor.copy()
     local[:, :3, 3] -= shift
     azimuth, elevation = angles_of(shots.direction)
-    direction = np.einsum("nij,nj->ni", local[moment, :3, :3].astype(np.float32), shots.direction)
+    # Column by column: einsum takes several times as long.
+    turn, ray = local[:, :3, :3].astype(np.float32), shots.direction.T
+    direction = np.stack([sum(turn[:, i, j].take(moment) * ray[j] for j in range(3)) for i in range(3)], axis=1)
     bins = bin_of(azimuth)
     count = np.bincount(bins, minlength=TIME_BINS)
     begin = int(shots.t_ns.min())
     mean = np.bincount(bins, shots.t_ns - begin, TIME_BINS) / np.maximum(count, 1)
     of_moment = np.bincount(bins, moment, TIME_BINS) / np.maximum(count, 1)
     known = np.flatnonzero(count)
-    nearest = known[np.abs(wrap_angle((np.arange(TIME_BINS)[:, None] - known) * 2 * np.pi / TIME_BINS)).argmin(axis=1)]
+    nearest, empty = np.arange(TIME_BINS), np.flatnonzero(count == 0)
+    nearest[empty] = known[np.abs(wrap_angle((empty[:, None] - known) * 2 * np.pi / TIME_BINS)).argmin(axis=1)]
     poses = local[np.rint(of_moment[nearest]).astype(np.intp)]
     origin = local[moment, :3, 3]
     spread = np.linalg.norm(origin - poses[bins, :3, 3], axis=1)

@@ -142,8 +142,16 @@ class Simulation:
 
 
 def with_sensors(policy: Policy, simulation: Simulation) -> Policy:
-    """Return a policy of the ego that also sees: its observations have `sweep(name)` and `image(name)`, from where it drives now."""
+    """Return a policy of the ego that also sees: its observations have `sweep(name)` and `image(name)`, from where it drives now.
+
+    Whoever steps a world by `open_world` gets such observations from `seeing`.
+    """
     return _SeeingPolicy(policy, simulation)
+
+
+def seeing(observation: Observation, simulation: Simulation) -> Observation:
+    """Return an observation that also sees, as of `with_sensors`; a sweep is cast, a picture made, when it is asked for."""
+    return replace(observation, look=partial(_look, simulation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,33 +163,34 @@ class _SeeingPolicy:
         reset_policy(self.inner, scenario)
 
     def __call__(self, observation: Observation) -> Controls:
-        return self.inner(replace(observation, look=self.look))
+        return self.inner(seeing(observation, self.simulation))
 
-    def look(self, observation: Observation, kind: Literal["sweep", "image"], name: str) -> Any:
-        """Look through a sensor, by the speeds of now where that takes time; a LiDAR sends the rays of the recorded sweep nearest in time."""
-        simulation, log, source = self.simulation, self.simulation.log, self.simulation.scenario
-        usable = [n for n in simulation.sensors if n in (log.lidars if kind == "sweep" else log.cameras)]
-        if name not in usable:
-            raise ConfigError(f"{kind} '{name}': no such sensor; simulated are {', '.join(usable) or 'none'}")
-        now_ns = source.t0_ns + round(observation.t_s * NS_PER_S)
 
-        def steady(x: float, y: float, z: float, yaw: float, vx: float, vy: float, speed: float) -> Waypoints:
-            later_s, one = np.array([-1.0, 1.0]), np.ones(2)
-            t_s, x_m, y_m = observation.t_s + later_s, x + vx * later_s, y + vy * later_s
-            return Waypoints(t_s, x_m, y_m, z * one, yaw * one, speed * one, observed=one > 0, sigma_xy_m=0 * one)
+def _look(simulation: Simulation, observation: Observation, kind: Literal["sweep", "image"], name: str) -> Any:
+    """Look through a sensor, by the speeds of now where that takes time; a LiDAR sends the rays of the recorded sweep nearest in time."""
+    log, source = simulation.log, simulation.scenario
+    usable = [n for n in simulation.sensors if n in (log.lidars if kind == "sweep" else log.cameras)]
+    if name not in usable:
+        raise ConfigError(f"{kind} '{name}': no such sensor; simulated are {', '.join(usable) or 'none'}")
+    now_ns = source.t0_ns + round(observation.t_s * NS_PER_S)
 
-        o, ego = observation.others, observation.ego
-        columns = (o.x_m, o.y_m, o.z_m, o.yaw_rad, o.velocity_x_mps, o.velocity_y_mps, o.speed_mps)
-        moving = {str(id): steady(*(float(c[k]) for c in columns)) for k, id in enumerate(o.id)}
-        heading = ego.speed_mps * np.cos(ego.yaw_rad), ego.speed_mps * np.sin(ego.yaw_rad)
-        moving[EGO] = steady(ego.x_m, ego.y_m, ego.z_m, ego.yaw_rad, *heading, ego.speed_mps)
-        agents = tuple(replace(a, waypoints=moving[a.id], static=False) for a in source.agents if a.id in moving)
-        present = replace(simulation, scenario=replace(source, agents=agents))
-        if kind == "image":
-            return present.picture(name, now_ns)[0]
-        shots = simulation.shots(name, int(nearest_index(log.streams[name].t_ns, [now_ns])[0]))
-        shots = replace(shots, t_ns=shots.t_ns + (now_ns - int(shots.t_ns.max())))
-        return present.cast(name, shots, present.driven, now_ns, np.random.default_rng([simulation.seed, now_ns]))[0]
+    def steady(x: float, y: float, z: float, yaw: float, vx: float, vy: float, speed: float) -> Waypoints:
+        later_s, one = np.array([-1.0, 1.0]), np.ones(2)
+        t_s, x_m, y_m = observation.t_s + later_s, x + vx * later_s, y + vy * later_s
+        return Waypoints(t_s, x_m, y_m, z * one, yaw * one, speed * one, observed=one > 0, sigma_xy_m=0 * one)
+
+    o, ego = observation.others, observation.ego
+    columns = (o.x_m, o.y_m, o.z_m, o.yaw_rad, o.velocity_x_mps, o.velocity_y_mps, o.speed_mps)
+    moving = {str(id): steady(*(float(c[k]) for c in columns)) for k, id in enumerate(o.id)}
+    heading = ego.speed_mps * np.cos(ego.yaw_rad), ego.speed_mps * np.sin(ego.yaw_rad)
+    moving[EGO] = steady(ego.x_m, ego.y_m, ego.z_m, ego.yaw_rad, *heading, ego.speed_mps)
+    agents = tuple(replace(a, waypoints=moving[a.id], static=False) for a in source.agents if a.id in moving)
+    present = replace(simulation, scenario=replace(source, agents=agents))
+    if kind == "image":
+        return present.picture(name, now_ns)[0]
+    shots = simulation.shots(name, int(nearest_index(log.streams[name].t_ns, [now_ns])[0]))
+    shots = replace(shots, t_ns=shots.t_ns + (now_ns - int(shots.t_ns.max())))
+    return present.cast(name, shots, present.driven, now_ns, np.random.default_rng([simulation.seed, now_ns]))[0]
 
 
 def ego_poses(log: Log, scenario: Scenario) -> PoseTrack | None:

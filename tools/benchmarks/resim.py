@@ -2,7 +2,7 @@
 
 python tools/bench.py resim samples/crossing out/scenario.json
 python tools/bench.py resim samples/crossing out/scenario.json --figures pictures --camera front
-python tools/bench.py resim samples/scenes/bare.toml --figures sweeps
+python tools/bench.py resim samples/scenes/bare.toml --figures sweeps --turned 5
 python tools/bench.py resim samples/crossing.toml --figures pictures --sideways -1 --sideways -3
 python tools/bench.py resim samples/crossing out/scenario.json --circle out/edited.json
 python tools/bench.py resim samples/crossing out/scenario.json --picture out/sweeps.jpg --without bus-1
@@ -39,6 +39,7 @@ from log2sim.pipeline import reconstruct
 from log2sim.resim.cameras import Pictures
 from log2sim.resim.rays import Shots, all_shots, poses_of, recorded_shots
 from log2sim.resim.simulate import Simulation, simulated_log
+from log2sim.resim.surfels import Surfels
 from log2sim.resim.world import World, build_world
 from log2sim.scenarios import find_tags
 from log2sim.synth import load_scene, synthesize
@@ -46,41 +47,86 @@ from log2sim.visualization.sensor_film import range_image, title_line, window_of
 
 EVERY = 5
 LIMIT_M = 40.0
+NEAR_M = 0.1  # scale of the density-aware Chamfer distance: three times the error of range that is wanted
+GROUND_STEP_M, GROUND_REACH_M = 0.7, 50.0  # of the baseline's flat ground, around the path
 FIGURES, SIDEWAYS_M = ("sweeps", "boxes", "pictures"), (0.0, 0.5, 1.0, 2.0, 3.0)
 SWEEP, EVERY_SIDEWAYS = 22, 7  # that is drawn; of a scene so many sweeps are compared
 Figures = dict[str, float]
 
 
-def compare(shots: Shots, points: Array, rows: Array) -> Figures:
-    """Compare returns of rays; `points` (P, 3) simulated, in the sensor's frame, of the rays `rows` (P,)."""
-    simulated = np.full(len(shots.t_ns), np.nan)
-    simulated[rows] = np.linalg.norm(points, axis=1)
+def compare(shots: Shots, sweep: Sweep, rows: Array) -> Figures:
+    """Compare returns of rays; `sweep` has one point, in the sensor's frame, for each of the rays `rows` (P,).
+
+    Intensity is compared where both rays return: the median error as a share of the mean.
+    """
+    simulated, strength = np.full((2, len(shots.t_ns)), np.nan)
+    simulated[rows] = np.linalg.norm(sweep.xyz_m, axis=1)
     came, comes = np.isfinite(shots.range_m), np.isfinite(simulated)
     near = came & comes & (shots.range_m < LIMIT_M)
     error = np.abs(simulated - shots.range_m)[near]
     true = (shots.direction * shots.range_m[:, None])[came & (shots.range_m < LIMIT_M)]
-    return {
-        "median m": float(np.median(error)),
-        "90 % m": float(np.quantile(error, 0.9)),
+    figures = {
+        "median m": float(np.median(error)), "90 % m": float(np.quantile(error, 0.9)),
         "return right": float((came == comes).mean()),
-        **chamfer(true, points[np.linalg.norm(points, axis=1) < LIMIT_M]),
-    }
+    }  # fmt: skip
+    if sweep.intensity is not None and np.isfinite(shots.intensity[near]).any():
+        strength[rows] = sweep.intensity
+        figures["intensity"] = float(
+            np.nanmedian(np.abs(strength - shots.intensity)[near]) / np.nanmean(shots.intensity[near])
+        )
+    return figures | chamfer(true, sweep.xyz_m[simulated[rows] < LIMIT_M])
 
 
 def chamfer(true: Array, found: Array) -> Figures:
-    """Return the mean distance of either cloud's points to the other, m."""
-    return {"Chamfer m": float((cKDTree(true).query(found)[0].mean() + cKDTree(found).query(true)[0].mean()) / 2)}
+    """Return the mean distance of either cloud's points to the other, m, and the density-aware one (Wu et al., NeurIPS 2021), 0 to 1.
+
+    In the latter a point counts exp(-distance / 0.1 m), shared by all whose nearest point is the same.
+    """
+    means, aware = [], []
+    for a, b in ((true, found), (found, true)):
+        distance, nearest = cKDTree(b).query(a)
+        sharing = np.bincount(nearest, minlength=len(b))[nearest]
+        means.append(distance.mean())
+        aware.append((1 - np.exp(-distance / NEAR_M) / sharing).mean())
+    return {"Chamfer m": float(np.mean(means)), "density-aware": float(np.mean(aware))}
 
 
-def moved_sweep(log: Log, name: str, source: int, target: int) -> Array:
-    """Return the points of one sweep where the sensor sees them at the stamp of another: the baseline."""
+def moved_sweep(log: Log, name: str, source: int, target: int) -> Sweep:
+    """Return one sweep where the sensor sees its points at the stamp of another: the baseline."""
     t_ns = log.streams[name].t_ns
     shots = recorded_shots(log, name, log.streams[name].read(source))
     poses, moment, _ = poses_of(log, name, shots.t_ns)
     points = (
         np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction * shots.range_m[:, None]) + poses[moment, :3, 3]
     )
-    return apply(inverse(log.map_T_sensor(name, t_ns[target : target + 1])[0][0]), points)
+    points = apply(inverse(log.map_T_sensor(name, t_ns[target : target + 1])[0][0]), points)
+    return Sweep(int(t_ns[target]), points, intensity=shots.intensity)
+
+
+def nearest_rays(shots: Shots, sweep: Sweep, gap_rad: float) -> tuple[Sweep, NDArray[np.intp]]:
+    """Return the points of a sweep that rays see, and which: for each ray the nearest point of those less than a gap between lines beside it."""
+    distance = np.linalg.norm(sweep.xyz_m, axis=1)
+    off, ray = cKDTree(shots.direction).query(sweep.xyz_m / distance[:, None])
+    order = np.lexsort((distance, ray))
+    order = order[off[order] < gap_rad / 2]
+    order = order[np.unique(ray[order], return_index=True)[1]]
+    strength = None if sweep.intensity is None else sweep.intensity[order]
+    return replace(sweep, xyz_m=sweep.xyz_m[order], intensity=strength), ray[order]
+
+
+def flat_world(log: Log, world: World) -> World:
+    """Return flat ground along the path and nothing else, so that agents are the bodies of `synth`: the other baseline."""
+    assert log.ego is not None
+    path = log.ego.map_T_ego[:, :3, 3] + log.ego.map_T_ego[:, :3, 2] * log.ground_z_ego_m - world.shift_m
+    low, high = path[:, :2].min(axis=0) - GROUND_REACH_M, path[:, :2].max(axis=0) + GROUND_REACH_M
+    steps = [np.arange(a, b, GROUND_STEP_M) for a, b in zip(low, high)]
+    places = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    away, at = cKDTree(path[:, :2]).query(places)
+    center = np.column_stack([places, path[at, 2]])[away < GROUND_REACH_M].astype(np.float32)
+    one = np.ones(len(center), np.float32)
+    up = np.tile(np.array([0, 0, 1], np.float32), (len(center), 1))
+    ground = Surfels(center, up, one * np.float32(GROUND_STEP_M), one, one, one)
+    return replace(world, given=None, refined=None, background=ground, agents={}, sightings={})
 
 
 def left_out(_: str, i: int) -> bool:
@@ -89,19 +135,25 @@ def left_out(_: str, i: int) -> bool:
 
 
 def held_out(log: Log, scenario: Scenario, name: str, world: World) -> list[tuple[str, Figures]]:
-    simulation, simulated, moved, cast_s = Simulation(log, world, scenario), [], [], []
+    simulation, cast_s, sent = Simulation(log, world, scenario), 0.0, 0
+    bodies = Simulation(log, flat_world(log, world), scenario)
+    rows: dict[str, list[Figures]] = {"held out": [], "nearest sweep, moved": [], "bodies on flat ground": []}
     for i in range(EVERY // 2, len(log.streams[name].t_ns), EVERY):
         shots = simulation.shots(name, i)
         begin = time.process_time()
-        sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(i))
-        cast_s.append(time.process_time() - begin)
-        simulated.append(compare(shots, sweep.xyz_m, rows))
-        true = shots.direction * shots.range_m[:, None]
-        true = true[shots.range_m < LIMIT_M]
-        baseline = moved_sweep(log, name, i - 1, i)
-        moved.append(chamfer(true, baseline[np.linalg.norm(baseline, axis=1) < LIMIT_M]))
-    speed = {"sweeps/s": 1 / float(np.mean(cast_s)), "surfels": float(len(world.background))}
-    return [("held out", {**mean(simulated), **speed}), ("nearest sweep, moved", mean(moved))]
+        simulated = simulation.cast(name, shots, log, 0, np.random.default_rng(i))
+        cast_s, sent = cast_s + time.process_time() - begin, sent + len(shots.t_ns)
+        moved = moved_sweep(log, name, i - 1, i)
+        of_rays = nearest_rays(shots, moved, world.models[name].pattern.gap_rad)
+        drawn = bodies.cast(name, shots, log, 0, np.random.default_rng(i))
+        for of, (sweep, ray) in zip(rows.values(), (simulated, of_rays, drawn)):
+            of.append(compare(shots, sweep, ray))
+        # Clouds are compared whole.
+        near = [p[np.linalg.norm(p, axis=1) < LIMIT_M] for p in (shots.direction * shots.range_m[:, None], moved.xyz_m)]
+        rows["nearest sweep, moved"][-1].update(chamfer(*near))
+    count = len(rows["held out"])
+    speed = {"sweeps/s": count / cast_s, "rays": sent / count, "surfels": float(len(world.background))}
+    return [(title, mean(of) | (speed if title == "held out" else {})) for title, of in rows.items()]
 
 
 def found_again(overlap: NDArray[np.floating], least: float) -> Figures:
@@ -235,17 +287,19 @@ def draw_sweep(log: Log, scenario: Scenario, name: str, without: str, path: Path
     cv2.imwrite(str(path), np.vstack(parts))
 
 
-def sweeps_sideways(scene_path: Path, meters: list[float]) -> list[tuple[str, Figures]]:
-    """Cast from beside the sensor that recorded, and compare with the true sweep from there."""
+def sweeps_sideways(scene_path: Path, meters: list[float], degrees: list[float]) -> list[tuple[str, Figures]]:
+    """Cast from where the ego were beside its path or turned, and compare with the true sweep from there."""
     scene = load_scene(scene_path).model_copy(update={"camera": ()})
     log, truth = synthesize(scene, observe=False)
     name = scene.lidar[0].name
     world = build_world(log, truth, [name])
     out = []
-    for off_m in meters:
-        spec = scene.lidar[0]
-        place = (spec.position_m[0], spec.position_m[1] + off_m, spec.position_m[2])
-        lidars = (spec.model_copy(update={"position_m": place}), *scene.lidar[1:])
+    for off_m, turned_deg in [*((m, 0.0) for m in meters), *((0.0, d) for d in degrees)]:
+        spec, c, s = scene.lidar[0], np.cos(np.deg2rad(turned_deg)), np.sin(np.deg2rad(turned_deg))
+        x, y, z = spec.position_m
+        place = (float(c * x - s * y), float(s * x + c * y) + off_m, z)
+        there = spec.model_copy(update={"position_m": place, "yaw_deg": spec.yaw_deg + turned_deg})
+        lidars = (there, *scene.lidar[1:])
         true_log = synthesize(scene.model_copy(update={"lidar": lidars}), observe=False)[0].changed(ego=log.ego)
         simulation, figures = Simulation(log, world, truth), []
         for i in range(0, len(log.streams[name].t_ns), EVERY_SIDEWAYS):
@@ -253,8 +307,8 @@ def sweeps_sideways(scene_path: Path, meters: list[float]) -> list[tuple[str, Fi
                 recorded_shots(true_log, name, true_log.streams[name].read(i)), world.models[name].pattern
             )
             sweep, rows = simulation.cast(name, shots, true_log, 0, np.random.default_rng(i))
-            figures.append(compare(shots, sweep.xyz_m, rows))
-        out.append((f"{off_m:g} m sideways", mean(figures)))
+            figures.append(compare(shots, sweep, rows))
+        out.append((f"{turned_deg:g} degrees turned" if turned_deg else f"{off_m:g} m sideways", mean(figures)))
     return out
 
 
@@ -285,7 +339,7 @@ def mean(figures: list[Figures]) -> Figures:
 
 def main(
     path: Path, scenario_path: Annotated[Path | None, typer.Argument(metavar="SCENARIO")] = None, figures: list[str] = list(FIGURES),
-    camera: str = "", count: int = 8, sideways: list[float] = list(SIDEWAYS_M), circle: Path | None = None, picture: Path | None = None,
+    camera: str = "", count: int = 8, sideways: list[float] = list(SIDEWAYS_M), turned: list[float] = [], circle: Path | None = None, picture: Path | None = None,
     without: str = "",
 ) -> None:  # fmt: skip
     """Measure a log beside what was reconstructed from it, or a scene file from beside its path.
@@ -293,7 +347,7 @@ def main(
     `figures` of sweeps, boxes and `count` pictures of a camera; `circle` is an edit of the scenario, `picture` a file for a sweep without an agent.
     """
     if scenario_path is None:
-        rows = sweeps_sideways(path, sideways) if "sweeps" in figures else []
+        rows = sweeps_sideways(path, sideways, turned) if "sweeps" in figures else []
         rows += pictures_sideways(path, sideways) if "pictures" in figures else []
     else:
         scenario = Scenario.load(scenario_path)
