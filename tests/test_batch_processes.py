@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from batch_logs import FAST, install_reader, lay_out_logs, tell
+from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.batch.discovery import find_logs
@@ -176,3 +178,24 @@ def test_the_workers_of_a_scheduler_run_a_batch_and_go_on_for_others(
 
     with Client(scheduler, timeout=LIMIT_S) as client:
         assert client.submit(sum, [1, 2]).result(timeout=LIMIT_S) == 3
+
+
+def test_the_workers_of_a_scheduler_find_situations_and_drive_a_policy_as_processes_do(
+    tmp_path: Path, scheduler: str
+) -> None:
+    pytest.importorskip("duckdb")
+    for seed in range(4):
+        traffic(seed, count=8, duration_s=12.0).scenario.save(tmp_path / "found" / f"{seed}" / "scenario.json")
+    (tmp_path / "mine.py").write_text(
+        "from log2sim.simulation.policy import Controls\n\n\ndef full(seen):\n    return Controls(2.5, 0.0)\n"
+    )
+    ran = run("find", tmp_path / "found", "cut_in", "--scheduler", scheduler)
+    assert ran.code == 0, ran.err
+    about = []
+    for name, workers in (("there", ("--scheduler", scheduler)), ("here", ("--jobs", 1))):
+        policy = f"{tmp_path / 'mine.py'}:full"
+        ran = run("test", policy, tmp_path / "found", "cut_in", "-o", tmp_path / name, "--runs", 40, "--worst", 0, *workers)  # fmt: skip
+        assert ran.code == 0, ran.err
+        about.append(json.loads((tmp_path / name / "test.json").read_text()))
+    assert about[0]["failures"] > 0
+    assert about[0] == about[1]

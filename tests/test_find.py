@@ -6,18 +6,21 @@ import ast
 import itertools
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.tags import traffic
+from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.datatypes import TAGS
 from log2sim.errors import ConfigError, ScenarioError
-from log2sim.scenarios import ask, open_index, tag
 from log2sim.scenarios.hits import write_hits
-from log2sim.scenarios.index import INDEX_FILE, Index, table_of_rows
+from log2sim.scenarios.index import INDEX_FILE, Index, open_index, table_of_rows
+from log2sim.scenarios.query import ask
+from log2sim.scenarios.tagging import tag
 
 pytest.importorskip("duckdb")
 pytest.importorskip("pyarrow")
@@ -251,6 +254,19 @@ def test_the_commands(folder, tmp_path) -> None:
     assert "lane_change" in tagged.out
     assert (tmp_path / "c.csv").read_text().startswith("agent,other,t_s,gap_m,")
     assert "exists already" in run("tag", folder / "log-3" / "scenario.json", "-o", tmp_path / "t.json").line
+
+
+def test_a_question_to_an_index_that_is_there_loads_neither_tagging_nor_pandas(folder) -> None:
+    """Each takes longer to import than the question."""
+    run("find", folder, "--jobs", 1)
+    code = f"""import sys
+from pathlib import Path
+from log2sim.scenarios.index import open_index
+from log2sim.scenarios.query import ask
+print(len(ask(open_index(Path({str(folder)!r})), "overtaking").rows) > 0)
+print([m for m in ("pandas", "scipy", "shapely", "log2sim.scenarios.tagging", "log2sim.simulation") if m in sys.modules])"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout == "True\n[]\n"
 
 
 def test_a_hit_is_opened_at_its_moment(folder, tmp_path, monkeypatch) -> None:

@@ -10,7 +10,7 @@ from test_plausibility_conflicts import agent, candidate
 from worlds import rows_at
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.evidence import SIGNS, Recording, continued, gather, missing_nats, remaining
+from log2sim.agents.evidence import SIGNS, Recording, continued, gather, may_suffice, missing_nats, remaining
 from log2sim.agents.judge import MIN_THERE, decide
 from log2sim.agents.rays import Ending, classify_rays, count_rays
 from log2sim.agents.size import static_geometry
@@ -107,10 +107,13 @@ def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
 
 
 @pytest.mark.parametrize(
-    ("way_m", "score", "in_sweeps", "confirmed"),
-    [(0.0, 0.8, True, True), (0.0, 0.5, True, False), (1.5, 0.45, True, False), (8.0, 0.45, True, True), (8.0, 0.45, False, False)],
+    ("way_m", "score", "in_sweeps", "may", "confirmed"),
+    [
+        (0.0, 0.8, True, True, True), (0.0, 0.5, True, False, False), (1.5, 0.45, True, True, False), (1.5, 0.1, True, False, False),
+        (8.0, 0.45, True, True, True), (8.0, 0.45, False, True, False), (8.0, 0.2, False, False, False),
+    ],
 )  # fmt: skip
-def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(way_m, score, in_sweeps, confirmed):
+def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(way_m, score, in_sweeps, may, confirmed):
     found = rows_at(np.zeros((5, 2)), "pedestrian", score=score, camera="" if in_sweeps else "front")
     found = replace(found, t_ns=TIMELINE.t_ns, box_yaw_rad=np.full(5, 0.0 if in_sweeps else np.nan))
     track = Track("pedestrian", np.arange(5), found)
@@ -120,6 +123,8 @@ def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(way_m, score, in
         Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
     )
     assert gather([seen], recording)["confirmed"] == [confirmed]
+    on = replace(found, center_m=found.center_m + np.outer(np.linspace(0, way_m, 5), [1.0, 0.0, 0.0]))
+    assert may_suffice(replace(track, measurements=on), static=way_m == 0) == may
 
 
 VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)

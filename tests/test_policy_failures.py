@@ -8,13 +8,15 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from benchmarks.tags import traffic
+from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.datatypes import EGO, Scenario
 from log2sim.errors import ConfigError
-from log2sim.scenarios import Base, ask, choose_base, fit, open_index
 from log2sim.scenarios.failure import LIMITS, Outcome, judge_run, report_page, search, with_ego
+from log2sim.scenarios.index import open_index
+from log2sim.scenarios.logical import Base, choose_base, fit
+from log2sim.scenarios.query import ask
 from log2sim.simulation.metrics.all_metrics import parse_limits
 from log2sim.simulation.policy import Controls
 
@@ -86,6 +88,16 @@ def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
     assert judge_run(
         base, logical, keeps, {"min_gap_m": free.values["min_gap_m"] + 1}, "scenario", far
     ).margin == pytest.approx(-1)
+
+    # At constant speed along the path nothing is uncomfortable; 20 m/s are a failure where 15 are allowed.
+    assert free.values["max_speed_mps"] == pytest.approx(20.0, abs=0.01)
+    assert free.values["max_jerk_mps3"] < 0.5
+    assert free.values["max_lateral_mps2"] < 0.5
+    fast = judge_run(base, logical, keeps, {"max_speed_mps": 15.0, "max_jerk_mps3": 8.4}, "scenario", far)
+    assert fast.margin == pytest.approx(-5.0, abs=0.01)
+    swerving = judge_run(base, logical, lambda seen: Controls(0.0, 0.03), {"max_off_path_m": 1.0}, "scenario", far)
+    assert swerving.margin == pytest.approx(1.0 - swerving.values["max_off_path_m"])
+    assert swerving.values["max_lateral_mps2"] > free.values["max_lateral_mps2"]
 
     def raises(seen):
         raise ZeroDivisionError("of my own")

@@ -8,7 +8,8 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from benchmarks.tags import Stage, crossing, f1, route, score, scripted, traffic, variants
+from benchmarks.tag_worlds import Stage, crossing, route, scripted, traffic, variants
+from benchmarks.tags import compare, f1, score
 from metric_scenes import agent, scenario
 from scipy.signal import savgol_filter
 
@@ -17,7 +18,7 @@ from log2sim.edit import Remove, edit
 from log2sim.errors import ScenarioError
 from log2sim.geometry import fit_windows, wrap_angle
 from log2sim.scenarios import criticality as c
-from log2sim.scenarios import criticality_table, find_tags, tag
+from log2sim.scenarios.tagging import criticality_table, find_tags, tag
 from log2sim.scenarios.traffic import Traffic, latched, runs
 
 # What has to be reached on the truth.
@@ -50,6 +51,22 @@ def test_scripted_maneuvers_are_found_and_no_others() -> None:
     } <= set(found)
     for true, invented, missed, _, wrong in found.values():
         assert f1(true, invented, missed) >= 0.95 or true + invented + missed == 0, wrong
+
+
+def test_what_a_reconstruction_lacks_is_counted_by_whether_sensors_show_it() -> None:
+    truth = traffic(3).scenario
+    whole = compare(truth, truth)["overtaking"]
+    assert len(whole[0]) > 1
+    assert whole[1:] == [[], []]
+    (first, *_) = [g for g in find_tags(truth) if g.tag == "overtaking" and g.start_s > 0.2 and g.end_s < 13.8]
+    for visible, seen in ((lambda t: t < 0, 0), (lambda t: abs(t - first.t_s) > 0.3, 1), (lambda t: t >= 0, 2)):
+        agents = tuple(
+            replace(a, waypoints=replace(a.waypoints, visible=visible(a.waypoints.t_s))) if a.id == first.agent else a
+            for a in truth.agents
+        )
+        lost = replace(truth, agents=tuple(a for a in truth.agents if a.id != first.agent))
+        missed = compare(lost, replace(truth, agents=agents))["overtaking"][2]
+        assert [s for s, line in missed if line.startswith(f"overtaking {first.agent} {first.other} {first.start_s}")] == [seen]  # fmt: skip
 
 
 @pytest.mark.slow

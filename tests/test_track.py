@@ -184,6 +184,21 @@ def test_a_motorway_is_followed_by_the_velocity_of_the_ego(rate_hz: int) -> None
     assert sum(map(len, tracks)) == sum(map(len, found))
 
 
+@pytest.mark.parametrize("age_s", [-0.09, 0.09])
+def test_cars_close_behind_each_other_are_followed_where_a_sweep_sees_them_before_or_after_its_tick(
+    age_s: float,
+) -> None:
+    """Two at 33 m/s, 7.9 m apart: at 5 Hz each comes near to where the one ahead was."""
+    t_ns = stamps(20, 0.2)
+    ways = {"first": line(-24, 4, 33, 0), "second": line(-31.9, 4, 33, 0)}
+    found = [
+        seen(np.array([way(0.2 * k + age_s) for way in ways.values()]), now_ns + round(age_s * 1e9), list(ways))
+        for k, now_ns in enumerate(t_ns)
+    ]
+    tracks = track(found, t_ns, **OPTIONS, flow_mps=np.tile([32.0, 0.0], (len(t_ns), 1)))
+    assert sorted(names_of(tracks)) == [["first"], ["second"]]
+
+
 def test_a_missed_car_does_not_shift_the_row_behind_it() -> None:
     t_ns = stamps(5, 0.5)
     row = {f"car {k}": (6.5 * k, 4.6) for k in range(6)}

@@ -229,12 +229,13 @@ def test_boxes_in_space_project_into_boxes_in_the_picture(
         around = project_boxes_in_view(view, labels.center_m[rows], labels.size_m[rows], labels.yaw_rad[rows])
         assert around.valid.all()
         silhouette = seen.box_px[seen.t_ns == t_ns]
-        # The silhouette of a vehicle lies within the projected box; what people push or pull is in theirs.
+        # The silhouette of a vehicle lies within the projected box but for rounding and mirrors close by; what people push or pull is in theirs.
         vehicle = np.isin(labels.category[rows], ("car", "truck", "bus"))
         assert (silhouette >= -1).all()
         assert (silhouette <= size_px).all()
-        assert (silhouette[vehicle, :2] > around.box_px[vehicle, :2] - 2).all()
-        assert (silhouette[vehicle, 2:] < around.box_px[vehicle, 2:] + 2).all()
+        outside = 2 + 0.01 * (around.box_px[vehicle, 2:] - around.box_px[vehicle, :2])
+        assert (silhouette[vehicle, :2] > around.box_px[vehicle, :2] - outside).all()
+        assert (silhouette[vehicle, 2:] < around.box_px[vehicle, 2:] + outside).all()
         area = [(box[:, 2:] - box[:, :2]).prod(axis=1) for box in (silhouette, around.box_px)]
         fills += (area[0] / area[1])[vehicle].tolist()
     assert len(fills) >= 4

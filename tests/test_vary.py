@@ -8,14 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.tags import traffic
+from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.scenarios import find_tags, open_index
+from log2sim.scenarios.index import open_index
 from log2sim.scenarios.logical import SAMPLERS, TIMING, Base, Logical, choose_base, concrete, fit, write_openscenario
 from log2sim.scenarios.query import ask
+from log2sim.scenarios.tagging import find_tags
 
 pytest.importorskip("duckdb")
 pytest.importorskip("pyarrow")

@@ -8,8 +8,16 @@
     python tools/train_lidar.py vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
     python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
 
+The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close beside the sensor's car, end-on and at
+walls, and are means with what they went on from:
+
+    python tools/train_lidar.py vehicle B --scenes 6000 --steps 15000 --seed 3 --start A.onnx --blend A.onnx --share 0.5
+    python tools/train_lidar.py vehicle C --scenes 6000 --steps 12000 --seed 4 --start B/vehicle.onnx --blend A.onnx --share 0.25
+    python tools/train_lidar.py vehicle D --scenes 2500 --steps 5000 --seed 5 --start C/vehicle.onnx --blend C/vehicle.onnx --share 0.25
+
 --data, of which every n-th sweep is taken, may be given several times; --only does one of generate, fit and finish; --seed holds with --scenes or
---steps; --bfloat16 takes a third less time where the processor has it; scores are calibrated and tested with so many --examples.
+--steps; --bfloat16 takes a third less time where the processor has it; the weights are averaged with those of --blend, which count --share; scores
+are calibrated and tested with so many --examples.
 """
 
 from __future__ import annotations
@@ -28,7 +36,7 @@ from subprocess import Popen
 import numpy as np
 import torch
 from entry import run
-from lidar_training import fitting
+from lidar_training import export, fitting
 from lidar_training.clouds import (
     REPORTED_KINDS,
     Example,
@@ -61,10 +69,13 @@ HELD_OUT_SHARE = 0.2
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 WARM_UP_STEPS = 100
-START_BATCHES = 4  # to find the moments of the layers of a network that training starts from
+# To find the moments of the layers of a network that training starts from; and the greatest learning rate from there.
+START_BATCHES, START_RATE = 4, 1.5e-3
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
 CELLS = {"vehicle": 256, "roadside": 192}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
+# Largest distance of a grid's middle from the sensor along an axis: with half a grid, as far as the network is to look.
+SHIFT_M = {"vehicle": 22.0, "roadside": 10.0}
 
 
 @dataclass(frozen=True)
@@ -83,7 +94,7 @@ ROUNDS = {
     "roadside": (Round(1, 3_000, 4_500), Round(2, 400, 5_000, rate=1.2e-3)),
 }
 # Largest |x| and |y| from the sensor at run time; the roadside sensor sees cars to some 25 m.
-RANGE_M = {"vehicle": 40.0, "roadside": 30.0}
+RANGE_M = {"vehicle": 54.0, "roadside": 30.0}
 
 
 def generate(mount: str, out: Path, scenes: int, seed: int) -> None:
@@ -177,7 +188,7 @@ def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
     samples, lows, grids = [], [], []
     for _ in range(BATCH):
         sample = augmented(pool.draw(rng), rng)
-        low = window_of(rng, cells, cell_m)
+        low = window_of(rng, cells, cell_m, SHIFT_M[mount])
         samples.append(sample)
         lows.append(low)
         grids.append(grid_of(sample, low, cells, cell_m))
@@ -223,9 +234,13 @@ def fit(
     fitting.fit(network, step_loss, plan)
 
 
-def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = ()) -> None:
+def finish(
+    mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = (), start: Path | None = None,
+    other: Path | None = None, share: float = 0.5,
+) -> None:  # fmt: skip
     """Export, calibrate and report; the files that ship are in `out` afterwards.
 
+    The card tells the rounds of `start`, too. `other` is averaged with the network and counts `share`.
     Without simulated scenes the scores are calibrated and tested on the held-out sweeps; with both, on both.
     """
     seed, simulated = rounds[0].seed, any(r.scenes for r in rounds)
@@ -238,8 +253,16 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
     path = out / f"{mount}.onnx"
     info = description(mount, CELL_M[mount], RANGE_M[mount])
     export_onnx(checkpoint_path(out, len(rounds)), path, info)
+    if other is not None:
+        export.blend(path, other, share)
     info["calibration"] = calibrate(path, calibration)
-    info["card"] = {"mount": mount, "rounds": [asdict(r) for r in rounds], "batch": BATCH, "torch": torch.__version__}
+    before = [] if start is None else open_network(start, LidarConfig(), name=mount).network.info.card.get("rounds", [])
+    info["card"] = {
+        "mount": mount,
+        "rounds": [*before, *(asdict(r) | ({} if other is None else {"blended": share}) for r in rounds)],
+        "batch": BATCH,
+        "torch": torch.__version__,
+    }
     describe(path, info)
     detector = open_network(path, LidarConfig(), name=mount)
     card = info["card"] | {"simulated" if simulated else "own": report(detector, test, range_m=RANGE_M[mount])}
@@ -251,14 +274,15 @@ def finish(mount: str, out: Path, rounds: Sequence[Round], examples: int, held_o
 
 def main(
     mount: Mount, out: Path, data: list[Path] = [], scenes: int | None = None, steps: int | None = None, seed: int = 1, every: int = 1,
-    only: str = "", start: Path | None = None, bfloat16: bool = False, examples: int = 150,
+    only: str = "", start: Path | None = None, bfloat16: bool = False, examples: int = 150, blend: Path | None = None, share: float = 0.5,
 ) -> None:  # fmt: skip
     """Run the steps that are asked for."""
     out.mkdir(parents=True, exist_ok=True)
     rounds: Sequence[Round] = ROUNDS[mount]
     if steps or scenes is not None:
         first = rounds[0]
-        rounds = (Round(seed, first.scenes if scenes is None else scenes, steps or first.steps),)
+        rate = START_RATE if start else first.rate
+        rounds = (Round(seed, first.scenes if scenes is None else scenes, steps or first.steps, rate),)
     if scenes == 0 and not data:
         raise ConfigError("--scenes 0 needs --data")
     shards = out / "data"
@@ -275,7 +299,7 @@ def main(
         if generator is not None:
             generator.terminate()
     if only in ("", "finish"):
-        finish(mount, out, rounds, examples, held_out)
+        finish(mount, out, rounds, examples, held_out, start, blend, share)
 
 
 if __name__ == "__main__":

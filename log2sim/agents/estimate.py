@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
+from log2sim.agents.evidence import may_suffice
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.smooth.smoother import signed_speed, smooth_track
@@ -40,7 +41,7 @@ def estimate_agents(
     smooth: bool,
     jobs: int = 1,
 ) -> list[AgentCandidate]:
-    """Make a candidate of every object that the tracks show, moving ones first.
+    """Make a candidate of every object that the tracks show and that may suffice (`may_suffice`), moving ones first.
 
     `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed. `jobs`: processes that
     share the tracks; the result is the same for any number.
@@ -48,7 +49,7 @@ def estimate_agents(
 
     def estimate(numbers: Sequence[int]) -> list[tuple[int, AgentCandidate]]:
         """Make the candidates of some tracks, with the number of each one's track; its measurements stay in this process."""
-        parts = [(k, part) for k in numbers for part in explain_track(tracks[k])]
+        parts = [(k, p) for k in numbers for p in explain_track(tracks[k]) if may_suffice(p.track, static=p.static)]
         moving = [(k, moving_candidate(p.track, obstacles, timeline, smooth=smooth)) for k, p in parts if not p.static]
         standing = static_candidates([p for _, p in parts if p.static], obstacles, timeline)
         found = [*moving, *zip((k for k, p in parts if p.static), standing)]

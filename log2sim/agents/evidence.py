@@ -194,6 +194,20 @@ def _odd_size(agent: Agent) -> float:
 MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS, DRIFT_M = 0.3, 0.6, float(np.log(2.0)), 2.0
 
 
+# Points show a person or rider who moves on a way of so many times that of the detections at most.
+MOST_FOLLOWED = 3.0
+
+
+def may_suffice(track: Track, *, static: bool) -> bool:
+    """Return whether the detections of a track may suffice once its way is known: most clutter is not worth the smoothing."""
+    m = track.measurements
+    if image_confidence(track) >= MIN_IMAGE_CONFIDENCE or (GROUP_OF[track.category] == "vehicle" and not static):
+        return True
+    way_m = 0.0 if static else MOST_FOLLOWED * float(np.hypot(*np.ptp(m.center_m[:, :2], axis=0)))
+    in_sweep = np.isfinite(m.box_yaw_rad).any()
+    return bool(in_sweep and sweep_log_odds(track) + np.log1p(way_m / DRIFT_M) >= MIN_SWEEP_LOG_ODDS)
+
+
 def _shown_well(candidate: AgentCandidate) -> bool:
     """Return whether the detections of a candidate in images suffice."""
     ordinary = candidate.geometry.is_likely and GROUP_OF[candidate.agent.category] != "pedestrian"

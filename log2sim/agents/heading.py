@@ -110,7 +110,7 @@ def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tup
     vehicles seen by simulated LiDARs.
     """
     m = track.measurements
-    rows = np.flatnonzero([len(cluster) > 0 for cluster in m.cluster])
+    rows = np.flatnonzero(m.kept_points)
     if len(rows) == 0:
         return 0.0
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MAX_MEASUREMENTS)).round().astype(np.intp)]

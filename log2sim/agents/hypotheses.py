@@ -51,7 +51,7 @@ def motion_of_ends(track: Track) -> tuple[float, float]:
     stays the same. An end that moves because more of the object comes into view moves alone.
     """
     m = track.measurements
-    rows = np.flatnonzero(np.isfinite(m.yaw_rad) & [len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
+    rows = np.flatnonzero(np.isfinite(m.yaw_rad) & (m.kept_points >= MIN_CLUSTER_POINTS))
     if GROUP_OF[track.category] != "vehicle" or len(rows) < MIN_START_ROWS:
         return 0.0, -np.inf
     rows = rows[_spread(len(rows))]

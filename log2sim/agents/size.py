@@ -125,7 +125,7 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     axis = mean_box_axis(m)
     yaw = boxes.fit_yaw(xy)[0] if axis is None else boxes.corrected_yaw(xy, axis)
     low, high = boxes.extents(xy, yaw)
-    rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
+    rows = np.flatnonzero(m.kept_points >= MIN_CLUSTER_POINTS)
     if track.category in BOXES:
         low, high = _reached(low, high, [m.points_of(k)[:, :2] - origin for k in rows.tolist()], yaw)
     seen = [view for _, view in m.views_of(rows)]
@@ -300,7 +300,7 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
     by 0.6 m at 30 m/s. Without it they stay.
     """
     m = track.measurements
-    rows = np.flatnonzero([len(c) >= MIN_CLUSTER_POINTS for c in m.cluster])
+    rows = np.flatnonzero(m.kept_points >= MIN_CLUSTER_POINTS)
     if len(rows) == 0:
         return _geometry_without_points(track)
     yaw, sensor = yaw_rad[rows], m.sensor_m[rows, :2]
@@ -393,7 +393,7 @@ def _is_too_thin(seen: Array, whole: NDArray[np.bool_], category: str) -> bool:
 def _height(track: Track) -> tuple[float, Array]:
     """Estimate the height of the object and z (n,) of its center: points reach its top where the LiDAR sees that high."""
     m = track.measurements
-    by_lidar_m = (m.top_m - m.bottom_m)[[len(c) >= MIN_CLUSTER_POINTS for c in m.cluster]]
+    by_lidar_m = (m.top_m - m.bottom_m)[m.kept_points >= MIN_CLUSTER_POINTS]
     # The height of a box without points is only as right as where it was placed.
     by_image_m = np.where(m.truncated | (m.source == "topdown"), np.nan, m.height_px_m)
     known = typical_box_size(m)

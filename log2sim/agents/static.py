@@ -241,10 +241,9 @@ def _rays_to(box: BoxState, origin: Array, rays: Rays) -> tuple[Array, Array]:
     # Box and LiDAR move past each other while the rays are sent.
     drift_m = np.hypot(*(velocity - box.velocity_mps).T).max() * np.abs(rays.t_s).max()
     reach_m = np.hypot(*box.size_m[:2]) / 2 + 2 * drift_m + MAX_GAP_M + MAX_SHIFT_SHARE * box.size_m.max() + MAX_SHIFT_M
-    to_x, to_y = (box.xy_m - origin[:2] - position).T.astype(np.float32)
-    x, y = rays.end[:, 0] - rays.position[rays.sensor, 0], rays.end[:, 1] - rays.position[rays.sensor, 1]
-    across = np.abs(to_x[rays.sensor] * y - to_y[rays.sensor] * x)
-    near = np.flatnonzero(across <= np.float32(reach_m) * np.hypot(x, y))
+    to_x, to_y = (rays.of_lidar(to) for to in (box.xy_m - origin[:2] - position).T.astype(np.float32))
+    x, y, away = rays.level
+    near = np.flatnonzero(np.abs(to_x * y - to_y * x) <= np.float32(reach_m) * away)
     end, sensor, t_s = rays.end[near], rays.sensor[near], rays.t_s[near, None]
     place = np.append(box.xy_m, box.bottom_m) - origin + t_s * np.append(box.velocity_mps, 0.0)
     start, end = rays.position[sensor] + rays.velocity_mps[sensor] * t_s - place, end - place

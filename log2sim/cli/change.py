@@ -185,7 +185,7 @@ def correct(
         corrected, unseen = _with_points(corrected, {a.id for a in changed}, log, sequence)
         lines += unseen
     if source.tags is not None:
-        from log2sim.scenarios import tag
+        from log2sim.scenarios.tagging import tag
 
         corrected = tag(corrected)
     corrected.save(out)

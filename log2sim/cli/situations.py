@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -44,7 +45,7 @@ def tag(
     """
     from log2sim.datatypes import TAGS, Scenario
     from log2sim.files.documents import check_targets
-    from log2sim.scenarios import criticality_table, tag, write_criticality
+    from log2sim.scenarios.tagging import criticality_table, tag, write_criticality
 
     check_targets(out, criticality, overwrite=overwrite)
     tagged = tag(Scenario.load(scenario))
@@ -154,6 +155,22 @@ def _on_workers(scheduler: str) -> MapFiles:
             yield from map_on_workers(workers.client, work, names)
 
     return run
+
+
+@contextmanager
+def _runs(
+    jobs: int | None, scheduler: str | None
+) -> Iterator[Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]]:
+    """Yield a function that maps over tasks in their order, on processes or on the workers of a scheduler."""
+    from log2sim.files.processes import default_jobs, map_in_processes
+
+    if scheduler is None:
+        yield lambda work, tasks: map_in_processes(work, tasks, jobs or default_jobs())
+        return
+    from log2sim.batch.run import workers_of
+
+    with workers_of(scheduler) as workers:
+        yield lambda work, tasks: (f.result() for f in workers.client.map(work, tasks, pure=False))
 
 
 def map_on_workers(client: Any, work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
@@ -281,7 +298,8 @@ def test_(
     out: Annotated[Path, opt.write_to("DIR", "Folder for the report and the worst runs.")],
     runs: Annotated[int, opt.option("Runs in all.", "N", min=40, max=100_000)] = 400,
     limit: Annotated[list[str] | None, opt.option(
-        "A failure, too: min_ttc_s, min_pet_s, min_gap_m below, max_brake_mps2 above.", "NAME=VALUE")] = None,
+        "A failure, too: min_ttc_s, min_pet_s, min_gap_m below; max_brake_mps2, max_jerk_mps3, max_lateral_mps2 (comfort), "
+        "max_speed_mps, max_off_path_m (rules) above.", "NAME=VALUE")] = None,
     agents: Annotated[str, opt.choose("--agents", "scenario|reactive", "Behavior of the other agent.")] = "scenario",
     latency: Annotated[str, opt.option(
         "How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")] = "0",
@@ -290,6 +308,8 @@ def test_(
     worst: Annotated[int, opt.option("Worst runs to write, with pages that play them.", "N", min=0, max=100)] = 3,
     seed: Annotated[int, opt.option("Seed of all draws.", min=0)] = 0,
     jobs: Annotated[int | None, opt.option("Processes.", "N", min=1, default="one for each core")] = None,
+    scheduler: Annotated[str | None, opt.option(
+        "Drive on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     overwrite: opt.OverwriteFolder = False,
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
@@ -310,7 +330,6 @@ def test_(
 
     from log2sim.datatypes import Scenario
     from log2sim.files.documents import refuse_folder, write_json
-    from log2sim.files.processes import default_jobs, map_in_processes
     from log2sim.scenarios.failure import (
         LIMITS,
         describe,
@@ -326,14 +345,15 @@ def test_(
     from log2sim.scenarios.query import ask
     from log2sim.simulation.metrics.all_metrics import parse_limits
     from log2sim.simulation.policy import load_policy
-    from log2sim.simulation.sensing import DelayedPolicy, parse_sensing
+    from log2sim.simulation.sensing import NamedPolicy, parse_sensing
     from log2sim.visualization.page.writer import write_page
 
     refuse_folder(out, overwrite=overwrite, holding="test.json", kind="folder of a test")
-    limits, driver = parse_limits(limit or (), list(LIMITS)), load_policy(policy)
-    sensing = parse_sensing(latency, noise)
-    if sensing:
-        driver = DelayedPolicy(driver, sensing)
+    opt.require_own_workers(jobs, scheduler)
+    limits, sensing = parse_limits(limit or (), list(LIMITS)), parse_sensing(latency, noise)
+    load_policy(policy)  # so that a wrong name is said at once
+    source, _, name = policy.rpartition(":")
+    driver = NamedPolicy(f"{Path(source).resolve()}:{name}" if source.endswith(".py") else policy, sensing)
     index = open_index(path)
     rows = ask(index, condition).rows
     logical = fit(rows)
@@ -342,12 +362,12 @@ def test_(
     outcomes: list[Outcome] = []
     values: list[Array] = []
     work = partial(judge_run, base, logical, driver, limits, agents)
-    with progress(quiet=quiet) as report_progress:
+    with progress(quiet=quiet) as report_progress, _runs(jobs, scheduler) as run:
 
         def margins(scores: Array) -> Array:
             drawn = logical.from_scores(scores)
             values.extend(drawn)
-            for outcome in map_in_processes(work, list(drawn), jobs or default_jobs()):
+            for outcome in run(work, list(drawn)):
                 outcomes.append(outcome)
                 report_progress("runs", len(outcomes), runs)
             return np.array([o.margin for o in outcomes[-len(drawn) :]])

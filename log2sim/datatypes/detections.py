@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes.log import Deferred, seen_from
-from log2sim.files.arrays import ArrayFile, ArrayList, join_arrays, take_arrays
+from log2sim.files.arrays import ArrayFile, ArrayList, array_lengths, join_arrays, take_arrays
 from log2sim.files.documents import short_repr
 from log2sim.geometry import Array
 
@@ -141,6 +141,11 @@ class BoxEvidence:
         """Return the number of rows."""
         return len(self.t_ns)
 
+    @property
+    def kept_points(self) -> NDArray[np.int64]:
+        """How many points of each row are kept (M,); none is read for it."""
+        return np.array(array_lengths(self.cluster), dtype=np.int64)
+
     def views_of(self, rows: NDArray[np.signedinteger[Any]]) -> list[tuple[int, OtherView]]:
         """List the viewpoints of rows (n,), first their own in their order, then the others: the row, and what is seen from there."""
         own = [(int(k), OtherView(self.sensor_m[k], self.ends_visible[k], self.cluster[k])) for k in rows]
@@ -251,7 +256,17 @@ class Rays:
     @property
     def start(self) -> NDArray[np.float32]:
         """Where their LiDARs were (K, 3) when they sent them."""
-        return np.asarray(self.position[self.sensor] + self.velocity_mps[self.sensor] * self.t_s[:, None])
+        return np.asarray(self.of_lidar(self.position) + self.of_lidar(self.velocity_mps) * self.t_s[:, None])
+
+    @cached_property
+    def level(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """From where their LiDARs were at the stamp of the cloud to their ends (K,): x, y and horizontal distance."""
+        x, y = (self.end[:, axis] - self.of_lidar(self.position[:, axis]) for axis in range(2))
+        return x, y, np.hypot(x, y)
+
+    def of_lidar(self, values: NDArray[np.float32]) -> Any:
+        """Return the value (..., D) or number of each ray's LiDAR among those of all (S, ...); of a single LiDAR just its own."""
+        return values[0] if len(values) == 1 else values[self.sensor]
 
 
 @dataclass(frozen=True, eq=False)

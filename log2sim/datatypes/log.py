@@ -167,6 +167,11 @@ class Labels:
     # Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI
     never_labeled: tuple[str, ...] = ()
 
+    def take(self, rows: NDArray[Any]) -> Labels:
+        """Select rows."""
+        of_all = ("cameras", "labeled_ns", "never_labeled")
+        return replace(self, **{n: v[rows] for n, v in vars(self).items() if n not in of_all and v is not None})
+
 
 @dataclass(frozen=True, eq=False)
 class ImageLabels:
@@ -258,8 +263,8 @@ class Stream:
     # Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that cannot be read.
     # Several threads may call it at once.
     read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
-    # Returns the image of record `i` as the bytes of a JPEG or PNG file, as the log holds it, which hold all that `read` returns; None
-    # where it holds none
+    # Returns the bytes of the file that the log holds of record `i`, of an image a JPEG or PNG: they, the stamp and the name of the
+    # stream determine all that `read` returns. None where it holds none, or where reading takes no longer
     encoded: Callable[[int], bytes] | None = None
 
 

@@ -22,6 +22,22 @@ KINDS, MAX_ITEM_BYTES = "biufU", 1024
 
 def pack(value: Any) -> bytes:
     """Return None, numbers, texts, arrays, and lists, tuples, mappings and dataclasses of them as bytes."""
+    text, arrays = _described(value)
+    rest = b"".join([text, *(array.tobytes() for array in arrays)])
+    return _HEAD.pack(MAGIC, _digest(rest), len(text)) + rest
+
+
+def digest_of(value: Any) -> str:
+    """Return a digest of what `pack` takes."""
+    text, arrays = _described(value)
+    found = hashlib.blake2b(text, digest_size=DIGEST_BYTES)
+    for array in arrays:
+        found.update(array.tobytes() if array.dtype.kind == "U" else array.data)
+    return found.hexdigest()
+
+
+def _described(value: Any) -> tuple[bytes, list[NDArray[Any]]]:
+    """Describe a value as JSON, and list the arrays in it."""
     arrays: list[NDArray[Any]] = []
 
     def described(item: Any) -> Any:
@@ -47,9 +63,7 @@ def pack(value: Any) -> bytes:
             return {"tuple": [described(part) for part in item]}
         raise TypeError(f"a {type(item).__name__} cannot be packed")
 
-    text = json.dumps(described(value), separators=(",", ":")).encode()
-    rest = b"".join([text, *(array.tobytes() for array in arrays)])
-    return _HEAD.pack(MAGIC, _digest(rest), len(text)) + rest
+    return json.dumps(described(value), separators=(",", ":")).encode(), arrays
 
 
 def unpack(content: bytes, classes: Collection[type]) -> Any:

@@ -13,7 +13,6 @@ from log2sim.datatypes import Labels, Log, MapFrame, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, PoseTrack, apply, inverse, wrap_angle
 from log2sim.localization.odometry import TransformAt, move_points
-from log2sim.logs.excerpt import take_labels
 
 
 def replace_poses(log: Log, new: PoseTrack) -> Log:
@@ -48,7 +47,7 @@ def replace_poses(log: Log, new: PoseTrack) -> Log:
         return read
 
     streams = {
-        name: Stream(name, lambda stream=stream: stream.t_ns, moved(stream), stream.encoded)  # type: ignore[misc]
+        name: Stream(name, lambda stream=stream: stream.t_ns, moved(stream))  # type: ignore[misc]
         if name in log.lidars and log.lidars[name].mount == "ego"
         else stream
         for name, stream in log.streams.items()
@@ -66,7 +65,7 @@ def _moved_labels(labels: Labels | None, new_T_old: TransformAt) -> Labels | Non
     k = np.flatnonzero(known)
     heading = np.stack([np.cos(labels.yaw_rad[k]), np.sin(labels.yaw_rad[k]), np.zeros(len(k))], axis=1)
     turned = np.einsum("nij,nj->ni", poses[k, :3, :3], heading)
-    moved = take_labels(labels, k)
+    moved = labels.take(k)
     yaw_rad = wrap_angle(np.arctan2(turned[:, 1], turned[:, 0]))
     return replace(moved, center_m=apply(poses[k], moved.center_m), yaw_rad=yaw_rad)
 
@@ -86,4 +85,4 @@ def shift_stream(stream: Stream, shift_ns: int, moved: Array | None = None) -> S
             compensated_ns=None if record.compensated_ns is None else int(record.compensated_ns) + shift_ns,
         )
 
-    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded)
+    return Stream(stream.name, lambda: stream.t_ns + shift_ns, read, stream.encoded if moved is None else None)

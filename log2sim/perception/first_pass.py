@@ -30,7 +30,7 @@ from log2sim.datatypes import (
 )
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
-from log2sim.files.packing import pack
+from log2sim.files.packing import digest_of
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Array, inverse, line_stamps_ns
@@ -152,8 +152,6 @@ class CloudMaker:
         self.before: list[tuple[Key, Boxes3D]] = []
         self.compensated: dict[tuple[str, int], str] = {}
         self._next = 0
-        # How many sweeps of each LiDAR are kept for the next ticks.
-        self.most_kept = SWEEPS_KEPT
         self._sweeps: dict[tuple[str, int], Sweep | None] = {}
         self._sketches: dict[tuple[str, int], SweepSketch] = {}
         self._live: set[tuple[str, int]] = set()
@@ -208,10 +206,10 @@ class CloudMaker:
                 last = sweeps
         return found[::-1]
 
-    def sweeps_of(self, ticks: range, records: RecordSource) -> list[Sweep | None]:
-        """Return all sweeps that the clouds of some ticks are made of, None for those that cannot be read."""
+    def sweeps_of(self, ticks: range) -> list[tuple[str, int]]:
+        """List all sweeps that the clouds of some ticks are made of: LiDARs and indices."""
         rows = [self._sweeps_of(tick, row) for tick in ticks for row in range(self._schedule.rows)]
-        return [self._sweep(*key, records) for key in self._listed([*self._searched_before(ticks.start), *rows])]
+        return self._listed([*self._searched_before(ticks.start), *rows])
 
     def _listed(self, keys: Sequence[Key]) -> list[tuple[str, int]]:
         return sorted({(name, i) for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0})
@@ -235,7 +233,7 @@ class CloudMaker:
                 self._live.add((name, i))
                 kind = compensation_of(self._log, name, sweep) if compensates else "left out"
                 self.compensated[name, i] = kind
-        most = max(self.most_kept * len(self._schedule.sweeps), len(wanted), 1)
+        most = max(SWEEPS_KEPT * len(self._schedule.sweeps), len(wanted), 1)
         self._sweeps = dict(list(self._sweeps.items())[-most:])
         self._sketches = {key: sketch for key, sketch in self._sketches.items() if key in self._sweeps}
 
@@ -348,7 +346,6 @@ class FirstPass:
         # Ticks of a part: where frames are skipped between some of them, a multiple of these.
         self.step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
         if detectors.cache is not None:
-            self.clouds.most_kept = self.step + 1
             # Of the plan what this pass looks at, so that other later stages leave the key as it is.
             looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
             planned = [
@@ -385,36 +382,27 @@ class FirstPass:
         """Return a digest of the records of some ticks, and of all else that what is seen there depends on."""
         ticks, total = task.ticks, len(self.schedule)
         looked = range(ticks.start, min(ticks.stop + (self.plan.detector_stride > 1), total))
-        value, described = hashlib.blake2b(digest_size=32), list[Any]()
-        for camera in self.plan.cameras if self.frames is not None else ():
-            for tick in looked:
-                index = int(self.schedule.frames[camera][tick])
-                if index >= 0:
-                    described.append([camera, index, int(self.log.streams[camera].t_ns[index])])
-                    value.update(self._picture(camera, index, records))
-        for sweep in self.clouds.sweeps_of(ticks, records):
-            columns: dict[str, Any] = {} if sweep is None else vars(sweep)
-            for column in columns.values():
-                if isinstance(column, np.ndarray):
-                    described.append([column.dtype.str, *column.shape])
-                    value.update(np.ascontiguousarray(column).data)
-                else:
-                    described.append(column)
+        cameras = self.plan.cameras if self.frames is not None else ()
+        shown = [(name, int(self.schedule.frames[name][tick])) for name in cameras for tick in looked]
+        described: list[Any] = []
+        for name, index in (*(key for key in shown if key[1] >= 0), *self.clouds.sweeps_of(ticks)):
+            stamp = int(self.log.streams[name].t_ns[index])
+            described.append([name, index, stamp, self._record(name, index, records)])
         sweeps = {name: index[:, ticks.start : ticks.stop] for name, index in self.schedule.sweeps.items()}
         before = task.before if self.plan.fusion is FusionLevel.POINTS else []
         states = [sorted(records.watch.known(s).items()) for s in self.log.streams] if task.judged else None
         described += [self.schedule.t_ns[ticks.start : ticks.stop], sweeps, before, ticks.stop == total, states]
-        value.update(pack(described))
-        return value.digest()
+        return bytes.fromhex(digest_of(described))
 
-    def _picture(self, camera: str, index: int, records: RecordSource) -> bytes:
-        """Return a digest of a picture: of its file where the log has one, which is not decoded then, else of its pixels."""
-        stream = self.log.streams[camera]
+    def _record(self, name: str, index: int, records: RecordSource) -> str:
+        """Return a digest of a record: of its file where the log has one, which is not decoded then, else of what it holds."""
+        stream = self.log.streams[name]
         try:
-            content = pack(records.require(camera, index)) if stream.encoded is None else stream.encoded(index)
+            if stream.encoded is None:
+                return digest_of(records.require(name, index))
+            return hashlib.blake2b(stream.encoded(index)).hexdigest()
         except RecordError as error:
-            content = str(error).encode()
-        return hashlib.blake2b(content, digest_size=32).digest()
+            return str(error)
 
     def _tick(self, tick: int, records: RecordSource, clock: StageClock) -> SeenTick:
         plan, live, lights, skipped, searched = self.plan, dict[str, Detections](), list[LightBox](), list[str](), 0

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
-from log2sim.files.arrays import array_lengths
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S
 from log2sim.perception.boxes import fit_extents, place_boxes, provisional_sizes, rotate, top_of
 
@@ -81,7 +80,7 @@ def _gated_pairs(rows: Measurements) -> NDArray[np.bool_]:
 
 def _has_points(rows: Measurements) -> NDArray[np.bool_]:
     """Mark the rows (M,) with LiDAR points."""
-    return np.asarray((rows.source == "lidar") & (np.array(array_lengths(rows.cluster), dtype=np.intp) > 0))
+    return np.asarray((rows.source == "lidar") & (rows.kept_points > 0))
 
 
 def _share_points(rows: Measurements, i: int, j: int) -> bool:

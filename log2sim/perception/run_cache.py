@@ -21,7 +21,7 @@ import scipy
 from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.files.cache import DiskCache, detection_folder
-from log2sim.files.packing import pack, unpack
+from log2sim.files.packing import digest_of, pack, unpack
 from log2sim.files.stages import StageClock
 from log2sim.perception.detect.detectors import Detector
 from log2sim.perception.detect3d.detectors import LidarDetector
@@ -30,7 +30,7 @@ KEY_BYTES = 16
 MAX_NAME_CHARACTERS = 48
 # Modules of log2sim between a record and what is kept of it, relative to the package; a change of any of them makes other
 # keys, so that nobody has to remember to raise a version.
-SOURCES = ("datatypes/*.py", "files/packing.py", "geometry/*.py", "logs/records.py", "perception/**/*.py", "plan.py")
+SOURCES = ("datatypes/*.py", "files/packing.py", "geometry/*.py", "logs/**/*.py", "perception/**/*.py", "plan.py")
 STAGE_SOURCES = (*SOURCES, "localization/*.py", "road/*.py")
 
 Made = TypeVar("Made")
@@ -103,7 +103,7 @@ class StageCache:
                     raise
                 self._failed |= isinstance(record, Sweep) and not len(record.xyz_m)
                 if stream.encoded is None and key not in self._digests:
-                    self._digests[key] = _digest(pack(record)).hex()
+                    self._digests[key] = digest_of(record)
                 return record
 
             return taken
@@ -118,10 +118,10 @@ class StageCache:
             stream = self._streams[name]
             if (name, i) not in self._digests:
                 try:
-                    content = pack(stream.read(i)) if stream.encoded is None else stream.encoded(i)
+                    found = digest_of(stream.read(i)) if stream.encoded is None else _digest(stream.encoded(i)).hex()
                 except RecordError as error:
-                    content = str(error).encode()
-                self._digests[name, i] = _digest(content).hex()
+                    found = _digest(str(error).encode()).hex()
+                self._digests[name, i] = found
             value.update(self._digests[name, i].encode())
         return value.hexdigest()
 

@@ -96,8 +96,12 @@ LIMITS: Mapping[str, tuple[str, float]] = {
     "min_pet_s": ("least post-encroachment time of the ego", 1.0),
     "min_gap_m": ("least distance of the ego from others", 1.0),
     "max_brake_mps2": ("hardest braking of the ego", -1.0),
+    "max_jerk_mps3": ("greatest jerk of the ego", -1.0),
+    "max_lateral_mps2": ("greatest lateral acceleration of the ego", -1.0),
+    "max_speed_mps": ("greatest speed of the ego", -1.0),
+    "max_off_path_m": ("farthest distance of the ego from the path that it drove in the log", -1.0),
 }
-"""What else than a collision may be a failure: below a limit, or, for the last, above it."""
+"""What else than a collision may be a failure, of safety, comfort or rules: below a limit, or, with -1, above it."""
 
 
 class Outcome(NamedTuple):
@@ -128,9 +132,14 @@ def judge_run(
     ego, own = done.metrics["ego"], done.metrics["by_agent"].get(EGO, {})
     hits = [e for e in done.metrics["collisions"] if EGO in e["agents"]]
     gap, brake = ego["min_gap"], ego["max_brake"]
+    comfort, driven = own.get("comfort") or {}, next(a for a in done.agents if a.id == EGO)
     figures = {
         "min_gap_m": np.inf if gap is None else float(gap["m"]),
         "max_brake_mps2": 0.0 if brake is None else float(brake["mps2"]),
+        "max_jerk_mps3": float(comfort.get("jerk_max_mps3", 0.0)),
+        "max_lateral_mps2": float(comfort.get("lat_accel_max_mps2", 0.0)),
+        "max_speed_mps": float(driven.speed_mps.max()),
+        "max_off_path_m": float(own.get("cross_track_max_m", 0.0)),
         **{name: np.inf if own.get(name) is None else float(own[name]) for name in ("min_ttc_s", "min_pet_s")},
     }
     margin = figures["min_gap_m"]

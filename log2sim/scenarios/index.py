@@ -15,8 +15,6 @@ from log2sim.datatypes import EGO, TAGS, Scenario
 from log2sim.errors import LogError, MissingExtra, ScenarioError
 from log2sim.files.documents import replaced
 from log2sim.files.processes import default_jobs, map_in_processes
-from log2sim.prediction.motion_table import TICK_S
-from log2sim.scenarios.tagging import find_tags
 
 INDEX_FILE = "tags.parquet"
 INDEX_VERSION = 2
@@ -55,6 +53,9 @@ class Index:
 
 def rows_of(scenario: Scenario, file: str) -> list[Row]:
     """Return a row for each tag of a scenario: those that it has, else those that are found in it."""
+    from log2sim.scenarios.tagging import find_tags
+    from log2sim.simulation.prediction.motion_table import TICK_S
+
     tags = find_tags(scenario) if scenario.tags is None else scenario.tags
     agents = {a.id: a for a in scenario.agents}
     rows = []
@@ -189,7 +190,8 @@ def _read(path: Path) -> tuple[dict[str, Any], Any]:
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(path)
+        with pq.ParquetFile(path) as file:  # `read_table` loads pandas
+            table = file.read()
         about = json.loads(table.schema.metadata[KEY])
         same = about["version"] == INDEX_VERSION and about["tags"] == sorted(TAGS)
         return (about, table) if same and set(TEXTS) <= set(table.column_names) else ({}, None)

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from log2sim.datatypes import TAGS
 from log2sim.errors import ConfigError, MissingExtra
 from log2sim.files.plugins import nearest
@@ -234,7 +236,9 @@ def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
     with duckdb.connect(":memory:", config={"enable_external_access": "false", "threads": "2"}) as connection:
         import pyarrow as pa
 
-        numbered = index.table.append_column("row", pa.array(range(index.table.num_rows), pa.int64()))
+        count = index.table.num_rows
+        buffers = [None, pa.py_buffer(np.arange(count, dtype=np.int64))]  # `pa.array` loads pandas
+        numbered = index.table.append_column("row", pa.Array.from_buffers(pa.int64(), count, buffers))
         connection.register("tags", numbered)
         query, values = condition.select("DISTINCT e.*", parts, "ORDER BY e.probability DESC, e.file, e.t_s, e.row")
         cursor = connection.execute(query, values)

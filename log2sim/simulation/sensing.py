@@ -5,12 +5,13 @@ from __future__ import annotations
 import zlib
 from collections import deque
 from dataclasses import dataclass, fields, replace
+from functools import cache
 
 import numpy as np
 
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
-from log2sim.simulation.policy import Controls, Observation, Others, Policy, query_policy, reset_policy
+from log2sim.simulation.policy import Controls, Observation, Others, Policy, load_policy, query_policy, reset_policy
 
 CORRELATION_S = 0.5
 """For how long an error of a place lasts: trackers average over some sweeps."""
@@ -29,6 +30,28 @@ class Sensing:
     def __bool__(self) -> bool:
         """Whether anything is late or off."""
         return any(getattr(self, f.name) > 0 for f in fields(self))
+
+
+@dataclass(frozen=True)
+class NamedPolicy:
+    """A policy that every process loads by its name when it first drives there, so that it can be sent to any worker."""
+
+    name: str  # as `load_policy` takes it
+    sensing: Sensing
+
+    def reset(self, scenario: Scenario) -> None:
+        """Prepare for a replay."""
+        reset_policy(_loaded(self), scenario)
+
+    def __call__(self, observation: Observation) -> Controls:
+        """Return the controls of the policy."""
+        return query_policy(_loaded(self), observation)
+
+
+@cache
+def _loaded(named: NamedPolicy) -> Policy:
+    policy = load_policy(named.name)
+    return DelayedPolicy(policy, named.sensing) if named.sensing else policy
 
 
 def parse_sensing(latency: str, noise_m: float) -> Sensing:

@@ -114,7 +114,12 @@ def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud
 
 
 REACH_M = 60.0
+OWN_CAR_M = (4.4, 1.8, 1.5)
 WALKING_MPS, RIDING_MPS = 1.4, 5.0
+# Shares of what stands before a wall.
+AT_WALLS = {
+    "person": 0.15, "bicycle": 0.12, "motorcycle": 0.13, "stand": 0.2, "bin": 0.15, "pole": 0.1, "planter": 0.05, "corner": 0.07, "sign board": 0.03,
+}  # fmt: skip
 # Shares of what drives on a lane.
 LANE_SHARES = {"car": 0.71, "truck": 0.08, "bus": 0.04, "motorcycle": 0.07, "cyclist": 0.1}
 
@@ -207,12 +212,15 @@ def draw_layout(
     roads: tuple[Road, ...],
     surface: Surface,
     rng: np.random.Generator,
+    forward: float,
     without: frozenset[str] = frozenset(),
 ) -> list[TrafficObject]:
-    """Draw the objects of a scene, without some kinds."""
+    """Draw the objects of a scene, without some kinds; a sensor's car heads `forward`."""
     out = _Layout(surface, roads, rng, without)
-    # The place of the sensor's own car, or of its pole.
-    out.take(np.array([[0.0, 0.0, 0.5 if mount == "roadside" else 2.4]]))
+    # The place of the sensor's pole, or of its own car.
+    out.take(np.array([[0.0, 0.0, 0.5]]) if mount == "roadside" else _covering(np.zeros(2), forward, OWN_CAR_M))
+    if mount == "vehicle" and rng.random() < 0.4:
+        _close(out, roads[0])
     for road in roads:
         _traffic(out, road)
     _parked(out, roads[0])
@@ -225,6 +233,27 @@ def draw_layout(
         _roadside(out, road)
         _fronts(out, road)
     return out.objects
+
+
+def _close(out: _Layout, road: Road) -> None:
+    """Put long vehicles beside the sensor's car, where one side is seen, and end-on before it, and people and riders who pass it."""
+    rng, own = out.rng, float(road.offset(np.zeros(1, np.float32), np.zeros(1, np.float32))[0])
+    for beside in (True, False):
+        for _ in range(rng.choice(3, p=[0.4, 0.4, 0.2])):
+            category = str(rng.choice(["truck", "bus", "car"], p=[0.5, 0.35, 0.15]))
+            away = rng.choice([-1, 1]) * rng.uniform(2.5, 4.5)
+            s, d = (
+                (rng.uniform(-9, 9), away) if beside else (rng.choice([-1, 1]) * rng.uniform(10, 40), rng.normal(0, 2))
+            )
+            xy, direction = road.at(float(s), own + float(d))
+            yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.03)
+            out.add_user(category, xy, yaw, speed=float(rng.uniform(0, 12) * (rng.random() < 0.6)), margin=0.1)
+    for _ in range(rng.poisson(1.5)):
+        xy, direction = road.at(rng.uniform(-6, 8), own + rng.choice([-1, 1]) * rng.uniform(1.3, 3))
+        category = str(rng.choice(["pedestrian", "cyclist", "motorcycle"], p=[0.5, 0.35, 0.15]))
+        yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
+        speed = (WALKING_MPS if category == "pedestrian" else RIDING_MPS) * float(rng.random() < 0.7)
+        out.add_user(category, xy, yaw, speed=speed, margin=0.0)
 
 
 def _traffic(out: _Layout, road: Road) -> None:
@@ -372,8 +401,9 @@ def _roadside(out: _Layout, road: Road) -> None:
 
 
 def _fronts(out: _Layout, road: Road) -> None:
-    """Line the road with houses, fences, hedges and open ground in pieces."""
+    """Line the road with houses, fences, hedges and open ground in pieces; people, parked two-wheelers and slim things stand before some."""
     rng = out.rng
+    at_walls = rng.random() < 0.5
     for side in (-1, 1):
         edge = road.half_width_m + rng.uniform(2.5, 12)
         style, s = rng.random(), -55.0
@@ -387,6 +417,23 @@ def _fronts(out: _Layout, road: Road) -> None:
                     out.add_thing("building", xy, yaw, clutter.building(length, rng))
                 elif style < 0.85 and rng.random() < 0.75:
                     out.add_thing("fence", xy, yaw, clutter.fence(length, rng))
+                for _ in range(rng.poisson(1.0) if at_walls else 0):
+                    place, _ = road.at(s + rng.uniform(0, length), side * (edge - rng.uniform(0.25, 1.2)))
+                    kind = out.one_of(AT_WALLS)
+                    if kind == "person":
+                        out.add_user("pedestrian", place, rng.uniform(-np.pi, np.pi), margin=0.0)
+                    elif kind in ("bicycle", "motorcycle"):
+                        lean = (
+                            yaw
+                            + np.pi * rng.integers(2)
+                            + rng.normal(0, 0.3)
+                            + (np.pi / 2 if rng.random() < 0.3 else 0.0)
+                        )
+                        out.add_user(
+                            kind, place, lean, margin=-0.2, kinds="parked motorcycle" if kind == "motorcycle" else ""
+                        )
+                    else:
+                        out.add_small(kind, place, yaw, 0.5)
             s += length + (rng.uniform(1, 9) if rng.random() < 0.4 else 0.0)
 
 
@@ -418,12 +465,12 @@ def draw_scene(
     kerb = float(rng.choice([0.0, rng.uniform(0.02, 0.2), rng.normal(0, 0.2)], p=[0.3, 0.6, 0.1]))
     surface = Surface(np.append(tilt, bend), waves, roads, kerb)
     model = lidar or _draw_lidar(mount, rng)
-    objects = draw_layout(mount, roads, surface, rng, without)
+    objects = draw_layout(mount, roads, surface, rng, sensor_forward, without)
     sensor = _draw_sensor(mount, model, surface, sensor_forward, rng)
     if mount == "vehicle" and sensor.position_m[2] > 1.5 and rng.random() < 0.7:
         parts = own_car(float(sensor.position_m[2]), rng)
         speed = float(np.hypot(*sensor.velocity_mps))
-        objects.append(TrafficObject("", np.zeros(3), sensor_forward, (4.4, 1.8, 1.5), parts, speed, kind="own car"))
+        objects.append(TrafficObject("", np.zeros(3), sensor_forward, OWN_CAR_M, parts, speed, kind="own car"))
     weather = weather or _draw_weather(rng)
     noise = model.noise_m if lidar else float(rng.uniform(0.008, 0.03))
     returns = ReturnModel(noise, float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 0.006)), weather)

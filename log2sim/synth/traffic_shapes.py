@@ -404,13 +404,25 @@ def cone(rng: Rng) -> Parts:
 def fence(length: float, rng: Rng) -> Parts:
     """Draw a piece of fence, wall, hedge or guard rail along x."""
     kind, half = rng.random(), length / 2
-    height = rng.uniform(0.7, 2.2)
+    # Walls and hedges are also as high as trucks and buses.
+    height = rng.uniform(0.7, 2.2) if rng.random() < 0.5 else rng.uniform(1.8, 4.0)
     if kind < 0.3:
         t, core = rng.uniform(0.3, 0.8), (0.2, height * 0.8)
         return block(0.0, 0.0, half, t, (0.05, height), LEAVES), block(0.0, 0.0, half, t * 0.4, core, LEAVES)
-    if kind < 0.5:
-        return (box((-half, -rng.uniform(0.08, 0.25), 0), (half, 0.1, height * 0.8), WALL),)
-    if kind < 0.65:
+    if kind < 0.6:
+        wall = box((-half, -rng.uniform(0.08, 0.25), 0), (half, 0.1, height), WALL)
+        if rng.random() < 0.6:
+            return (wall,)
+        # Climbing plants, shrubs and heaps before it.
+        tops = height * rng.uniform(0.2, 1.1, rng.integers(1, 6))
+        plants = (
+            ellipsoid(
+                (rng.uniform(0.3, 1.2), rng.uniform(0.1, 0.6), top / 2), (x, -rng.uniform(0.1, 0.5), top / 2), LEAVES
+            )
+            for x, top in zip(rng.uniform(-half, half, len(tops)), tops)
+        )
+        return (wall, *plants)
+    if kind < 0.72:
         return (
             box((-half, -0.04, 0.5), (half, 0.04, 0.8), METAL),
             *(box((x - 0.05, -0.08, 0), (x + 0.05, 0.0, 0.75), METAL) for x in np.arange(-half + 0.5, half, 2.0)),
@@ -420,8 +432,9 @@ def fence(length: float, rng: Rng) -> Parts:
 
 
 def building(length: float, rng: Rng) -> Parts:
-    """Draw a house front along x that faces -y, with windows, a bay or an entrance."""
-    half, height, depth = length / 2, rng.uniform(3.5, 16.0), 6.0
+    """Draw a house front along x that faces -y, with windows, a bay or an entrance, pilasters or downpipes."""
+    # Garages and sheds are as high as trucks and buses.
+    half, height, depth = length / 2, rng.uniform(3.5, 16.0) if rng.random() < 0.75 else rng.uniform(2.0, 3.8), 6.0
     parts = [box((-half, 0, 0), (half, depth, height), WALL)]
     if rng.random() < 0.5:
         x = rng.uniform(-half * 0.6, half * 0.6)
@@ -429,6 +442,10 @@ def building(length: float, rng: Rng) -> Parts:
     parts += [box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)][:2]
     if rng.random() < 0.3:
         parts.append(box((-half, -1.5, 2.8), (half, 0.1, 3.0), WALL))
+    if rng.random() < 0.4:
+        width, out = rng.uniform(0.08, 0.6), rng.uniform(0.06, 0.4)
+        for x in rng.uniform(-half, half, rng.integers(1, 5)):
+            parts.append(box((x - width / 2, -out, 0), (x + width / 2, 0.1, height), WALL))
     return tuple(parts)
 
 

@@ -163,6 +163,7 @@ def track_forward(
 
 COLUMNS = (
     "number", "mean", "covariance", "seen_ns", "hits", "standing", "place_m", "place_covariance", "_group", "_riderless",
+    "_born_age_s",
 )  # fmt: skip
 """Of the active tracks of a `ForwardTracker`."""
 
@@ -190,6 +191,8 @@ class ForwardTracker:
         self._group = np.zeros(0, dtype=np.intp)
         # Share of the measurements of a track that are bicycles without riders.
         self._riderless = np.zeros(0)
+        # When the first measurement was made, relative to its tick: at 30 m/s 0.1 s are 3 m.
+        self._born_age_s = np.zeros(0)
         self._born = 0
         self._now_ns: int | None = None
 
@@ -282,7 +285,7 @@ class ForwardTracker:
         if len(fresh):
             shares, best = [moving[fresh]], squared[fresh]
             for flow in (flow_mps, -flow_mps):
-                age_s = (now_ns - self.seen_ns[fresh, None]) / NS_PER_S
+                age_s = ((now_ns - self.seen_ns[fresh]) / NS_PER_S - self._born_age_s[fresh])[:, None]
                 shift = np.concatenate([flow * age_s, np.broadcast_to(flow, (len(fresh), 2))], axis=1)
                 apart, _ = innovation(
                     self.mean[fresh] + shift, self.covariance[fresh], columns.xy, columns.r, columns.age_s
@@ -321,7 +324,7 @@ class ForwardTracker:
         number, seen_ns = np.arange(self._born, self._born + count), np.full(count, now_ns, dtype=np.int64)
         of_born = (
             number, mean, covariance, seen_ns, np.ones(count, dtype=np.int64), prior, columns.xy[born], columns.r[born],
-            columns.group[born], columns.riderless[born],
+            columns.group[born], columns.riderless[born], columns.age_s[born],
         )  # fmt: skip
         for name, values in zip(COLUMNS, of_born, strict=True):
             setattr(self, name, np.concatenate([getattr(self, name), values]))

@@ -12,7 +12,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from benchmarks.tags import traffic
+from benchmarks.tag_worlds import traffic
 from log2sim.batch.run import local_workers
 from log2sim.cli.situations import map_on_workers
 from log2sim.files.processes import map_in_processes

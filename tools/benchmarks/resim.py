@@ -41,7 +41,7 @@ from log2sim.resim.rays import Shots, all_shots, poses_of, recorded_shots
 from log2sim.resim.simulate import Simulation, simulated_log
 from log2sim.resim.surfels import Surfels
 from log2sim.resim.world import World, build_world
-from log2sim.scenarios import find_tags
+from log2sim.scenarios.tagging import find_tags
 from log2sim.synth import load_scene, synthesize
 from log2sim.visualization.sensor_film import range_image, title_line, window_of
 

@@ -29,6 +29,7 @@ from log2sim.agents.evidence import SIGNS, Table, gather
 from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, variance_terms
 from log2sim.datatypes import CATEGORIES, GROUP_OF
 from log2sim.datatypes.log_odds import probability_of
+from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.metrics.comparison import Selection
 from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
@@ -67,7 +68,7 @@ class Rated:
 
 
 def agents_of(case: Case, log: str) -> list[Rated]:
-    """Reconstruct a case with all candidates kept, and judge them."""
+    """Reconstruct a case with all candidates kept, and judge them; none where nothing was detected."""
     gathered: list[tuple[Any, Table]] = []
     judged: list[Any] = []
 
@@ -84,7 +85,10 @@ def agents_of(case: Case, log: str) -> list[Rated]:
         patch.object(judging, "gather", keep_table),
         patch.object(pipeline, "judge", keep_candidates),
     ):
-        scenario = case.second().scenario
+        try:
+            scenario = case.second().scenario
+        except NothingToReconstruct:
+            return []
     t_ns, lidar = case.run.schedule.t_ns, bool(case.run.log.lidars)
     timeline = Timeline(t_ns, int(t_ns[0]))
     compared, _, ego = compare_scenarios(scenario, case.truth, Selection(None, frozenset(CATEGORIES)))

@@ -7,7 +7,8 @@ detector in sweeps, a simulated one in images, or both, and a second time withou
 in images have: boxes that jitter and are off, misses and scores that depend on the object and its height in the image, swapped
 categories, one box over two objects, two boxes on one, boxes on what is no road user or on a fixed part of the image, and boxes
 that appear for one frame; and those of a detector in sweeps that it has on recorded walls, hedges and fences, which are more
-various than those that it was trained on. Files that exist are left as they are.
+various than those that it was trained on. Poses wander as those of GNSS and IMU do, so that what stands seems to move. Files that exist
+are left as they are.
 """
 
 from __future__ import annotations
@@ -37,7 +38,16 @@ from log2sim.datatypes import (
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.evaluation.metrics.truth import points_in_labels, truth_from_log
 from log2sim.files.stages import StageClock
-from log2sim.geometry import Array, nearest_index, wrap_angle
+from log2sim.geometry import (
+    NS_PER_S,
+    Array,
+    PoseTrack,
+    apply,
+    inverse,
+    nearest_index,
+    rotation_from_rpy,
+    wrap_angle,
+)
 from log2sim.perception.detect.detectors import MIN_SIDE_PX
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.detectors import LidarDetector
@@ -55,6 +65,8 @@ RATES = ((10.0, 2.5), (10.0, 4.5), (5.0, 6.0), (2.0, 9.0))
 ROADSIDE_EVERY = 6
 # Random traffic drives at up to 18 m/s; so many times as fast it is that of a motorway, on roads as straight as one.
 FAST_EVERY, FAST, MAX_FAST_CURVATURE_PM = 3, 2.0, 0.003
+# Poses wander by so much, from the best receivers to the worst, m and rad, correlated over so long, s.
+WANDER_M, WANDER_RAD, WANDER_S = (0.005, 0.15), (0.0005, 0.005), 5.0
 # Shares of logs by what is searched.
 SEARCHED = {"images and sweeps": 0.45, "sweeps": 0.2, "images": 0.35}
 # What LiDAR sees less of, a camera does not see either; what is hidden behind nearer objects by more is not found.
@@ -114,8 +126,8 @@ class SimulatedDetector:
 
     name, default_min_score = "simulated", MIN_SCORE
 
-    def __init__(self, log: Log, scene: TrafficScene, seed: int) -> None:
-        self._log, self._seed = log, seed
+    def __init__(self, log: Log, scene: TrafficScene, true: PoseTrack | None, seed: int) -> None:
+        self._log, self._true, self._seed = log, true, seed
         rng = np.random.default_rng([seed, 0])
         self._offset, false_share = rng.normal(0, 0.4), 0.05 * np.exp(rng.normal(0, 0.7))
         things = [o for o in scene.objects if not o.category and o.kind in LOOKS_LIKE and rng.random() < false_share]
@@ -210,6 +222,7 @@ class SimulatedDetector:
         if view is None or not self._things:
             return []
         center = np.array([o.position_m + np.array([0, 0, o.size_m[2] / 2]) for o, _, _ in self._things])
+        center = apply(seen_from(self._log, self._true, frame.t_ns), center)
         size, yaw = np.array([o.size_m for o, _, _ in self._things]), np.array([o.yaw_rad for o, _, _ in self._things])
         found = project_boxes_in_view(view, center, size, yaw)
         rows = []
@@ -223,8 +236,10 @@ class SimulatedDetector:
 class MistakenDetector:
     """Adds boxes of road users on what is none to those of a detector in sweeps; every box depends on the seed and its sweep alone."""
 
-    def __init__(self, detector: LidarDetector, scene: TrafficScene, seed: int) -> None:
-        self._detector, self._seed, self.name = detector, seed, detector.name
+    def __init__(
+        self, detector: LidarDetector, log: Log, scene: TrafficScene, true: PoseTrack | None, seed: int
+    ) -> None:
+        self._detector, self._log, self._true, self._seed, self.name = detector, log, true, seed, detector.name
         rng = np.random.default_rng([seed, 4])
         share, self._seen = SEEN_SHARE * np.exp(rng.normal(0, 0.7)), []
         for thing in scene.objects:
@@ -248,7 +263,10 @@ class MistakenDetector:
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         found = self._detector.detect(cloud, earlier)
         rng, rows = np.random.default_rng([self._seed, 5, cloud.stamp_ns // 1_000_000]), []
+        moved = seen_from(self._log, self._true, cloud.stamp_ns)
+        turn_rad = np.arctan2(moved[1, 0], moved[0, 0])
         for at, size, yaw, categories, odds, reach_m, along in self._seen:
+            at, yaw = apply(moved, at), yaw + turn_rad
             forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
             if reach_m:  # level with the sensor, as far as the front reaches to both sides of its middle
                 level_m = float(forward @ (cloud.origin + cloud.sensor - at))
@@ -284,8 +302,34 @@ def _iou(a: Array, b: Array) -> float:
     return float(w * h / ((a[2:] - a[:2]).prod() + (b[2:] - b[:2]).prod() - w * h))
 
 
-def make_log(seed: int, index: int) -> tuple[Log, TrafficScene]:
-    """Make log `index`; its sweeps are kept in memory, and its images are black."""
+def seen_from(log: Log, true: PoseTrack | None, t_ns: int) -> Array:
+    """Return how poses of a log move (4, 4) what is seen at a stamp, which `true` poses leave where it is."""
+    if log.ego is None or true is None:
+        return np.eye(4)
+    return np.asarray(log.ego.at(t_ns)[0][0] @ inverse(true.at(t_ns)[0][0]))
+
+
+def _wandering(log: Log, rng: np.random.Generator) -> Log:
+    """Let the poses of a log wander, and its labels with them, which are made in the frame of the sensor."""
+    if log.ego is None or log.labels is None:
+        return log
+    sigma = np.exp(rng.uniform(*np.log([WANDER_M, WANDER_M, WANDER_RAD]).T))
+    keep = np.exp(-np.diff(log.ego.t_ns, prepend=log.ego.t_ns[0]) / NS_PER_S / WANDER_S)
+    off = rng.normal(0, sigma, (len(keep), 3))  # along x and y, in yaw: an Ornstein-Uhlenbeck process each
+    for k in range(1, len(off)):
+        off[k] = keep[k] * off[k - 1] + np.sqrt(1 - keep[k] ** 2) * off[k]
+    poses = log.ego.map_T_ego.copy()
+    poses[:, :3, :3] = rotation_from_rpy(0.0, 0.0, off[:, 2]) @ poses[:, :3, :3]
+    poses[:, :2, 3] += off[:, :2]
+    moved, labels = log.changed(ego=replace(log.ego, map_T_ego=poses)), log.labels
+    transforms = np.array([seen_from(moved, log.ego, int(t)) for t in labels.t_ns]).reshape(-1, 4, 4)
+    center = np.einsum("nij,nj->ni", transforms[:, :3, :3], labels.center_m) + transforms[:, :3, 3]
+    yaw = wrap_angle(labels.yaw_rad + np.arctan2(transforms[:, 1, 0], transforms[:, 0, 0]))
+    return moved.changed(labels=replace(labels, center_m=center, yaw_rad=yaw))
+
+
+def make_log(seed: int, index: int) -> tuple[Log, TrafficScene, PoseTrack | None]:
+    """Make log `index` and return it with its scene and true poses; its sweeps are kept in memory, and its images are black."""
     rng = np.random.default_rng([seed, index, 9])
     mount = "roadside" if index % ROADSIDE_EVERY == ROADSIDE_EVERY - 1 else "vehicle"
     rate_hz, duration_s = RATES[int(rng.integers(len(RATES)))]
@@ -305,7 +349,8 @@ def make_log(seed: int, index: int) -> tuple[Log, TrafficScene]:
     }
     log = log.changed(streams=streams)
     points, _ = points_in_labels(log, log.labels)
-    return log.changed(labels=replace(log.labels, visible=points >= MIN_SEEN_POINTS)), scene
+    log, true = log.changed(labels=replace(log.labels, visible=points >= MIN_SEEN_POINTS)), log.ego
+    return _wandering(log, rng), scene, true
 
 
 def _sped_up(scene: TrafficScene) -> TrafficScene:
@@ -322,20 +367,23 @@ def _sped_up(scene: TrafficScene) -> TrafficScene:
 
 def cases_of(seed: int, index: int) -> list[Case]:
     """Run the first passes of a log."""
-    log, scene = make_log(seed, index)
+    log, scene, true = make_log(seed, index)
     truth = truth_from_log(log)
     sweeps = "lidar:vehicle" if scene.mount == "vehicle" else "lidar:roadside"
     names = {"images and sweeps": f"labels+{sweeps}", "sweeps": sweeps, "images": "labels"}
     rng = np.random.default_rng([seed, index, 10])
     searched = names[str(rng.choice(list(SEARCHED), p=list(SEARCHED.values())))]
     blind = log.changed(lidars={}, streams={"camera": log.streams["camera"]})
-    return [_case(log, scene, truth, searched, seed + index), _case(blind, scene, truth, "labels", seed + index)]
+    return [
+        _case(log, scene, true, truth, searched, seed + index),
+        _case(blind, scene, true, truth, "labels", seed + index),
+    ]
 
 
-def _case(log: Log, scene: TrafficScene, truth: Scenario, detector: str, seed: int) -> Case:
+def _case(log: Log, scene: TrafficScene, true: PoseTrack | None, truth: Scenario, detector: str, seed: int) -> Case:
     run = start(log, Config.load(settings=[f"detect.name={detector}"]))
-    images = None if run.detectors.images is None else SimulatedDetector(log, scene, seed)
-    sweeps = MistakenDetector(run.detectors.sweeps, scene, seed) if run.detectors.sweeps else None
+    images = None if run.detectors.images is None else SimulatedDetector(log, scene, true, seed)
+    sweeps = MistakenDetector(run.detectors.sweeps, run.log, scene, true, seed) if run.detectors.sweeps else None
     observations = observe_log(replace(run, detectors=Detectors(images, sweeps)))
     observations.records = None
     kept = run.log.changed(streams={k: Stream(k, np.asarray(s.t_ns), silent) for k, s in run.log.streams.items()})

@@ -136,6 +136,26 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
     return network
 
 
+def blend(path: Path, other: Path, share: float) -> None:
+    """Average the weights of an exported network with those of the one that its training began from, which count a `share`.
+
+    The mean keeps more of what the other was right about than training on new scenes alone (Wortsman et al., CVPR 2022). Raises `ValueError`
+    where the layers differ.
+    """
+    import onnx
+
+    model = onnx.load(path)
+    before = {v.name: onnx.numpy_helper.to_array(v) for v in onnx.load(other).graph.initializer}
+    for weight in model.graph.initializer:
+        value = onnx.numpy_helper.to_array(weight)
+        if weight.name not in before or before[weight.name].shape != value.shape:
+            raise ValueError(f"{other}: its layers are not those of {path}")
+        if value.dtype.kind == "f":
+            mean = (1 - share) * value.astype(np.float32) + share * before[weight.name].astype(np.float32)
+            weight.CopyFrom(onnx.numpy_helper.from_array(mean.astype(value.dtype), weight.name))
+    onnx.save(model, path)
+
+
 def describe(path: Path, info: dict[str, Any], key: str = METADATA_KEY) -> None:
     """Write the description of a network into its file."""
     import onnx

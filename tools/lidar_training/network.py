@@ -142,8 +142,8 @@ class Targets:
 
     heat: Tensor  # (B, 3, h, w): one at an object's middle, falling around it
     box: Tensor  # (B, 10, h, w): dx, dy, z, log sizes, sin and cos of twice the yaw, sin and cos of the yaw
-    regressed: Tensor  # (B, 1, h, w): where the box is regressed; where the heat is judged
-    considered: Tensor  # (B, 1, h, w): where the box is regressed; where the heat is judged
+    regressed: Tensor  # (B, 1, h, w): where the box is regressed
+    considered: Tensor  # (B, 3, h, w): where the heat is judged
     category: Tensor  # (B, h, w): index of the category, -1 where none is regressed
     segment: Tensor  # (B, h, w): 0 background, else 1 + group
     vote: Tensor  # (B, 2, h, w)
@@ -154,7 +154,7 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
     n, b, cell = cells // STRIDE, len(samples), cell_m * STRIDE
     heat = np.zeros((b, 3, n, n), np.float32)
     box = np.zeros((b, 10, n, n), np.float32)
-    regressed, considered = np.zeros((b, 1, n, n), np.float32), np.ones((b, 1, n, n), np.float32)
+    regressed, considered = np.zeros((b, 1, n, n), np.float32), np.ones((b, 3, n, n), np.float32)
     category, segment = np.full((b, n, n), -1, np.int64), np.zeros((b, n, n), np.int64)
     vote = np.zeros((b, 2, n, n), np.float32)
     for k, (sample, low) in enumerate(zip(samples, lows, strict=True)):
@@ -176,10 +176,11 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
             c, s = np.cos(yaw), np.sin(yaw)
             along, across = dx * c + dy * s, dy * c - dx * s
             inside = (np.abs(along) < length / 2 + 0.1) & (np.abs(across) < width / 2 + 0.1)
+            # A bicycle without rider may pass for a two-wheeler, but not for a person.
+            group = GROUPS.index("vehicle" if name == "other" else GROUP_OF[name])
             if points < MIN_POINTS or name in ("bicycle", "other") or not (0 <= u < n and 0 <= v < n):
-                considered[(k, 0, *area)][inside] = 0
+                considered[(k, group, *area)][inside] = 0
                 continue
-            group = GROUPS.index(GROUP_OF[name])
             spread_m = [
                 max(length * PEAK_LENGTH, cell * MIN_PEAK_CELLS),
                 max(width * PEAK_WIDTH, cell * MIN_PEAK_CELLS),

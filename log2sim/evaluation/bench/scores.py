@@ -277,7 +277,7 @@ def split_holdout(
         xy, object_id = known[tick].xy, known[tick].object_id
         near = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T) <= MAX_RANGE_M
         good = (m.source == "lidar") & ~m.truncated & (m.points >= MIN_POINTS) & near & np.isfinite(xy[:, 0])
-        good &= np.array([len(c) > 0 for c in m.cluster], dtype=bool)
+        good &= m.kept_points > 0
         good &= rng.random(len(m)) < HOLDOUT_FRACTION
         for camera in obstacles:
             rows = np.flatnonzero(good & (m.camera == camera))

@@ -17,10 +17,10 @@ from log2sim.datatypes import Labels, Lidar, Log, Stream, Sweep
 from log2sim.datatypes.log import intrinsics_to_dict
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.files.documents import check, refuse_folder
+from log2sim.files.images import JPEG_MAGIC, image_size
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
 from log2sim.logs.native import reader as tables
-from log2sim.logs.records import JPEG_MAGIC, image_size
 from log2sim.logs.stamps import geodetic_from_map
 
 POINT_RESOLUTION_M = 1e-3
@@ -67,7 +67,9 @@ def write_log(
             rows, sweeps = list[tuple[Any, ...]](), list[tuple[str, int | None]]()
             for i, t_ns in enumerate(stream.t_ns.tolist()):
                 try:
-                    suffix, data, kind = _encode(stream, i, sweep, jpeg_quality, offset)
+                    suffix, data, kind = _encode(
+                        stream, i, sweep if entry["kind"] == "lidar" else "", jpeg_quality, offset
+                    )
                 except RecordError as error:
                     if problems is None:
                         raise
@@ -134,8 +136,8 @@ def _sensor(sensor: Camera | Lidar, offset: Array) -> dict[str, Any]:
 def _encode(
     stream: Stream, i: int, kind: str, jpeg_quality: int, offset: Array
 ) -> tuple[str, bytes, tuple[str, int | None] | None]:
-    """Return suffix and bytes of the file of a record; of a sweep also its frame and to which stamp it is compensated."""
-    if stream.encoded is not None:
+    """Return suffix and bytes of the file of a record; of a sweep, in a format `kind`, also its frame and to which stamp it is compensated."""
+    if stream.encoded is not None and not kind:  # of an image
         data = stream.encoded(i)
         image_size(data, f"{stream.name}, stamp {stream.t_ns[i]}")  # an image, or a RecordError
         return "jpg" if data[:2] == JPEG_MAGIC else "png", data, None

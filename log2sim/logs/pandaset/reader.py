@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.documents import JSON_LIMIT_BYTES, read_json
-from log2sim.files.inputs import is_present, read_text, require_links_inside
+from log2sim.files.inputs import is_present, read_file, read_text, require_links_inside
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, nearest_rotation, transform, wrap_angle
 from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.excerpt import digest_of
-from log2sim.logs.pandaset.unpickle import Columns, read_pickled_table
+from log2sim.logs.pandaset.unpickle import MAX_TABLE_BYTES, Columns, read_pickled_table
 from log2sim.logs.records import (
     MAX_POSITION_M,
     FolderReader,
@@ -69,7 +69,10 @@ class SweepFiles:
             t_ns, files = self.index(lidar)
             return _read_sweep(self._kept.take(files[i], lidar), files[i], int(t_ns[i]), LIDARS[lidar])
 
-        return Stream(lidar, lambda: self.index(lidar)[0], read)
+        def encoded(i: int) -> bytes:
+            return read_file(self.index(lidar)[1][i], MAX_TABLE_BYTES, RecordError)
+
+        return Stream(lidar, lambda: self.index(lidar)[0], read, encoded)
 
     def index(self, lidar: str) -> tuple[NDArray[np.int64], list[Path]]:
         """Return stamps (F,) and files of the sweeps of one LiDAR, in order."""

@@ -197,7 +197,7 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
     In the image it is the middle of the box's lower edge, on the ground the point below the nearest side of their LiDAR
     points. Truncated boxes and obstacles with few points are left out.
     """
-    kept = np.array([len(c) > 0 for c in measured.cluster], dtype=bool)
+    kept = measured.kept_points > 0
     good = (measured.source == "lidar") & ~measured.truncated & (measured.points >= MIN_FOOT_POINTS) & kept
     rows = np.flatnonzero(good & (measured.camera == camera.name))
     xy = []

@@ -505,19 +505,22 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
     edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
     free = np.ones(len(xyz), dtype=bool)
     free[found.point] = False
-    members, place = [found.point[own][a:b] for a, b in pairwise(edges)], xyz[:, :2] - cloud.sensor[:2]
+    point, (x, y, _), place = found.point[own], cloud.obstacle_columns, xyz[:, :2] - cloud.sensor[:2]
+    members = [point[a:b] for a, b in pairwise(edges)]
     for k, category in enumerate(boxes.category):
         longest_m, seed = MAX_SIZE_M[category][0], members[k]
         if longest_m < MIN_LONG_M or len(seed) < MIN_CLUSTER_POINTS:
             continue
         # The boxes of a detector that sees little of a long flank at a time end before it does.
-        near = free & (np.abs(xyz[:, :2] - center[k, :2].astype(xyz.dtype)).max(axis=1) < longest_m)
-        rest = np.flatnonzero(near)
+        middle = center[k].astype(xyz.dtype)
+        rest = np.flatnonzero(free & (np.abs(x - middle[0]) < longest_m) & (np.abs(y - middle[1]) < longest_m))
         yaw_rad = corrected_yaw(place[seed].astype(np.float64), float(boxes.yaw_rad[k]))
         for _ in range(2):  # along the flank, then round the corner
             own, more = (place[index].astype(np.float64) for index in (seed, rest))
             added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
-            seed, rest = np.union1d(seed, rest[added]), np.delete(rest, added)
+            seed, rest = np.sort(np.concatenate([seed, rest[added]])), np.delete(rest, added)
+            if not len(added):
+                break
         # Sides that go on past the longest and widest vehicle are a wall's.
         sides_m = np.sort(np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0))
         if (sides_m <= MAX_SIZE_M[category][1::-1]).all():
