@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from fits.confidence_logs import Case
 from log2sim import pipeline
+from log2sim.agents import estimate
 from log2sim.agents import judge as judging
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import SIGNS, Table, gather
@@ -84,6 +85,7 @@ def agents_of(case: Case, log: str) -> list[Rated]:
         patch.object(judging, "MIN_THERE", {True: 0.0, False: 0.0}),
         patch.object(judging, "gather", keep_table),
         patch.object(pipeline, "judge", keep_candidates),
+        patch.object(estimate, "may_suffice", lambda track, static: True),
     ):
         try:
             scenario = case.second().scenario
