@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.slow
 def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
-    log, scene = confidence_logs.make_log(1, 8)
-    detector = confidence_logs.SimulatedDetector(log, scene, 3)
+    log, scene, true = confidence_logs.make_log(1, 8)
+    detector = confidence_logs.SimulatedDetector(log, scene, true, 3)
     camera, stamp = log.cameras["camera"], int(log.streams["camera"].t_ns[3])
     frame = Frame(camera, stamp, lambda: np.zeros((camera.height_px, camera.width_px, 3), np.uint8))
     one, two = detector.detect(frame), detector.detect(frame)

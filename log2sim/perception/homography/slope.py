@@ -226,7 +226,7 @@ def _refine(rows: _Rows, planes: _Planes, K: Array, *, slopes: bool) -> tuple[_P
         flat = (design * weight[:, None, None]).reshape(-1, design.shape[2])
         normal = flat.T @ design.reshape(-1, design.shape[2])
         prior = variance * STEP_SIGMAS**-2.0
-        size = np.sqrt(np.maximum(np.diagonal(normal) + np.append(np.zeros(8), prior)[: len(normal)], 1e-300))
+        size = np.sqrt(np.maximum(np.diagonal(normal) + np.append(np.zeros(8), prior)[: len(normal)], 1e-24))
         damped = normal + np.diag(np.append(np.zeros(8), prior)[: len(normal)])
         inverse = np.linalg.inv(damped / size[:, None] / size + 1e-12 * np.eye(len(size))) / size[:, None] / size
         moved = inverse @ (flat.T @ whitened.ravel())
