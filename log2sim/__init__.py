@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from log2sim.logs.opening import open_log
     from log2sim.logs.validation import validate_log
     from log2sim.pipeline import reconstruct
-    from log2sim.prediction.prediction import predict_scenario
     from log2sim.resim.simulate import resimulate
     from log2sim.road.builder import map_ground
     from log2sim.scenarios.failure import search as search_failures
     from log2sim.scenarios.logical import fit as fit_logical
     from log2sim.scenarios.query import ask as find_situations
     from log2sim.scenarios.tagging import tag as tag_scenario
+    from log2sim.simulation.prediction.prediction import predict_scenario
     from log2sim.simulation.runner import replay
     from log2sim.synth.synthesis import write_synthetic
     from log2sim.visualization.page.writer import write_page as view
@@ -55,7 +55,7 @@ _PLACES = {
     "map_ground": "log2sim.road.builder:map_ground",
     "open_log": "log2sim.logs.opening:open_log",
     "plot": "log2sim.visualization.plot.scene:plot",
-    "predict_scenario": "log2sim.prediction.prediction:predict_scenario",
+    "predict_scenario": "log2sim.simulation.prediction.prediction:predict_scenario",
     "reconstruct": "log2sim.pipeline:reconstruct",
     "reconstruct_all": "log2sim.batch.run:reconstruct_all",
     "replay": "log2sim.simulation.runner:replay",

@@ -413,3 +413,13 @@ def _ego_motion(ego: PoseTrack, t_ns: NDArray[np.int64]) -> tuple[float, float]:
     positions, rotations = map_T_ego[:, :3, 3], map_T_ego[:, :3, :3]
     cosine = (np.einsum("ij,nij->n", rotations[0], rotations) - 1) / 2
     return float(np.ptp(positions, axis=0).max()), float(np.arccos(np.clip(cosine, -1, 1)).max())
+
+
+def explain_missing_poses(log: Log, t_ns: NDArray[np.int64]) -> str:
+    """Explain why no pose of the ego is known at any of some ticks (T,)."""
+    if log.ego is None:
+        return "no ego poses"
+    poses, ticks = Span.of("ego poses", log.ego.t_ns), Span.of("ticks", t_ns)
+    if poses.is_apart(ticks, 0):
+        return describe_gap(poses, ticks)
+    return f"no ego pose within {log.ego.max_gap_s:g} s of any tick"

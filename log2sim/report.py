@@ -18,14 +18,13 @@ from log2sim.files.stages import StageClock
 from log2sim.files.version import __version__
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, undistort
 from log2sim.localization.choice import GIVEN, PoseChoice
-from log2sim.logs.checks import explain_missing_poses
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.records import RecordSource
 from log2sim.perception.run_cache import StageCache
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
-from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage
+from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage, explain_missing_poses
 
 Progress = Callable[[str, int, int], None]
 

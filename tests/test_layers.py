@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Folders and modules of the package from the ground floor up. Each may import those before it and nothing else.
 RANKED = (
     "errors", "files", "geometry", "datatypes", "config", "logs", "synth", "tracking", "plan", "perception", "localization",
-    "agents", "road", "report", "pipeline", "prediction", "simulation", "resim", "edit", "export", "visualization", "evaluation", "scenarios", "batch", "cli",
+    "agents", "road", "report", "pipeline", "simulation", "resim", "edit", "export", "visualization", "evaluation", "scenarios", "batch", "cli",
     "__init__", "__main__",
 )  # fmt: skip
 

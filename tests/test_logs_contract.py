@@ -17,11 +17,11 @@ from log_encoders.world import labels_at, world_log
 from log2sim.datatypes import CATEGORIES, Labels, Log, Stream, Sweep
 from log2sim.errors import ConfigError, Log2SimError, LogError, RecordError
 from log2sim.files import plugins
+from log2sim.files.images import decode_image
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
 from log2sim.logs.opening import open_log
-from log2sim.logs.records import decode_image
 from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 
 # Opening may read the index, and where a size is stated nowhere else the first image; images are nearly all of a log.

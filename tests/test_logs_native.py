@@ -13,10 +13,10 @@ import pytest
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
+from log2sim.files.images import decode_image
 from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
-from log2sim.logs.records import decode_image
 from log2sim.logs.stamps import transverse_mercator
 from log2sim.logs.validation import validate_log
 

@@ -14,9 +14,15 @@ from replay_maneuvers import agent_from
 from replay_scenes import line, parked, walker
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
-from log2sim.prediction.displacement import measure_predictions
-from log2sim.prediction.motion_table import table_of
-from log2sim.prediction.prediction import ACCELERATION_S, METHODS, Predictions, drift_variance, predict_scenario
+from log2sim.simulation.prediction.displacement import measure_predictions
+from log2sim.simulation.prediction.motion_table import table_of
+from log2sim.simulation.prediction.prediction import (
+    ACCELERATION_S,
+    METHODS,
+    Predictions,
+    drift_variance,
+    predict_scenario,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))

@@ -10,102 +10,64 @@ one sweep in N.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from cooperation_worlds import blind_area, curve, hidden_traffic, overlap
-from cooperation_worlds.runs import (
-    ALONE,
-    TABLE,
-    WAYS,
-    Found,
-    detect,
-    perceive,
-    prepared,
-)
-from cooperation_worlds.world import World, disturb, draw_error, log_of
+from cooperation_worlds.runs import ALONE, TABLE, WAYS, detect, perceive, prepared
+from cooperation_worlds.world import disturb, log_of
 from entry import run
 
 from log2sim.datatypes import Log
 
-DRAW = {"range": curve.draw_range, "blind_area": blind_area.draw_blind_area, "overlap": overlap.draw_overlap}
-
-
-@dataclass(frozen=True)
-class Choices:
-    """What to run."""
-
-    seeds: range
-    ways: tuple[str, ...]
-    noise: float
-    delayed: bool
-    register: bool
-    every: int
-
-    def disturbed(self, log: Log, seed: int) -> Log:
-        """Put an error on the road's end."""
-        return disturb(log, draw_error(seed, self.noise, delayed=self.delayed)) if self.noise else log
+DRAW = {
+    "range": curve.draw_range, "blind_area": blind_area.draw_blind_area, "overlap": overlap.draw_overlap,
+    "ap": lambda seed: hidden_traffic.seen(hidden_traffic.draw_hidden_traffic(seed)),
+}  # fmt: skip
 
 
 def main(test: str, variants: int = 50, seed: int = 0, ways: str = ",".join(WAYS), noise: float = 0.0, delay: bool = True,
          register: bool = True, every: int = 1) -> None:  # fmt: skip
     """Run a test and print its table."""
-    choices = Choices(range(seed, seed + variants), tuple(ways.split(",")), noise, delay, register, every)
-    print(TABLE[test](RUN[test](choices)))
-
-
-def measured(
-    test: str, choices: Choices, measure: Callable[[World, Log, str, Found], Any]
-) -> Iterator[tuple[World, dict[str, Any]]]:
-    """Yield each world with a row for every way, in the order of the seeds."""
-    for seed in choices.seeds:
-        world = replace(DRAW[test](seed), every=choices.every)
-        log = choices.disturbed(log_of(world)[0], seed)
-        both = prepared(log, register=choices.register) if set(choices.ways) - set(ALONE) else log
-        logs = {way: log if way in ALONE else both for way in choices.ways}
-        yield world, {way: measure(world, of, way, perceive(of, way, world.scene.start_ns)) for way, of in logs.items()}
-
-
-def run_range(choices: Choices) -> dict[str, Any]:
-    """Test A."""
-    rows = [r for _, r in measured("range", choices, lambda world, _, __, found: curve.perceived(world, found))]
-    return {way: curve.figures([r[way] for r in rows]) for way in choices.ways}
-
-
-def run_blind_area(choices: Choices) -> dict[str, Any]:
-    """Test B."""
-    results = list(measured("blind_area", choices, lambda world, _, __, found: blind_area.row(world, found)))
-    rows = {way: [r[way] for _, r in results] for way in choices.ways}
-    return blind_area.figures([world for world, _ in results], rows)
-
-
-def run_overlap(choices: Choices) -> dict[str, Any]:
-    """Test C, box by box and as a scenario."""
-
-    def measure(world: World, log: Log, way: str, found: Found) -> dict[str, Any]:
-        return {"scenario": overlap.of_scenario(world, found), "boxes": overlap.from_boxes(world, *detect(log, way))}
-
-    rows = [r for _, r in measured("overlap", choices, measure)]
-    return {
-        of: overlap.figures([{way: r[way][of] for way in choices.ways} for r in rows]) for of in ("boxes", "scenario")
-    }
-
-
-def run_ap(choices: Choices) -> dict[str, Any]:
-    """AP in random traffic, of all road users that both ends together have points of; too short to register."""
-    rows: dict[str, list[Any]] = {way: [] for way in choices.ways}
-    for seed in choices.seeds:
-        view = hidden_traffic.seen(hidden_traffic.draw_hidden_traffic(seed))
-        log = choices.disturbed(view.log, seed)
+    worlds: list[Any] = []
+    rows: dict[str, list[Any]] = {way: [] for way in ways.split(",")}
+    for k in range(seed, seed + variants):
+        world = DRAW[test](k)
+        if test != "ap":
+            world = replace(world, every=every)
+        log = world.log if test == "ap" else log_of(world)[0]
+        log = disturb(log, k, noise, delayed=delay) if noise else log
+        # The sweeps of random traffic are too few to register.
+        both = prepared(log, register=register) if test != "ap" and set(rows) - set(ALONE) else log
         for way, of_way in rows.items():
-            of_way += hidden_traffic.sweeps(view, *detect(log, way, min_score=hidden_traffic.MIN_SCORE))
-    return hidden_traffic.figures(rows)
+            of_way += measure(test, world, log if way in ALONE else both, way)
+        worlds.append(world)
+    print(TABLE[test](figures(test, worlds, rows)))
 
 
-RUN: dict[str, Callable[[Choices], dict[str, Any]]] = {
-    "range": run_range, "blind_area": run_blind_area, "overlap": run_overlap, "ap": run_ap,
-}  # fmt: skip
+def measure(test: str, world: Any, log: Log, way: str) -> list[Any]:
+    """What one way of perceiving makes of a variant."""
+    if test == "ap":  # of all road users that both ends together have points of
+        return hidden_traffic.sweeps(world, *detect(log, way, min_score=hidden_traffic.MIN_SCORE))
+    found = perceive(log, way, world.scene.start_ns)
+    if test == "range":
+        return [curve.perceived(world, found)]
+    if test == "blind_area":
+        return [blind_area.row(world, found)]
+    return [{"scenario": overlap.of_scenario(world, found), "boxes": overlap.from_boxes(world, *detect(log, way))}]
+
+
+def figures(test: str, worlds: list[Any], rows: dict[str, list[Any]]) -> dict[str, Any]:
+    """The figures of a test, by way; those of the overlap box by box and as a scenario."""
+    if test == "ap":
+        return hidden_traffic.figures(rows)
+    if test == "range":
+        return {way: curve.figures(of_way) for way, of_way in rows.items()}
+    if test == "blind_area":
+        return blind_area.figures(worlds, rows)
+    by_variant = [dict(zip(rows, of_variant)) for of_variant in zip(*rows.values())]
+    return {of: overlap.figures([{w: r[of] for w, r in v.items()} for v in by_variant]) for of in ("boxes", "scenario")}
+
 
 if __name__ == "__main__":
     run(main, __doc__)

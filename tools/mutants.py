@@ -54,7 +54,7 @@ MUTANTS = (
     ("switches of identity", "evaluation/metrics/comparison.py", "& (now != last)", "& (now > last)", "metrics_evaluate"),
     ("association of HOTA", "evaluation/metrics/evaluator.py", "np.divide(potential, union", "np.divide(potential, potential + union", "metrics_tracking"),
     ("normals face the sensor", "localization/roadside_fit.py", "np.where(facing < 0, -1.0, 1.0)", "np.where(facing < 0, 1.0, 1.0)", "cooperation"),
-    ("sigmas of predictions do not grow", "prediction/prediction.py", "** 2 + variance)", "** 2 + 0 * variance)", "prediction"),
+    ("sigmas of predictions do not grow", "simulation/prediction/prediction.py", "** 2 + variance)", "** 2 + 0 * variance)", "prediction"),
     ("centers of exported boxes", "export/openscenario/write.py", "x=number(agent.rear_axle_offset_m), y", "x=number(-agent.rear_axle_offset_m), y", "export_openscenario import"),
     ("shifts to the side", "edit/motion.py", "y_m=w.y_m + offset * np.cos(yaw)", "y_m=w.y_m - offset * np.cos(yaw)", "edit"),
     ("hypotheses are not counted", "agents/hypotheses.py", "- np.log(count))", ")", "hypotheses"),

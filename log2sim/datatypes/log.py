@@ -167,6 +167,11 @@ class Labels:
     # Categories that got no 3D boxes by the log's rules, such as bicycles without riders in KITTI
     never_labeled: tuple[str, ...] = ()
 
+    def take(self, rows: NDArray[Any]) -> Labels:
+        """Select rows."""
+        of_all = ("cameras", "labeled_ns", "never_labeled")
+        return replace(self, **{n: v[rows] for n, v in vars(self).items() if n not in of_all and v is not None})
+
 
 @dataclass(frozen=True, eq=False)
 class ImageLabels:

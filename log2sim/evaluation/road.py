@@ -58,10 +58,6 @@ class Area:
         """Whether what is true at points (N, 2) should be found: near the path, where a sensor saw the ground."""
         return _within(self.near, xy_m) & _within(self.seen, xy_m)
 
-    def is_close(self, xy_m: Array) -> NDArray[np.bool_]:
-        """Whether points (N, 2) lie in the nearer part."""
-        return _within(self.close, xy_m)
-
 
 def _within(area: BaseGeometry | None, xy_m: Array) -> NDArray[np.bool_]:
     if area is None:
@@ -168,7 +164,7 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
     right = away <= MATCH_M
     found_m, true_m = float(ours.length_m.sum()), float(theirs.length_m.sum())
     false_m = float(ours.length_m[~right].sum())
-    close = area.is_close(theirs.xy_m)
+    close = _within(area.close, theirs.xy_m)
     # Shares of the matched length whose kind, and whose color where both sides state one, is right.
     matched, agreement = ours.where(right), {}
     for name in ("kind", "color"):

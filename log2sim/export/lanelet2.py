@@ -14,8 +14,7 @@ from log2sim.export.exporters import Options, project_points
 from log2sim.export.roads.network import MarkFinder
 from log2sim.export.roads.opendrive import LIGHT_HEIGHT_M, LIGHT_WIDTH_M, edges_of, lanes, signal_lanes
 from log2sim.export.xml_text import element
-from log2sim.geometry import Array, wrap_angle
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import Array, Polyline, wrap_angle
 
 SHARED_M = 0.5  # edges whose ends are nearer than this are one way: lanes of log2sim are measured to some decimeters
 STOP_M = 8.0  # from a stop line to where its lane ends: across a crosswalk

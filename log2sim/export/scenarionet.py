@@ -18,8 +18,7 @@ from log2sim.datatypes import GROUP_OF, VERSION, Agent, MapFeatures, MapLane, Sc
 from log2sim.errors import ScenarioError
 from log2sim.export.exporters import Options, SampledMotion, file_name, near_origin, sample_steps, step_times
 from log2sim.export.roads.opendrive import lanes, signal_lanes
-from log2sim.geometry import NS_PER_S, Array
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import NS_PER_S, Array, Polyline
 
 SPACING_M = 1.0  # of points of lanes, as MetaDrive's own maps have them
 # Types of lane lines by kind and color; MetaDrive has none for lines of unknown color, which are written as white.

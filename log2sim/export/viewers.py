@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim import geometry
-from log2sim.datatypes import Agent, Log, Scenario, Sweep
+from log2sim.datatypes import Agent, Log, Scenario
 from log2sim.errors import ConfigError, RecordError
 from log2sim.export.exporters import SampledMotion, sample_steps, step_times
 from log2sim.perception.lidar.cloud import sweep_to_map
@@ -53,7 +53,7 @@ class ThinnedSweep:
 
     t_ns: int
     lidar: str
-    points_map: geometry.Array  # (N, 3)
+    points_map: geometry.Array  # (N, 3); none where the pose of the LiDAR is not known
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,8 @@ def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -
         return CameraFrame(
             t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, geometry.inverse(poses[0]), t_ns))
         )
-    return ThinnedSweep(t_ns, name, _points_map(log, name, record))
+    mapped = sweep_to_map(log, name, record.thinned(MAX_SWEEP_POINTS), compensate=True)
+    return ThinnedSweep(t_ns, name, np.zeros((0, 3)) if mapped is None else mapped[0])
 
 
 def _downscaled(camera: geometry.Camera, scale: float) -> geometry.Camera:
@@ -158,11 +159,3 @@ def _outlines(
             lines = geometry.box_lines(camera, geometry.apply(cam_T_map, corners))
             if len(lines):
                 yield agent, lines
-
-
-def _points_map(log: Log, name: str, sweep: Sweep) -> geometry.Array:
-    """Transform every n-th point of a sweep to the map frame (N, 3); none when the pose of the LiDAR is unknown."""
-    kept = slice(None, None, max(1, -(-len(sweep.xyz_m) // MAX_SWEEP_POINTS)))
-    t_ns = None if sweep.t_ns is None else sweep.t_ns[kept]
-    mapped = sweep_to_map(log, name, replace(sweep, xyz_m=sweep.xyz_m[kept], t_ns=t_ns), compensate=True)
-    return np.zeros((0, 3)) if mapped is None else mapped[0]

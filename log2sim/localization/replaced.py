@@ -13,7 +13,6 @@ from log2sim.datatypes import Labels, Log, MapFrame, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.geometry import Array, PoseTrack, apply, inverse, wrap_angle
 from log2sim.localization.odometry import TransformAt, move_points
-from log2sim.logs.excerpt import take_labels
 
 
 def replace_poses(log: Log, new: PoseTrack) -> Log:
@@ -66,7 +65,7 @@ def _moved_labels(labels: Labels | None, new_T_old: TransformAt) -> Labels | Non
     k = np.flatnonzero(known)
     heading = np.stack([np.cos(labels.yaw_rad[k]), np.sin(labels.yaw_rad[k]), np.zeros(len(k))], axis=1)
     turned = np.einsum("nij,nj->ni", poses[k, :3, :3], heading)
-    moved = take_labels(labels, k)
+    moved = labels.take(k)
     yaw_rad = wrap_angle(np.arctan2(turned[:, 1], turned[:, 0]))
     return replace(moved, center_m=apply(poses[k], moved.center_m), yaw_rad=yaw_rad)
 

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
+from log2sim.files.images import MAX_IMAGE_PX
 from log2sim.files.inputs import is_present, read_file, require_links_inside
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, shift_poses
 from log2sim.logs.arrow import LIMITS, Kind, TableLimits, read_columns
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import (
-    MAX_IMAGE_PX,
     MAX_SWEEP_BYTES,
     MAX_SWEEP_POINTS,
     checked_poses,

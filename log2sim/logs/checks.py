@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Log
 from log2sim.geometry import NS_PER_S, Camera, fold_radius, nearest_index, undistort
-from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of, take_labels
+from log2sim.logs.excerpt import MAX_LABEL_DISTANCE_NS, STAMP_TOLERANCE_NS, reference_of
 from log2sim.logs.records import MAX_POSITION_M
 
 # As a scenario may state; a freight train is not longer.
@@ -30,7 +30,7 @@ def drop_impossible_labels(log: Log) -> Log:
 
     def labels() -> Labels | None:
         kept, given = possible(), log.labels
-        return given if given is None or kept is None or kept.all() else take_labels(given, kept)
+        return given if given is None or kept is None or kept.all() else given.take(kept)
 
     def notes() -> tuple[str, ...]:
         kept = possible()
@@ -187,16 +187,6 @@ class Span:
 def list_time_problems(log: Log) -> list[str]:
     """List what is wrong with the stamps of a log, one line each; only stamps are read, and the labels."""
     return [*_other_clocks(log), *_reference_problem(log), *_image_label_problems(log), *_label_problems(log)]
-
-
-def explain_missing_poses(log: Log, t_ns: NDArray[np.int64]) -> str:
-    """Explain why no pose of the ego is known at any of some ticks (T,)."""
-    if log.ego is None:
-        return "no ego poses"
-    poses, ticks = Span.of("ego poses", log.ego.t_ns), Span.of("ticks", t_ns)
-    if poses.is_apart(ticks, 0):
-        return describe_gap(poses, ticks)
-    return f"no ego pose within {log.ego.max_gap_s:g} s of any tick"
 
 
 def describe_gap(one: Span, other: Span) -> str:

@@ -120,16 +120,7 @@ def _cut_labels(labels: Labels | None, cameras: list[str], span: _Span | None) -
     labeled = labels.labeled_ns
     if labeled is not None:
         labeled = labeled[_mark_rows(labeled, np.arange(len(labeled)), span)]
-    return replace(take_labels(labels, keep), cameras=labeled_cameras, labeled_ns=labeled)
-
-
-def take_labels(labels: Labels, rows: NDArray[Any]) -> Labels:
-    """Select rows of labels."""
-    of_all = ("cameras", "labeled_ns", "never_labeled")
-    columns: dict[str, Any] = {
-        name: v[rows] for name, v in vars(labels).items() if name not in of_all and v is not None
-    }
-    return replace(labels, **columns)
+    return replace(labels.take(keep), cameras=labeled_cameras, labeled_ns=labeled)
 
 
 def _mark_rows(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> NDArray[np.bool_]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding, Log, Sweep, Treatment
 from log2sim.errors import LogError, RecordError
+from log2sim.files.images import decode_image
 from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera
-from log2sim.logs.records import decode_image
 
 Motion = Literal["drives", "stands", "unclear"]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
-from log2sim.geometry import Array, wrap_angle
-from log2sim.road.polyline import MAX_TURN_RAD, MIN_PATH_M, DrivenPath, Match, Polyline, collect_paths
+from log2sim.geometry import Array, Polyline, wrap_angle
+from log2sim.road.driven_paths import MAX_TURN_RAD, MIN_PATH_M, DrivenPath, Match, collect_paths
 from log2sim.road.routes import (
     BESIDE_M,
     CLEARANCE_M,

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
-from log2sim.geometry import Array
+from log2sim.geometry import Array, Polyline
+from log2sim.road.driven_paths import MAX_TURN_RAD
 from log2sim.road.lane_graph import infer_lanes
-from log2sim.road.polyline import MAX_TURN_RAD, Polyline
 
 # Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time.
 STEP_S = 0.1

@@ -8,19 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, wrap_angle
-from log2sim.road.polyline import (
-    ENTER_M,
-    MAX_TURN_RAD,
-    SHORT_M,
-    SPACING_M,
-    STAY_M,
-    DrivenPath,
-    Match,
-    Polyline,
-    Run,
-    match,
-)
+from log2sim.geometry import SPACING_M, Array, Polyline, wrap_angle
+from log2sim.road.driven_paths import ENTER_M, MAX_TURN_RAD, SHORT_M, STAY_M, DrivenPath, Match, Run, match
 
 # Stations at which distances are taken.
 STEP_M = 2.0

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
-from log2sim.road.polyline import JUMP_M, STAY_M, DrivenPath, Match, Polyline, Projection, Run, crossings
+from log2sim.geometry import Array, Polyline, Projection, crossings
+from log2sim.road.driven_paths import JUMP_M, STAY_M, DrivenPath, Match, Run
 from log2sim.road.routes import JOIN_M, LANE_M, MAX_LANE_M, Beside, Route
 
 # A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two.

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Marking, RoadBorder
-from log2sim.geometry import Array, wrap_angle
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import Array, Polyline, wrap_angle
 
 # Stations at which the distance to the next line is taken.
 STEP_M = 1.0

@@ -15,8 +15,8 @@ from log2sim.datatypes import EGO, TAGS, Scenario
 from log2sim.errors import LogError, MissingExtra, ScenarioError
 from log2sim.files.documents import replaced
 from log2sim.files.processes import default_jobs, map_in_processes
-from log2sim.prediction.motion_table import TICK_S
 from log2sim.scenarios.tagging import find_tags
+from log2sim.simulation.prediction.motion_table import TICK_S
 
 INDEX_FILE = "tags.parquet"
 INDEX_VERSION = 2

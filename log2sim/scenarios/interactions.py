@@ -12,8 +12,6 @@ import numpy as np
 
 from log2sim.datatypes import Tag
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
-from log2sim.prediction.motion_table import TICK_S
-from log2sim.prediction.prediction import MOVING, drift_variance
 from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
 from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
 from log2sim.scenarios.traffic import (
@@ -30,6 +28,8 @@ from log2sim.scenarios.traffic import (
 )
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import post_encroachment_times, time_to_touch
+from log2sim.simulation.prediction.motion_table import TICK_S
+from log2sim.simulation.prediction.prediction import MOVING, drift_variance
 
 FOLLOWING_S = 3.0
 """Time headway up to which a vehicle follows another (HCM 2016, percent time spent following)."""

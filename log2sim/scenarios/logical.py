@@ -21,10 +21,10 @@ from log2sim.export.exporters import Options, export
 from log2sim.export.xml_text import element, number, read, unique_names, write
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
-from log2sim.prediction.motion_table import TICK_S
 from log2sim.scenarios.index import Row
 from log2sim.scenarios.tagging import find_tags
 from log2sim.scenarios.traffic import Traffic
+from log2sim.simulation.prediction.motion_table import TICK_S
 
 MIN_HITS = 5  # of which a distribution is fitted
 # A concrete scenario shows a situation with a second before and after it, at least and at most so long before and after its moment.

@@ -14,9 +14,9 @@ import numpy as np
 
 from log2sim.datatypes import STANDSTILL_MPS, Tag
 from log2sim.geometry import Array, wrap_angle
-from log2sim.prediction.motion_table import TICK_S
 from log2sim.scenarios.traffic import LANE_CHANGE_S, Mask, Traffic, latched, probability_above, runs, turned
 from log2sim.simulation.driver_paths import STOP_STATES, light_ahead
+from log2sim.simulation.prediction.motion_table import TICK_S
 
 COMFORTABLE_MPS2 = 3.4
 """Deceleration that most drivers find comfortable (AASHTO, "Green Book" 2018, 3.2.2)."""

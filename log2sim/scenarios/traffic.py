@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import STANDSTILL_MPS, Agent, MapLane, Scenario
-from log2sim.geometry import Array, fit_windows, wrap_angle
-from log2sim.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
-from log2sim.prediction.prediction import MOVING, drift_variance
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import Array, Polyline, fit_windows, wrap_angle
+from log2sim.simulation.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
+from log2sim.simulation.prediction.prediction import MOVING, drift_variance
 
 Mask = NDArray[np.bool_]
 Index = NDArray[np.intp]

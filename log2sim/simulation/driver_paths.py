@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from log2sim.datatypes import MapFeatures, MapLane, Signal
-from log2sim.geometry import Array, wrap_angle
-from log2sim.prediction.motion_table import Complex
-from log2sim.prediction.prediction import ACCELERATION_S, MOVING
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import Array, Polyline, wrap_angle
+from log2sim.simulation.prediction.motion_table import Complex
+from log2sim.simulation.prediction.prediction import ACCELERATION_S, MOVING
 from log2sim.simulation.present import Mask, Present
 
 POINTS = 161

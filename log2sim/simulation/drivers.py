@@ -16,10 +16,10 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
-from log2sim.prediction.motion_table import TICK_S, Complex
-from log2sim.prediction.prediction import ACCELERATION_S, MOVING
 from log2sim.simulation.driver_paths import LIGHT_M, POINTS, SIDE_M, STOP_STATES, Paths
 from log2sim.simulation.metrics.realism import Motions
+from log2sim.simulation.prediction.motion_table import TICK_S, Complex
+from log2sim.simulation.prediction.prediction import ACCELERATION_S, MOVING
 from log2sim.simulation.present import Mask, observe, recorded
 from log2sim.simulation.reactive import EXPONENT, IdmParameters, idm_parameters, leader_demand
 

@@ -15,10 +15,10 @@ from log2sim.datatypes import ENDS, Agent, Scenario, Span, Trajectory
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, wrap_angle
-from log2sim.prediction.motion_table import Complex, MotionTable
-from log2sim.prediction.prediction import DEFAULT_METHOD, predict_table
 from log2sim.simulation.corridors import ON_PATH_COS, ON_PATH_M, PathTable
 from log2sim.simulation.metrics.conflicts import touching
+from log2sim.simulation.prediction.motion_table import Complex, MotionTable
+from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_table
 from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
 
 # Whose observations count: those of the sensors of the ego, of those at the roadside, or all.
@@ -200,7 +200,7 @@ class ExpectedAgents:
     `table`: states of the agents at all ticks. `known`: what is known of them at these ticks. `interval_s`: between
     observations.
 
-    Movers are predicted by `log2sim.prediction` from the states at ticks at which they were observed. To its standard deviations
+    Movers are predicted by `log2sim.simulation.prediction` from the states at ticks at which they were observed. To its standard deviations
     comes that of a speed which a tracker has learned from few observations: of the slope of a line through n places with
     errors sigma, sigma sqrt(12 / (n (n^2 - 1))) per interval. Static agents stay where they are.
     """

@@ -68,7 +68,6 @@ def follow_vehicles(
     memory: ControllerMemory,
     parameters: vehicle.VehicleParameters,
     dt_s: float,
-    gains: ControllerGains = GAINS,
 ) -> tuple[vehicle.VehicleControls, ControllerMemory]:
     """Compute the controls of vehicles that follow their references.
 
@@ -78,7 +77,7 @@ def follow_vehicles(
     agents the overhead of a NumPy call is as large as the computation. The correction across the path is a curvature that
     depends on distance and not on time, so nothing is divided by the speed.
     """
-    p, reference_gear, stands = parameters, row[6], row[7]
+    p, gains, reference_gear, stands = parameters, GAINS, row[6], row[7]
     pace = np.abs(state.speed_mps)
     moves, square = pace > 0, pace * pace
     gear = np.sign(state.speed_mps + vehicle.TINY * reference_gear)
@@ -142,8 +141,3 @@ def start_vehicles(row: Array, parameters: vehicle.VehicleParameters) -> vehicle
     speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
     still = np.zeros(len(x))
     return vehicle.VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, still, still)
-
-
-def start_points(row: Array) -> vehicle.PointState:
-    """Return states of points on their references `row` (C, A)."""
-    return vehicle.PointState(row[0].copy(), row[1].copy(), row[3].copy(), row[4].copy())

@@ -267,7 +267,8 @@ class PedestrianGroup(AgentGroup):
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put points on their references."""
         slots = self._slots(index)
-        self.state.put(slots, follower.start_points(self._exact(index, t_s)))
+        x, y, _, yaw, speed, *_ = self._exact(index, t_s)
+        self.state.put(slots, vehicle.PointState(x.copy(), y.copy(), yaw.copy(), speed.copy()))
 
     def snapshot(self) -> Snapshot:
         """Return the present states of the living points."""

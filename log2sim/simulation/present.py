@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
-from log2sim.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
 from log2sim.simulation.metrics.realism import Motions, sizes_of
+from log2sim.simulation.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
 from log2sim.simulation.vehicles.parameters import WHEELED
 
 HISTORY_S = 1.0

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import STANDSTILL_MPS, Agent, Trajectory
 from log2sim.geometry import Array, wrap_angle
-from log2sim.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
 from log2sim.simulation import corridors
 from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, Snapshot, StepClock, VehicleGroup
 from log2sim.simulation.metrics.collisions import BoxTracks, contacts
+from log2sim.simulation.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
 from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
 from log2sim.simulation.vehicles.parameters import WHEELED
 from log2sim.simulation.vehicles.vehicle import Columns
@@ -115,7 +115,7 @@ class PathForesight:
 
 
 class MotionForesight(PathForesight):
-    """Others go on at the speed and turn rate that they had so far, smoothed as `log2sim.prediction` does."""
+    """Others go on at the speed and turn rate that they had so far, smoothed as `log2sim.simulation.prediction` does."""
 
     def __init__(self, paths: corridors.PathTable, agents: Sequence[Agent]) -> None:
         super().__init__(paths)

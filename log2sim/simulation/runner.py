@@ -333,7 +333,7 @@ def replay(
         if it is among them).
     foresight : {"path", "motion"}
         What reactive agents expect of others: that they go where the scenario has them go, or that they go on as they
-        have moved so far, see `log2sim.prediction`.
+        have moved so far, see `log2sim.simulation.prediction`.
     sight_m : float
         Range within which the ego's policy observes other agents, center to center.
     host : Host, optional

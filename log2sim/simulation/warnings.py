@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO, ENDS, STANDSTILL_MPS, Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.prediction.motion_table import TICK_S, Complex, table_of, tabulate
 from log2sim.simulation.expected_motion import (
     EgoPath,
     EgoStates,
@@ -30,6 +29,7 @@ from log2sim.simulation.expected_motion import (
 from log2sim.simulation.follower import ControllerMemory, follow_vehicles
 from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.policy import Controls, EgoState, Observation
+from log2sim.simulation.prediction.motion_table import TICK_S, Complex, table_of, tabulate
 from log2sim.simulation.reference import Reference, vehicle_reference_of
 from log2sim.simulation.result import CollisionWarning, Moment, Replay, Warnings, to_scenario
 from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for
@@ -226,7 +226,7 @@ def warn(
 
     Notes
     -----
-    At every tick of 0.1 s agents are expected where `log2sim.prediction` sees them by what the ends have observed up to then, and
+    At every tick of 0.1 s agents are expected where `log2sim.simulation.prediction` sees them by what the ends have observed up to then, and
     the ego on its path at its speed, or braking as it does. An agent with which the ego collides by that, with at least
     `min_probability` within `horizon_s`, is warned of from when the ego has to react within `margin_s`. Nothing later is used but the ego's path: its route. States of a
     reconstruction were smoothed over the whole log, so that they depend a little on what came next. In scenarios without an ego

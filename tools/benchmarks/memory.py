@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.table import markdown
 from log2sim.datatypes import ImageLabels, Labels, Log, Stream, Sweep
@@ -122,25 +121,15 @@ def _moved(sweep: Sweep, late_ns: int, step: Array) -> Sweep:
 
 
 def _labels(labels: Labels, late_ns: list[int], steps: list[Array]) -> Labels:
-    times = len(late_ns)
-
-    def again(column: NDArray[Any] | None) -> NDArray[Any] | None:
-        return None if column is None else np.concatenate([column] * times)
-
+    times, count = len(late_ns), len(labels.t_ns)
+    labeled_ns = labels.labeled_ns
     return replace(
-        labels,
+        labels.take(np.tile(np.arange(count), times)),
         t_ns=np.concatenate([labels.t_ns + late for late in late_ns]),
         track_id=np.concatenate([np.char.add(labels.track_id.astype(str), f"/{k}") for k in range(times)]),
-        category=np.concatenate([labels.category] * times),
         center_m=np.concatenate([labels.center_m @ step[:3, :3].T + step[:3, 3] for step in steps]),
-        size_m=np.concatenate([labels.size_m] * times),
         yaw_rad=np.concatenate([labels.yaw_rad + np.arctan2(step[1, 0], step[0, 0]) for step in steps]),
-        visible=again(labels.visible),
-        kind=again(labels.kind),
-        occlusion=again(labels.occlusion),
-        labeled_ns=None
-        if labels.labeled_ns is None
-        else np.unique(np.concatenate([labels.labeled_ns + late for late in late_ns])),
+        labeled_ns=None if labeled_ns is None else np.unique(np.add.outer(late_ns, labeled_ns)),
     )
 
 

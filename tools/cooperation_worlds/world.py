@@ -320,33 +320,22 @@ LEANS_DEG = 0.3  # roll and pitch of a pole are leveled better than its yaw is k
 SINKS_M = 0.1
 
 
-@dataclass(frozen=True)
-class RoadError:
-    """What is wrong with the road's end."""
+def disturb(log: Log, seed: int, share: float, *, delayed: bool) -> Log:
+    """Return a log whose road's LiDAR is off by up to a share of 0.5 m, 2 degrees and 0.3 s, uniform in size and direction.
 
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of its position in the map
-    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # roll, pitch and yaw, of its axes in the map
-    delay_s: float = 0.0  # its stamps are later than its records
-
-
-def draw_error(seed: int, share: float = 1.0, *, delayed: bool = True) -> RoadError:
-    """Draw an error up to a share of 0.5 m, 2 degrees and 0.3 s, uniform in its size and in its direction."""
+    Its points and their times stay.
+    """
     rng = np.random.default_rng([seed, 9])
     angle, size = rng.uniform(-np.pi, np.pi), share * MAX_OFFSET_M * rng.random()
-    offset = (size * float(np.cos(angle)), size * float(np.sin(angle)), share * SINKS_M * float(rng.uniform(-1, 1)))
-    lean = share * LEANS_DEG * rng.uniform(-1, 1, 2)
-    turn = share * MAX_TURN_DEG * float(rng.uniform(-1, 1))
-    delay = share * MAX_DELAY_S * float(rng.random())
-    return RoadError(offset, (float(lean[0]), float(lean[1]), turn), round(delay, 3) if delayed else 0.0)
-
-
-def disturb(log: Log, error: RoadError) -> Log:
-    """Return a log whose road's LiDAR has an error; its points and their times stay."""
+    offset_m = [size * np.cos(angle), size * np.sin(angle), share * SINKS_M * rng.uniform(-1, 1)]
+    lean_deg = share * LEANS_DEG * rng.uniform(-1, 1, 2)
+    turn_deg = [*lean_deg, share * MAX_TURN_DEG * rng.uniform(-1, 1)]
+    delay_s = round(share * MAX_DELAY_S * rng.random(), 3) * delayed
     lidar = log.lidars[ROAD_LIDAR]
     pose = np.array(lidar.mount_T_lidar)
     # Turned about itself, not about the origin of the map.
-    turned = transform(rotation_from_rpy(*np.deg2rad(error.turn_deg)) @ pose[:3, :3], pose[:3, 3] + error.offset_m)
-    late = shift_stream(log.streams[ROAD_LIDAR], round(error.delay_s * NS_PER_S))
+    turned = transform(rotation_from_rpy(*np.deg2rad(turn_deg)) @ pose[:3, :3], pose[:3, 3] + offset_m)
+    late = shift_stream(log.streams[ROAD_LIDAR], round(delay_s * NS_PER_S))
     lidars = {**log.lidars, ROAD_LIDAR: replace(lidar, mount_T_lidar=turned)}
     return log.changed(lidars=lidars, streams={**log.streams, ROAD_LIDAR: late})
 

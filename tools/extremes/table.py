@@ -16,9 +16,9 @@ from typing import Literal
 
 import numpy as np
 
-from log2sim import Config, Scenario, open_log, reconstruct
+from log2sim import Config, Scenario, open_log
 from log2sim.datatypes import Log
-from log2sim.errors import Log2SimError, LogError
+from log2sim.errors import LogError
 from log2sim.logs.native.writer import write_log
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import Decision, Stage
@@ -170,21 +170,12 @@ def same(result: Result, within_m: float, shift_m: tuple[float, ...] = (0.0, 0.0
     return Outcome(error <= within_m, found or ("the same" if error <= within_m else "another scenario"), None, error)
 
 
-def refused(change: Callable[[Path], object], words: str, kind: type[Log2SimError] = LogError) -> Outcome:
-    """The log is refused with a message of ours that holds the words."""
+def refused(run: Callable[[], object], words: str) -> Outcome:
+    """A log, of files or in memory as a reader of others may make it, is refused with a message of ours that holds the words."""
     try:
-        result_of(change)
-    except kind as error:
+        run()
+    except LogError as error:
         return Outcome(words in str(error), f"refused: {str(error).split('/')[-1][:90]}")
-    return Outcome(False, "accepted")
-
-
-def refused_log(log: Log, words: str, kind: type[Log2SimError] = LogError) -> Outcome:
-    """The same for a log in memory, as a reader of others may make it."""
-    try:
-        reconstruct(log, LABELS)
-    except kind as error:
-        return Outcome(words in str(error), f"refused: {str(error)[:90]}")
     return Outcome(False, "accepted")
 
 

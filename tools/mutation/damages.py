@@ -65,46 +65,31 @@ Rng = np.random.Generator
 Changed = tuple[Any, str, bool] | None
 
 
-@dataclass(frozen=True)
-class Mutation:
-    """A way to damage files with `suffixes` (all without): `change(rng, file, place)`, or with a codec `change(rng, content, file)`."""
-
-    change: Callable[..., Any]
-    suffixes: tuple[str, ...]
-    weight: float
-    codec: tuple[Callable[[Path], Any], Callable[[Path, Any], Any]] | None  # reads content from a file, and writes it
-
-    def apply(self, rng: Rng, file: Path, place: Place) -> Damage | None:
-        """Damage a file; None where this does not fit."""
-        if self.codec is None:
-            done: Damage | None = self.change(rng, file, place)
-            return done
-        changed: Changed = self.change(rng, self.codec[0](file), file)
-        if changed is None:
-            return None
-        self.codec[1](file, changed[0])
-        return Damage(changed[1], bool(changed[2]))
-
-
 def files_below(path: Path) -> list[Path]:
     """Regular files of an input, in order of their names."""
     return [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file() and not p.is_symlink())
 
 
-def damage(rng: Rng, place: Place, mutations: Sequence[Mutation]) -> tuple[str, Damage]:
-    """Apply one mutation to one file; each folder's kind of file is drawn as often as any other, however many there are."""
+def damage(rng: Rng, place: Place) -> tuple[str, Damage]:
+    """Damage one file in one way of `WAYS`; each folder's kind of file is drawn as often as any other, however many there are."""
     groups: dict[tuple[Path, str], list[Path]] = {}
     for file in files_below(place.input):
         groups.setdefault((file.parent, "".join(file.suffixes[-2:])), []).append(file)
     for _ in range(MAX_TRIES):
         file = pick(rng, pick(rng, list(groups.values())))
-        usable = [m for m in mutations if not m.suffixes or file.name.endswith(m.suffixes)]
-        weights = np.array([m.weight for m in usable])
-        chosen = usable[rng.choice(len(usable), p=weights / weights.sum())]
-        done = chosen.apply(rng, file, place)
+        usable = [way for way in WAYS if not way[2] or file.name.endswith(way[2])]
+        weights = np.array([weight for _, _, _, weight in usable])
+        codec, change, _, _ = usable[rng.choice(len(usable), p=weights / weights.sum())]
+        if codec is None:
+            done = change(rng, file, place)
+        elif (changed := change(rng, codec[0](file), file)) is None:
+            done = None
+        else:
+            codec[1](file, changed[0])
+            done = Damage(changed[1], bool(changed[2]))
         if done is not None:
             inner = file.relative_to(place.input) if file != place.input else Path(file.name)
-            return f"{chosen.change.__name__} {inner}", done
+            return f"{change.__name__} {inner}", done
     raise RuntimeError(f"no mutation fits to {place.input}")
 
 
@@ -819,18 +804,17 @@ RAW = Path.read_bytes, Path.write_bytes
 STRING = lambda file: file.read_text("utf-8"), lambda file, text: file.write_text(text, "utf-8")
 TREE, TABLE = (read_json, write_json), (read_table, write_table)
 ARROW, PICKLED = (".feather", ".parquet"), (".pkl.gz",)
-ALL = tuple(
-    Mutation(change, suffixes, weight, codec)
-    for codec, change, suffixes, weight in (
-        (RAW, flip_bytes, (), 3.0), (RAW, cut_file, (), 2.0), (RAW, change_stretch, (), 4.0), (RAW, blow_up_integer, (), 1.0),
-        (RAW, replace_content, (), 1.0), (STRING, change_number, (*TABLES, ".yaml"), 7.0), (STRING, change_line, TABLES, 6.0),
-        (RAW, encode_otherwise, TEXT, 1.0), (TREE, change_tree, (".json",), 18.5),
-        (STRING, change_attribute, (".xosc",), 14.0), (STRING, change_elements, (".xosc",), 3.5), (None, add_entities, (".xosc",), 2.0),
-        (None, change_arrays, (".npz",), 8.0), (RAW, change_archive, (".npz",), 4.0), (None, replace_pickle, PICKLED, 5.0),
-        (TABLE, change_cells, PICKLED, 5.0), (TABLE, change_rows, PICKLED, 1.0),
-        (TABLE, change_cells, ARROW, 10.0), (TABLE, change_rows, ARROW, 2.0), (RAW, change_image, (".png", ".jpg"), 3.0),
-        (None, change_database, (".db3",), 12.0), (RAW, change_records, (".tfrecord",), 10.0), (None, change_message, tuple(STYLES), 14.0),
-        (None, remove_file, (), 2.0), (None, exchange_files, (), 1.0), (None, rename_file, (), 1.0), (None, replace_file, (), 3.5),
-        (None, link_file, (), 1.5), (None, change_folder, (), 0.8),
-    )
+# Ways to damage: how content is read from a file and written, `change(rng, content, file)`, or without that `change(rng, file, place)`;
+# suffixes of files (all without), and how often.
+WAYS: tuple[tuple[Any, Callable[..., Any], tuple[str, ...], float], ...] = (
+    (RAW, flip_bytes, (), 3.0), (RAW, cut_file, (), 2.0), (RAW, change_stretch, (), 4.0), (RAW, blow_up_integer, (), 1.0),
+    (RAW, replace_content, (), 1.0), (STRING, change_number, (*TABLES, ".yaml"), 7.0), (STRING, change_line, TABLES, 6.0),
+    (RAW, encode_otherwise, TEXT, 1.0), (TREE, change_tree, (".json",), 18.5),
+    (STRING, change_attribute, (".xosc",), 14.0), (STRING, change_elements, (".xosc",), 3.5), (None, add_entities, (".xosc",), 2.0),
+    (None, change_arrays, (".npz",), 8.0), (RAW, change_archive, (".npz",), 4.0), (None, replace_pickle, PICKLED, 5.0),
+    (TABLE, change_cells, PICKLED, 5.0), (TABLE, change_rows, PICKLED, 1.0),
+    (TABLE, change_cells, ARROW, 10.0), (TABLE, change_rows, ARROW, 2.0), (RAW, change_image, (".png", ".jpg"), 3.0),
+    (None, change_database, (".db3",), 12.0), (RAW, change_records, (".tfrecord",), 10.0), (None, change_message, tuple(STYLES), 14.0),
+    (None, remove_file, (), 2.0), (None, exchange_files, (), 1.0), (None, rename_file, (), 1.0), (None, replace_file, (), 3.5),
+    (None, link_file, (), 1.5), (None, change_folder, (), 0.8),
 )  # fmt: skip

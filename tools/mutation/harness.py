@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mutation.bases import KINDS, LOGS, SCENARIO, WITHOUT_LABELS, XOSC, write_base
-from mutation.damages import ALL, Damage, Place, damage
+from mutation.damages import Damage, Place, damage
 from mutation.watching import MEMORY_BYTES, Outcome, Ran, in_a_process, run_commands, warm_up
 
 # Of 48 inputs four are scenarios and two OpenSCENARIO files, the rest logs in turn.
@@ -113,7 +113,7 @@ class Harness:
         (self.outside / "canary").write_text('{"canary": 1}')
         shutil.copytree(top, self.folder / "case/input")
         path = self.folder / "case/input" / sound.relative_to(top)
-        name, done = damage(np.random.default_rng([self.seed, index]), Place(path, sound, self.outside), ALL)
+        name, done = damage(np.random.default_rng([self.seed, index]), Place(path, sound, self.outside))
         return path, name, done
 
     def _files_outside(self) -> set[tuple[str, int]]:

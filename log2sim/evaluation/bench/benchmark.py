@@ -122,9 +122,9 @@ def _panel(stage: str, points: Sequence[settings.Point], whole_ms: float, known:
     recommendation = settings.recommend(points, unit, whole_ms)
     if not known and stage != "homography":
         recommendation = settings.Recommendation(None, recommendation.present, WITHOUT_TRUTH)
-    return Panel(
-        stage, error, label, unit, tuple(points), tuple(bool(f) for f in settings.front_mask(points)), recommendation
-    )
+    errors = [np.nan if p.error is None else p.error for p in points]
+    front = settings.pareto_front([p.ms_per_tick for p in points], errors)
+    return Panel(stage, error, label, unit, tuple(points), tuple(front.tolist()), recommendation)
 
 
 def _point(context: BenchContext, stage: str, run: BenchRun) -> settings.Point:

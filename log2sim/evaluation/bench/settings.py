@@ -279,11 +279,6 @@ def pareto_front(cost: ArrayLike, error: ArrayLike) -> NDArray[np.bool_]:
     return np.isfinite(c) & np.isfinite(e) & ~(no_worse & better).any(axis=1)
 
 
-def front_mask(points: Sequence[Point]) -> NDArray[np.bool_]:
-    """Mark (K,) the points on the Pareto front."""
-    return pareto_front([p.ms_per_tick for p in points], [np.nan if p.error is None else p.error for p in points])
-
-
 def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommendation:
     """Recommend a setting of a stage: the fastest of those whose error is within `ERROR_TOLERANCE` of the smallest.
 

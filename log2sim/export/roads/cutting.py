@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import MapLane
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import Polyline
 from log2sim.road.routes import Beside, find_beside
 
 ALIGNED_M = 0.3  # lanes side by side whose ends are farther apart along the road than this are roads of their own

@@ -11,8 +11,7 @@ import numpy as np
 from log2sim.datatypes import MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.export.roads.cutting import ALIGNED_M, cut_together, is_connection
 from log2sim.export.roads.reference_line import ReferenceLine, fit
-from log2sim.geometry import Array
-from log2sim.road.polyline import Polyline
+from log2sim.geometry import Array, Polyline
 
 LEVEL_M = 5.0  # length over which heights are averaged against their noise
 EXACT_M = 0.002  # how far widths between stations may be from what is written

@@ -15,9 +15,8 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
 from log2sim.export.roads.network import MarkFinder, Road, RoadMark, RoadNetwork, build_network
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, Polyline, wrap_angle
 from log2sim.road.lane_graph import add_missing_lanes, infer_lanes
-from log2sim.road.polyline import Polyline
 
 STANDING_M = 20.0  # length of the lane under an agent that stands, where nobody moves: its whole vehicle is on it
 STANDING_WIDTH_M = 3.5  # of that lane, as of lanes along paths

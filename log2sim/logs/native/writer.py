@@ -17,10 +17,10 @@ from log2sim.datatypes import Labels, Lidar, Log, Stream, Sweep
 from log2sim.datatypes.log import intrinsics_to_dict
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.files.documents import check, refuse_folder
+from log2sim.files.images import JPEG_MAGIC, image_size
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import Array, Camera, quaternion_from_rotation, yaw_of
 from log2sim.logs.native import reader as tables
-from log2sim.logs.records import JPEG_MAGIC, image_size
 from log2sim.logs.stamps import geodetic_from_map
 
 POINT_RESOLUTION_M = 1e-3

@@ -336,8 +336,6 @@ def find_layout_problem(topic: Topic) -> str | None:
         return f"its messages are encoded as '{topic.encoding}', only ros1 and cdr are read"
     if topic.msgtype in TYPES:
         expected = FIELDS
-    if topic.msgtype in TYPES:
-        expected = FIELDS
     else:
         definitions = typestore(topic.encoding).fielddefs
         expected = [name for name, _ in definitions[ALIASES.get(topic.msgtype, topic.msgtype)][1]]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import Lidar, Log, MapFrame, Stream
+from log2sim.datatypes.log import camera_of
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.files.inputs import require_link_inside
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, PoseTrack, RollingShutter, inverse
@@ -227,7 +228,7 @@ class _Opening:
                 continue
             try:
                 if chosen.intrinsics is not None:
-                    cameras[name] = calibration.camera_from_intrinsics(name, chosen.intrinsics, *mounts[name])
+                    cameras[name] = camera_of(name, chosen.intrinsics.model_dump(), *mounts[name])
                 else:
                     stereo = frames.count(chosen.frame) > 1
                     cameras[name] = calibration.camera_from_info(

@@ -9,21 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Stream, Sweep
-from log2sim.datatypes.log import camera_of
 from log2sim.errors import RecordError
+from log2sim.files.images import MAX_IMAGE_PX, decode_image, image_size
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, inverse, transform
-from log2sim.logs.records import (
-    MAX_IMAGE_PX,
-    MAX_SWEEP_POINTS,
-    decode_image,
-    find_intensity_field,
-    image_size,
-    sweep_of,
-)
+from log2sim.logs.records import MAX_SWEEP_POINTS, find_intensity_field, sweep_of
 from log2sim.logs.ros import messages
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
-from log2sim.logs.ros.messages import CameraTopic, Intrinsics, LidarTopic, Stamped, decode
+from log2sim.logs.ros.messages import CameraTopic, LidarTopic, Stamped, decode
 from log2sim.logs.ros.roles import COMPRESSED
 
 BROWN, FISHEYE = ("plumb_bob", "rational_polynomial", "radtan", ""), ("equidistant", "fisheye", "kannala_brandt4")
@@ -32,11 +25,6 @@ ROTATION_TOLERANCE = 1e-3
 
 class CalibrationProblem(ValueError):
     """A CameraInfo that gives no camera; the text is the reason."""
-
-
-def camera_from_intrinsics(name: str, given: Intrinsics, mount: Mount, mount_T_cam: Array) -> Camera:
-    """Build a camera from the settings."""
-    return camera_of(name, given.model_dump(), mount, mount_T_cam)
 
 
 def camera_from_info(

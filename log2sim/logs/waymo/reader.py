@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
+from log2sim.files.images import decode_image
 from log2sim.files.inputs import require_link_inside
 from log2sim.geometry import Camera, PoseTrack, RollingShutter, shift_poses, transform, whole_kilometers
 from log2sim.logs.excerpt import digest_of
-from log2sim.logs.records import decode_image, sweep_of
+from log2sim.logs.records import sweep_of
 from log2sim.logs.stamps import MAX_TIME_S, defer_notes, strictly_increasing
 from log2sim.logs.waymo.messages import (
     FrameIndex,

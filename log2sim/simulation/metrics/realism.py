@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, MapLane
 from log2sim.geometry import Array, box_corners_bev, separating_axes, wrap_angle
-from log2sim.prediction.motion_table import Complex
+from log2sim.simulation.prediction.motion_table import Complex
 
 Mask = NDArray[np.bool_]
 

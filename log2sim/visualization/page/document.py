@@ -24,8 +24,8 @@ from log2sim.datatypes import (
 )
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
-from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.simulation.expected_motion import ends_of
+from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.plot.layers import lane_arrows, lane_outline, shown_spans
 from log2sim.visualization.plot.viewport import assign_view_roles, is_moving

@@ -26,9 +26,9 @@ from log2sim.datatypes import (
     explain_doubt,
 )
 from log2sim.geometry import Array
-from log2sim.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.simulation.expected_motion import ends_of
 from log2sim.simulation.metrics.collisions import REPLAY
+from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.visualization.plot import viewport
 from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, Background, add_lines, add_polygons
 from log2sim.visualization.plot.selection import NO_OPTIONS, PlotOptions, TimeRange

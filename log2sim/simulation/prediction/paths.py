@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF
 from log2sim.geometry import Array
-from log2sim.prediction.motion_table import MIN_COURSE_MPS, Complex, MotionTable
+from log2sim.simulation.prediction.motion_table import MIN_COURSE_MPS, Complex, MotionTable
 
 SPACING_M = 0.5
 """Of the points of a path: the middle of a chord on a circle of 6 m is 5 mm off."""

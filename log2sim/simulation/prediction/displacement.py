@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, EGO, STANDSTILL_MPS, Scenario
 from log2sim.files.documents import rounded
-from log2sim.prediction.prediction import METHODS, Forecast, Predictions
+from log2sim.simulation.prediction.prediction import METHODS, Forecast, Predictions
 
 MOTIONS = ("moving", "standing")
 """Whether an agent is faster than `STANDSTILL_MPS` when it is predicted."""

@@ -14,7 +14,7 @@ from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.documents import short_repr
 from log2sim.geometry import Array
-from log2sim.prediction.motion_table import (
+from log2sim.simulation.prediction.motion_table import (
     MIN_COURSE_MPS,
     PROOF_S,
     TICK_S,
@@ -25,7 +25,7 @@ from log2sim.prediction.motion_table import (
     table_of,
     turn_rates,
 )
-from log2sim.prediction.paths import Paths, Seekers, follow, kind_of, locate
+from log2sim.simulation.prediction.paths import Paths, Seekers, follow, kind_of, locate
 
 
 class Restlessness(NamedTuple):
