@@ -15,10 +15,10 @@ from log2sim.geometry import NS_PER_S
 from log2sim.logs.opening import open_log
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
-from log2sim.resim.sightings import sighting, with_sightings
+from log2sim.resim.sightings import Sighting, sighting, with_sightings
 from log2sim.resim.simulate import Simulation, resimulate, seeing, simulate, with_sensors
-from log2sim.resim.surfels import Surfels, joined, smallest_axis
-from log2sim.resim.world import World, body_of, build_world, ground_below
+from log2sim.resim.surfels import SurfelGrid, Surfels, joined, smallest_axis
+from log2sim.resim.world import World, _add_sweep, body_of, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import open_world, replay
 from log2sim.synth import Scene, load_scene, synthesize
@@ -206,6 +206,26 @@ def test_agents_have_about_as_many_points_as_recorded(recorded: tuple[Log, Scena
     seen = counts[0] >= 20
     assert seen.sum() >= 4
     np.testing.assert_allclose(counts[1, seen] / counts[0, seen], 1, atol=0.15)
+
+
+def test_wheels_that_reach_out_of_a_short_box_are_kept(recorded: tuple[Log, Scenario], world: World) -> None:
+    log, truth = recorded
+    (name,) = log.lidars
+    shots, pattern = recorded_shots(log, name, log.streams[name].read(12)), world.models[name].pattern
+    poses, moment, _ = poses_of(log, name, shots.t_ns)
+    points = np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction * shots.range_m[:, None])
+    points += poses[moment, :3, 3]
+    t_s = (log.streams[name].t_ns[12] - truth.t0_ns) / NS_PER_S - 0.05
+    seen = max(truth.others, key=lambda a: count_in_box(points, truth, a.id, t_s))
+    length, width, height = seen.size_m
+    reach = {}
+    for category in ("cyclist", "car"):
+        short = replace(seen, category=category, size_m=(length - 0.6, width, height))
+        own, sightings = {short.id: SurfelGrid()}, {short.id: list[Sighting]()}
+        only = replace(truth, agents=(short,))
+        _add_sweep(log, log, only, name, shots, pattern, 1.0, world.shift_m, SurfelGrid(), own, sightings)
+        reach[category] = np.abs(own[short.id].surfels().center_m[:, 0]).max() - short.size_m[0] / 2
+    assert reach["car"] < 0.15 < 0.25 < reach["cyclist"] < 0.35
 
 
 def test_the_same_seed_gives_the_same_sweep(recorded: tuple[Log, Scenario], world: World) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.datatypes import Agent, Log, Scenario
+from log2sim.datatypes import GROUP_OF, Agent, Log, Scenario
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
@@ -321,7 +321,10 @@ def _add_sweep(
         inside = local(points[near] - np.column_stack([at.x_m, at.y_m, at.z_m]))
         high = inside[:, 2] > GROUND_M - half[2]
         out = high & (np.abs(inside) < half + LEFT_OUT_M).all(axis=1)
-        taken = out & free[near] & (np.abs(inside) < half + TAKEN_M).all(axis=1)
+        own_half = half + TAKEN_M
+        if GROUP_OF[agent.category] == "two_wheeler":
+            own_half[0] = half[0] + LEFT_OUT_M  # wheels have few points, so that boxes end before them
+        taken = out & free[near] & (np.abs(inside) < own_half).all(axis=1)
         free[near[out]] = False
         rows = near[taken]
         if len(rows):
