@@ -17,7 +17,7 @@ from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.sightings import Sighting, sighting, with_sightings
 from log2sim.resim.simulate import Simulation, resimulate, seeing, simulate, with_sensors
-from log2sim.resim.surfels import SurfelGrid, Surfels, joined, smallest_axis
+from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, smallest_axis
 from log2sim.resim.world import World, _add_sweep, body_of, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import open_world, replay
@@ -206,6 +206,13 @@ def test_agents_have_about_as_many_points_as_recorded(recorded: tuple[Log, Scena
     seen = counts[0] >= 20
     assert seen.sum() >= 4
     np.testing.assert_allclose(counts[1, seen] / counts[0, seen], 1, atol=0.15)
+
+
+def test_the_noise_of_ranges_is_that_of_the_sensor(scene: Scene, recorded: tuple[Log, Scenario]) -> None:
+    log, _ = recorded
+    (name,) = log.lidars
+    found = local_surface(recorded_shots(log, name, log.streams[name].read(12)), find_pattern(log, name)).noise_m
+    assert found == pytest.approx(scene.lidar[0].noise_m, rel=0.15)
 
 
 def test_wheels_that_reach_out_of_a_short_box_are_kept(recorded: tuple[Log, Scenario], world: World) -> None:
