@@ -17,7 +17,7 @@ from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
 from log2sim.resim.sightings import Sighting, sighting, with_sightings
 from log2sim.resim.simulate import Simulation, resimulate, seeing, simulate, with_sensors
-from log2sim.resim.surfels import SurfelGrid, Surfels, joined, smallest_axis
+from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, smallest_axis
 from log2sim.resim.world import World, _add_sweep, body_of, build_world, ground_below
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import open_world, replay
@@ -64,8 +64,8 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
     grid = np.stack(np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25)), -1).reshape(-1, 2)
     plane = disc_surfels(np.column_stack([grid, -1.8 + 0 * grid[:, 0]]), np.tile([0.0, 0, 1], (len(grid), 1)), 0.25)
     wall = np.stack(np.meshgrid(np.arange(-20, 20, 0.1), np.arange(-1.8, 4, 0.1)), -1).reshape(-1, 2)
-    wall = np.column_stack([wall[:, 0], 0 * wall[:, 0] + 6, wall[:, 1]])
-    plane = joined([plane, disc_surfels(wall, np.tile([0.0, -1, 0], (len(wall), 1)), 0.1)])
+    wall = np.column_stack([0 * wall[:, 0] + 8, wall])  # across the way, so that every start counts
+    plane = joined([plane, disc_surfels(wall, np.tile([-1.0, 0, 0], (len(wall), 1)), 0.1)])
     rng = np.random.default_rng(2)
     azimuth, elevation = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(-0.6, 0.1, 6000)
     ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
@@ -91,9 +91,9 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
         found = first_hits(met, plane, len(ray), rng).range_m
         world = np.einsum("nij,nj->ni", poses[moment, :3, :3], ray)
         with np.errstate(divide="ignore"):
-            down, left = -1.8 / world[:, 2], 6 / world[:, 1]
-        expected = np.minimum(np.where(down > 0, down, np.inf), np.where(left > 0, left, np.inf))
-        there = (expected < 12) & (np.abs(x[moment] + world[:, 0] * expected) < 19)
+            down, ahead = -1.8 / world[:, 2], (8 - x[moment]) / world[:, 0]
+        expected = np.minimum(np.where(down > 0, down, np.inf), np.where(ahead > 0, ahead, np.inf))
+        there = expected < 12
         there &= np.abs(azimuth) < np.deg2rad(178)  # what the first and the last rays see has two places
         assert there.sum() > 2000
         off = np.abs(found[there] - expected[there])
@@ -206,6 +206,13 @@ def test_agents_have_about_as_many_points_as_recorded(recorded: tuple[Log, Scena
     seen = counts[0] >= 20
     assert seen.sum() >= 4
     np.testing.assert_allclose(counts[1, seen] / counts[0, seen], 1, atol=0.15)
+
+
+def test_the_noise_of_ranges_is_that_of_the_sensor(scene: Scene, recorded: tuple[Log, Scenario]) -> None:
+    log, _ = recorded
+    (name,) = log.lidars
+    found = local_surface(recorded_shots(log, name, log.streams[name].read(12)), find_pattern(log, name)).noise_m
+    assert found == pytest.approx(scene.lidar[0].noise_m, rel=0.15)
 
 
 def test_wheels_that_reach_out_of_a_short_box_are_kept(recorded: tuple[Log, Scenario], world: World) -> None:

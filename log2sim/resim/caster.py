@@ -15,15 +15,13 @@ from log2sim.resim.rays import Floats, Rays, bin_of
 from log2sim.resim.surfels import Surfels
 
 CELL_RAD, ROW_RAD = np.float32(np.deg2rad(0.1)), np.float32(np.deg2rad(0.2))  # of azimuth and of elevation
-MARGIN = np.float32(
-    1.1
-)  # of half the angles that a disc covers: meanwhile a fast ego comes a tenth nearer to what is beside it
+# Of half the angles that a disc covers: meanwhile a fast ego comes a tenth nearer to what is beside it.
+MARGIN = np.float32(1.1)
 MAX_HALF_WIDTH_RAD = np.float32(np.deg2rad(20.0))  # of a disc in the sensor's picture
 MIN_RANGE_M = 0.5
 CHUNK = 30_000  # discs at a time: their columns stay in the cache
-SAME_START_M = np.float32(
-    0.005
-)  # rays that look one way start there, a quarter of the usual noise; those of some LiDARs do not
+# A quarter of the usual noise: rays that look one way start within it where the LiDAR spins.
+SAME_START_M = np.float32(0.005)
 THICKNESS_M = 0.08  # discs this far behind the first one, across their plane, are the same surface
 MIN_FACING = 0.02
 

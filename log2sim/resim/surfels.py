@@ -122,10 +122,26 @@ def local_surface(shots: Shots, pattern: Pattern) -> LocalSurface:
         slant = [np.hypot(1, np.einsum("ni,ni->n", normal, axis) / facing) for axis in (level, upward)]
     reach = np.maximum(pattern.step_rad * np.where(flat, slant[0], 1), gap * np.where(flat, slant[1], 1))
     normal[~flat] = 0
-    seen = flat & (facing > 0.7)
-    noise = float(np.median(rough[seen] / facing[seen]) * np.sqrt(count / (count - 3))) if seen.sum() > 30 else np.nan
+    noise = _noise_m(azimuth, row, shots.range_m, near, flat & (facing > 0.7)) if count > 2 else np.nan
     radius = np.minimum(0.6 * shots.range_m * reach, MAX_RADIUS_M)
     return LocalSurface(normal.astype(np.float32), radius.astype(np.float32), noise)
+
+
+def _noise_m(azimuth: Array, row: Array, range_m: Floats, near: NDArray[np.intp], flat: NDArray[np.bool_]) -> float:
+    """Return the noise of ranges: how far those on flat surfaces are off the line through the rays beside them, NaN without such.
+
+    Planes through several lines of a LiDAR would count as noise what is always the same, the offsets of its lasers.
+    """
+    own = np.flatnonzero(flat)
+    left, right = near[own, 1], near[own, 2]
+    a, b = azimuth[left] - azimuth[own], azimuth[right] - azimuth[own]
+    beside = (a * b < 0) & (np.abs(row[left] - row[own]) < 0.2) & (np.abs(row[right] - row[own]) < 0.2)
+    if beside.sum() < 30:
+        return np.nan
+    own, left, right, share = own[beside], left[beside], right[beside], (a / (a - b))[beside]
+    off = range_m[own] - (1 - share) * range_m[left] - share * range_m[right]
+    # Of a normal distribution half lies within 0.6745 standard deviations.
+    return float(np.median(np.abs(off) / np.sqrt(1 + share**2 + (1 - share) ** 2)) / 0.6745)
 
 
 def smallest_axis(matrix: Array) -> tuple[Array, Array]:
