@@ -354,12 +354,14 @@ def test_an_unsure_homography_makes_places_unsure() -> None:
     foot = foot_pixel(camera, 20.0, 3.0)
     box_px, covariance = np.array([foot[0] - 40, foot[1] - 70, foot[0] + 40, foot[1]]), 1e-14 * np.eye(9)
     sure = place_obstacle(ground_H_image, camera, box_px, "car", np.zeros(2))
-    unsure = place_obstacle(ground_H_image, camera, box_px, "car", np.zeros(2), covariance)
+    tick_sigmas = place_obstacle(ground_H_image, camera, box_px, "car", np.zeros(2), covariance)
     assert sure is not None
-    assert unsure is not None
+    assert tick_sigmas is not None
     draws = ground_H_image + 1e-7 * np.random.default_rng(0).normal(size=(4000, 3, 3))
     places = np.array([apply_homography(h, foot[None])[0][0] for h in draws])
-    np.testing.assert_allclose(unsure[1] - sure[1], np.cov(places.T), rtol=0.15, atol=0.02 * np.cov(places.T).max())
+    np.testing.assert_allclose(
+        tick_sigmas[1] - sure[1], np.cov(places.T), rtol=0.15, atol=0.02 * np.cov(places.T).max()
+    )
 
 
 def test_obstacles_at_the_horizon_and_far_away_are_not_located() -> None:

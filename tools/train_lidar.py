@@ -1,7 +1,7 @@
 """Train the LiDAR detector on simulated clouds and on labeled logs: generate, fit, export, check, in one command that resumes.
 
     pip install 'log2sim[train]'
-    python tools/train_lidar.py vehicle DIR             # everything, with the settings of the shipped weights; or roadside
+    python tools/train_lidar.py roadside DIR            # everything, with the settings of the shipped weights; `vehicle`: its first two rounds
     python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300                           # a toy
     python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
     python tools/train_lidar.py vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format

@@ -128,17 +128,17 @@ def local_surface(shots: Shots, pattern: Pattern) -> LocalSurface:
 
 
 def _noise_m(azimuth: Array, row: Array, range_m: Floats, near: NDArray[np.intp], flat: NDArray[np.bool_]) -> float:
-    """Return the noise of ranges: how far those on flat surfaces are off the line through the rays beside them, NaN without such.
+    """Return the noise of ranges: how far those on flat surfaces are off the line through their neighbors on the same line of the LiDAR, NaN without such.
 
     Planes through several lines of a LiDAR would count as noise what is always the same, the offsets of its lasers.
     """
     own = np.flatnonzero(flat)
     left, right = near[own, 1], near[own, 2]
     a, b = azimuth[left] - azimuth[own], azimuth[right] - azimuth[own]
-    beside = (a * b < 0) & (np.abs(row[left] - row[own]) < 0.2) & (np.abs(row[right] - row[own]) < 0.2)
-    if beside.sum() < 30:
+    between = (a * b < 0) & (np.abs(row[left] - row[own]) < 0.2) & (np.abs(row[right] - row[own]) < 0.2)
+    if between.sum() < 30:
         return np.nan
-    own, left, right, share = own[beside], left[beside], right[beside], (a / (a - b))[beside]
+    own, left, right, share = own[between], left[between], right[between], (a / (a - b))[between]
     off = range_m[own] - (1 - share) * range_m[left] - share * range_m[right]
     # Of a normal distribution half lies within 0.6745 standard deviations.
     return float(np.median(np.abs(off) / np.sqrt(1 + share**2 + (1 - share) ** 2)) / 0.6745)

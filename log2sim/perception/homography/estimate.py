@@ -136,12 +136,12 @@ def _fit_stream(data: NormalizedCorrespondences, options: EstimationOptions, rng
     robust = ransac(data, rng, pitch_sigma=pitch_sigma, image_K=image_K, schedule=schedule)
     if robust.h is None or not options.pitch_roll:
         return validated_fit(robust, image_K)
-    moving, warps, unsure = fit_pitch_roll(data, robust.h, image_K)
+    moving, warps, tick_sigmas = fit_pitch_roll(data, robust.h, image_K)
     fit = validated_fit(moving, image_K)
     if not fit.ok or moving.h is None:
         return fit
-    unsure = fit.ground_H_image @ np.linalg.inv(data.image_N_px) @ unsure @ data.image_N_px
-    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h), unsure=unsure)
+    tick_sigmas = fit.ground_H_image @ np.linalg.inv(data.image_N_px) @ tick_sigmas @ data.image_N_px
+    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h), tick_sigmas=tick_sigmas)
 
 
 def _spread_to_all(
@@ -159,12 +159,12 @@ def _spread_to_all(
         missing = fit.ground_H_image if of_stream else np.full((3, 3), np.nan)
         per_tick = np.repeat(missing[None], len(ticks), axis=0)
         per_tick[np.unique(number[rows])] = fit.per_tick
-    unsure = fit.unsure
-    if unsure is not None:
+    tick_sigmas = fit.tick_sigmas
+    if tick_sigmas is not None:
         # A tick without usable rows may have any angle that other ticks have.
-        unsure = np.repeat(unsure[[np.abs(unsure).sum(axis=(1, 2, 3)).argmax()]], len(ticks), axis=0)
-        unsure[np.unique(number[rows])] = fit.unsure
-    return replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick, unsure=unsure)
+        tick_sigmas = np.repeat(tick_sigmas[[np.abs(tick_sigmas).sum(axis=(1, 2, 3)).argmax()]], len(ticks), axis=0)
+        tick_sigmas[np.unique(number[rows])] = fit.tick_sigmas
+    return replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick, tick_sigmas=tick_sigmas)
 
 
 # A detector's box ends this far from the true foot point (standard deviation).
@@ -213,8 +213,10 @@ def fit_camera(
     if not stable.ok:
         return fit, source
     per_tick = scaled(stable.ground_H_image @ stabilizing_warps(moving))
-    unsure = stable.ground_H_image @ np.linalg.inv(moving.ground_H_image) @ moving.unsure
-    return replace(stable, ticks=moving.ticks, per_tick=per_tick, unsure=unsure, pitch_roll=pitch_roll), source
+    tick_sigmas = stable.ground_H_image @ np.linalg.inv(moving.ground_H_image) @ moving.tick_sigmas
+    return replace(
+        stable, ticks=moving.ticks, per_tick=per_tick, tick_sigmas=tick_sigmas, pitch_roll=pitch_roll
+    ), source
 
 
 def _fit_fixed(

@@ -174,7 +174,7 @@ class HomographyFit:
     # not known
     covariance: Array | None = None
     # (T, 2, 3, 3): by how much `per_tick` changes with one standard deviation of the pitch and of the roll of a tick
-    unsure: Array | None = None
+    tick_sigmas: Array | None = None
     # Whether each tick has its own pitch and roll, and by how much they vary; None where that was not tested
     pitch_roll: PitchRoll | None = None
     slope: RoadSlope | None = None  # a second plane of the road, where held-out errors ask for it
@@ -192,12 +192,12 @@ class HomographyFit:
 
     def covariance_at(self, tick: int) -> Array | None:
         """Return the covariance (9, 9) of the elements of `at_tick`, with that of the tick's angles; None where it is not known."""
-        if self.covariance is None or self.unsure is None:
+        if self.covariance is None or self.tick_sigmas is None:
             return self.covariance
         k = int(np.searchsorted(self.ticks, tick))
         if k >= len(self.ticks) or self.ticks[k] != tick:
-            k = int(np.abs(self.unsure).sum(axis=(1, 2, 3)).argmax())
-        by_angle = self.unsure[k].reshape(2, 9)
+            k = int(np.abs(self.tick_sigmas).sum(axis=(1, 2, 3)).argmax())
+        by_angle = self.tick_sigmas[k].reshape(2, 9)
         return np.asarray(self.covariance + by_angle.T @ by_angle)
 
     @property

@@ -86,8 +86,8 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
         angles = replace(angles, sigma=sigma)
     warps = angles.warps()
     of_rows, parameters = warps[noisy.tick], float((angles.significant * information * variance).sum())
-    unsure = (np.sqrt(variance) * angles.significant)[:, :, None, None] * angles.generators
-    return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps, unsure
+    tick_sigmas = (np.sqrt(variance) * angles.significant)[:, :, None, None] * angles.generators
+    return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps, tick_sigmas
 
 
 def _is_significant(angles: _Angles, information: Array) -> NDArray[np.bool_]:

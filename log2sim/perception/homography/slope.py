@@ -93,7 +93,7 @@ def fit_slope(
     significance = judged[best].significance()
     if not significance > MIN_SIGNIFICANCE_SIGMA:
         return fit
-    planes, covariance = _refine(kinds[best], _search(kinds[best], start, K), K, slopes=True)
+    planes, covariance = _refine(kinds[best], _search(kinds[best], start, K), K, two_planes=True)
     back = np.linalg.inv(planes.image_H_ground)
     size = np.linalg.norm(back[2])
     to_ground = -by_elements(back, back) / size
@@ -105,7 +105,9 @@ def fit_slope(
         ground_H_image=h,
         covariance=to_ground @ covariance[:9, :9] @ to_ground.T,
         per_tick=scaled(h @ stabilizing_warps(fit)) if keeps else None,
-        unsure=h @ np.linalg.inv(fit.ground_H_image) @ fit.unsure if keeps and fit.unsure is not None else None,
+        tick_sigmas=h @ np.linalg.inv(fit.ground_H_image) @ fit.tick_sigmas
+        if keeps and fit.tick_sigmas is not None
+        else None,
         pitch_roll=fit.pitch_roll if keeps or fit.pitch_roll is None else replace(fit.pitch_roll, per_tick=False),
         slope=slope,
     )
@@ -118,7 +120,7 @@ def _held_out(
     parts = []
     for k in range(2):
         training, test = parity != k, parity == k
-        one = _refine(rows.take(training), start, K, slopes=False)[0]
+        one = _refine(rows.take(training), start, K, two_planes=False)[0]
         errors = [_errors(rows.take(test), one, K), _errors(bent.take(test), _search(bent.take(training), start, K), K)]
         squared, distance = np.stack([(e**2).sum(axis=1) for e, _ in errors]), np.stack([d for _, d in errors])
         parts.append(HeldOutErrors(place[test], squared, distance))
@@ -204,20 +206,20 @@ def _weights(squared: Array, *, gated: bool) -> tuple[Array, float]:
     return 1 / (1 + squared / (4 * variance)), variance
 
 
-def _slopes(rows: _Rows, planes: _Planes, by_point: Array) -> Array:
+def _by_homography(rows: _Rows, planes: _Planes, by_point: Array) -> Array:
     """Compute the derivatives (N, 2, 8) of whitened pixels by a homography across its scale."""
     by_h = (by_point[:, :, :, None] * rows.xy1[:, None, None, :]).reshape(len(rows.uv), 2, 9)
     return np.asarray(np.nan_to_num(by_h) @ scale_free_basis(planes.image_H_ground))
 
 
-def _refine(rows: _Rows, planes: _Planes, K: Array, *, slopes: bool) -> tuple[_Planes, Array]:
+def _refine(rows: _Rows, planes: _Planes, K: Array, *, two_planes: bool) -> tuple[_Planes, Array]:
     """Take Gauss-Newton steps; returns the planes and the covariance (12, 12) of homography, slope, direction and offset."""
     for step in range(STEPS + LAST_STEPS):
         error, by_point, up, beyond = _project(rows, planes, K)
         whitened = np.nan_to_num((rows.whiten @ error[:, :, None])[:, :, 0], nan=1e6)
         weight, variance = _weights((whitened**2).sum(axis=1), gated=step >= STEPS)
-        design = _slopes(rows, planes, by_point)
-        if slopes:
+        design = _by_homography(rows, planes, by_point)
+        if two_planes:
             turn = np.array([-planes.line[1], planes.line[0]])
             grows = planes.change * _beyond(rows, planes.line[:2], np.array(planes.offset_m))[1]
             by_height = np.nan_to_num(by_point @ up)
@@ -226,13 +228,13 @@ def _refine(rows: _Rows, planes: _Planes, K: Array, *, slopes: bool) -> tuple[_P
         flat = (design * weight[:, None, None]).reshape(-1, design.shape[2])
         normal = flat.T @ design.reshape(-1, design.shape[2])
         prior = variance * STEP_SIGMAS**-2.0
-        size = np.sqrt(np.maximum(np.diagonal(normal) + np.append(np.zeros(8), prior)[: len(normal)], 1e-24))
         damped = normal + np.diag(np.append(np.zeros(8), prior)[: len(normal)])
+        size = np.sqrt(np.maximum(np.diagonal(damped), 1e-24))
         inverse = np.linalg.inv(damped / size[:, None] / size + 1e-12 * np.eye(len(size))) / size[:, None] / size
         moved = inverse @ (flat.T @ whitened.ravel())
         basis = scale_free_basis(planes.image_H_ground)
         h = planes.image_H_ground + (basis @ moved[:8]).reshape(3, 3)
-        more = moved[8:] if slopes else np.zeros(3)
+        more = moved[8:] if two_planes else np.zeros(3)
         planes = _Planes(h, planes.change + more[0], planes.direction_rad + more[1], planes.offset_m + more[2])
     spread = np.zeros((12, len(size)))
     spread[:9, :8] = basis
@@ -253,14 +255,14 @@ def _search(rows: _Rows, start: _Planes, K: Array) -> _Planes:
         by_height = np.nan_to_num(by_point @ up)
         whitened = np.nan_to_num((rows.whiten @ error[:, :, None])[:, :, 0], nan=1e6)
         root = np.sqrt(_weights((whitened**2).sum(axis=1), gated=False)[0])
-        across = np.linalg.qr((_slopes(rows, planes, by_point) * root[:, None, None]).reshape(-1, 8))[0]
+        across = np.linalg.qr((_by_homography(rows, planes, by_point) * root[:, None, None]).reshape(-1, 8))[0]
         left = ((whitened + planes.change * own[:, None] * by_height) * root[:, None]).ravel()
         columns = (beyond[:, :, None] * (by_height * root[:, None])[None]).reshape(len(beyond), -1)
         pull, inner = columns @ (left - across @ (across.T @ left)), columns @ across
         information = (columns**2).sum(axis=1) - (inner**2).sum(axis=1) + 1e-12
         k = int(np.argmax(pull**2 / information))
         begun = _Planes(planes.image_H_ground, float(pull[k] / information[k]), float(angle[k]), float(offset[k]))
-        planes = _refine(rows, begun, K, slopes=True)[0]
+        planes = _refine(rows, begun, K, two_planes=True)[0]
         squared = (_errors(rows, planes, K)[0] ** 2).sum(axis=1)
         loss = float(np.minimum(squared, CHI2_2DOF_99 * np.median(squared) / CHI2_2DOF_50).sum())
         if loss < least:
