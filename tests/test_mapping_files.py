@@ -83,7 +83,7 @@ def test_a_point_of_a_geotiff_is_where_the_projection_puts_it(name: str, tmp_pat
     place = x + column * sx, y - row * sy
     lon, lat = pyproj.Transformer.from_crs(crs_of(keys), crs_of(keys).geodetic_crs, always_xy=True).transform(*place)
     own = pyproj.CRS(frame.projection)
-    mapped = ground.xy_of(7, 31)[None][0] + frame.offset_m[:2]
+    mapped = ground.raster.xy_of(7, 31)[None][0] + frame.offset_m[:2]
     expected = pyproj.Transformer.from_crs(own, own.geodetic_crs, always_xy=True).transform(*mapped)
     assert abs(lon - expected[0]) < 1e-9
     assert abs(lat - expected[1]) < 1e-9
@@ -99,7 +99,7 @@ def test_a_png_and_its_world_file_are_read_back_to_the_same_place(tmp_path: Path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["m.pgw", "m.png"]
     d, _, _, down, x, y = (float(line) for line in (tmp_path / "m.pgw").read_text().split())
     assert (d, down) == (0.5, -0.5)
-    np.testing.assert_allclose(np.array([x, y]) - [1000, 2000], ground.xy_of(0, 0))
+    np.testing.assert_allclose(np.array([x, y]) - [1000, 2000], ground.raster.xy_of(0, 0))
     back = read_png_map(tmp_path / "m.png", frame)
     np.testing.assert_array_equal(back.color_bgr, ground.color_bgr)
     np.testing.assert_allclose(back.extent_m, ground.extent_m)

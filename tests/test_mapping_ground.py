@@ -28,7 +28,7 @@ def ground() -> GroundMap:
 
 def positions(ground: GroundMap) -> Array:
     rows, columns = np.mgrid[: ground.alpha.shape[0], : ground.alpha.shape[1]]
-    return ground.xy_of(rows, columns)
+    return ground.raster.xy_of(rows, columns)
 
 
 def near_path(xy: Array, reach_m: float) -> Array:
@@ -42,10 +42,10 @@ def clear_of_edges(xy: Array, margin_m: float) -> Array:
 
 
 def test_cells_and_positions_are_inverse(ground: GroundMap) -> None:
-    rows, columns = ground.cells_of([[1.234, -2.345]])
-    np.testing.assert_allclose(ground.xy_of(rows, columns), [[1.234, -2.345]], atol=1e-9)
+    rows, columns = ground.raster.cells_of([[1.234, -2.345]])
+    np.testing.assert_allclose(ground.raster.xy_of(rows, columns), [[1.234, -2.345]], atol=1e-9)
     x0, _, _, y1 = ground.extent_m
-    np.testing.assert_allclose(ground.xy_of(0, 0), [x0 + 0.025, y1 - 0.025])
+    np.testing.assert_allclose(ground.raster.xy_of(0, 0), [x0 + 0.025, y1 - 0.025])
     np.testing.assert_allclose(np.array(ground.extent_m) / 0.05, np.rint(np.array(ground.extent_m) / 0.05), atol=1e-6)
 
 

@@ -19,7 +19,7 @@ from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import give_pictures, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.records import RecordSource
-from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
+from log2sim.road.ground_map import GroundMap, Raster, coarsened_cell_m
 from log2sim.road.pictures import ColorRaster, Image, StandingPictures, View, find_hidden, sample_nearest, warp_onto
 from log2sim.road.road_users import MASK_SHRINK, RoadUsers, covered, draw_footprints, draw_outlines
 from log2sim.road.surface import (
@@ -55,33 +55,27 @@ def choose_records(
     """Choose the records of sensors by name: where the ego is a step, m, farther on, at most `most` of all sensors together."""
     steps_m = {name: step_m for name, step_m in steps_m.items() if name in log.streams}
     most = max(most // max(len(steps_m), 1), STANDING_RECORDS)
-    return {name: _choose(log, scenario, name, step_m, most) for name, step_m in steps_m.items()}
+    found = {}
+    for name, step_m in steps_m.items():
+        t_ns, end_ns = log.streams[name].t_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        pose, known = log.map_T_sensor(name, t_ns)
+        usable = np.flatnonzero(known & (t_ns >= scenario.t0_ns) & (t_ns <= end_ns))
+        place, chosen = pose[usable, :3, 3], [0]
+        gone = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(place, axis=0), axis=1)))
+        # Noise of the poses of a sensor at rest is no way; it must come away from where it was last taken.
+        step = max(step_m, gone[-1] / most)
+        for k in range(1, len(usable)):
+            if np.linalg.norm(place[k] - place[chosen[-1]]) >= step:
+                chosen.append(k)
+        if len(chosen) < STANDING_RECORDS:
+            chosen = np.unique(np.linspace(0, len(usable) - 1, STANDING_RECORDS).round().astype(int)).tolist()
+        found[name] = usable[chosen[:most]].astype(np.int64) if len(usable) else usable.astype(np.int64)
+    return found
 
 
 def sweep_step_m(points: int) -> float:
     """Return how far the ego goes, m, between sweeps of a number of points that are taken."""
     return max(SWEEP_STEP_M, points / POINTS_A_METER)
-
-
-def _choose(log: Log, scenario: Scenario, name: str, step_m: float, most: int) -> NDArray[np.int64]:
-    t_ns = log.streams[name].t_ns
-    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
-    pose, known = log.map_T_sensor(name, t_ns)
-    usable = np.flatnonzero(known & (t_ns >= scenario.t0_ns) & (t_ns <= end_ns))
-    if not len(usable):
-        return usable.astype(np.int64)
-    place = pose[usable, :3, 3]
-    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
-    # Noise of the poses of a sensor at rest is no way; it must come away from where it was last taken.
-    step = max(step_m, gone[-1] / most)
-    chosen, last = [0], 0
-    for k in range(1, len(usable)):
-        if np.linalg.norm(place[k] - place[last]) >= step:
-            chosen.append(k)
-            last = k
-    if len(chosen) < STANDING_RECORDS:
-        chosen = np.unique(np.linspace(0, len(usable) - 1, STANDING_RECORDS).round().astype(int)).tolist()
-    return usable[chosen[:most]].astype(np.int64)
 
 
 def path_of(log: Log, scenario: Scenario) -> Array:
@@ -98,32 +92,6 @@ def path_of(log: Log, scenario: Scenario) -> Array:
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ground[:, :3], axis=0), axis=1))])
     at = np.linspace(0, gone[-1], max(int(gone[-1] / 0.5), 1) + 1)
     return np.column_stack([np.interp(at, gone, ground[:, k]) for k in range(3)])
-
-
-def roadside_places(log: Log, scenario: Scenario) -> Array:
-    """Places (K, 3), m, of the sensors that are fixed in the map, on the ground."""
-    names = [name for name, camera in log.cameras.items() if camera.mount == "map"]
-    names += [name for name, lidar in log.lidars.items() if lidar.mount == "map"]
-    poses = [log.map_T_sensor(name, scenario.t0_ns)[0][0, :3, 3] for name in names]
-    ground_z = cloud_origin(log, scenario.t0_ns)[1] if log.ego is None else None
-    return np.array([[x, y, z if ground_z is None else ground_z] for x, y, z in poses]).reshape(-1, 3)
-
-
-def extent_of(path: Array, roadside: Array) -> Extent:
-    """Return the extent of a map, m, around places (K, 3) of the ego and of roadside sensors.
-
-    Raises `LogError` where there are neither, as in a log without poses.
-    """
-    low, high = [], []
-    for places, margin in ((path, MARGIN_M), (roadside, ROADSIDE_MARGIN_M)):
-        if len(places):
-            low.append(places[:, :2].min(axis=0) - margin)
-            high.append(places[:, :2].max(axis=0) + margin)
-    if not low:
-        raise LogError("no pose of any sensor is known, so pictures and sweeps have no place in a map of the ground")
-    (x0, y0), (x1, y1) = np.min(low, axis=0), np.max(high, axis=0)
-    # Whole meters, so that maps of one log lie on the same cells whichever part of it they show.
-    return float(np.floor(x0)), float(np.ceil(x1)), float(np.floor(y0)), float(np.ceil(y1))
 
 
 # Cells of heights along the edge of a cell of colors: curbs are 10 cm wide, and ten points lie on such a cell in a usual log.
@@ -163,8 +131,20 @@ class GroundMapBuilder:
         self._log, self._scenario = log, scenario
         self._records, self._progress = records or RecordSource(log), progress or (lambda done, total: None)
         self._path = path_of(log, scenario)
-        roadside = roadside_places(log, scenario)
-        extent = extent_of(self._path, roadside)
+        # Sensors that are fixed in the map, on the ground.
+        fixed = [name for name, sensor in (*log.cameras.items(), *log.lidars.items()) if sensor.mount == "map"]
+        roadside = np.array([log.map_T_sensor(name, scenario.t0_ns)[0][0, :3, 3] for name in fixed]).reshape(-1, 3)
+        if log.ego is None:
+            roadside[:, 2] = cloud_origin(log, scenario.t0_ns)[1]
+        around = [(self._path, MARGIN_M), (roadside, ROADSIDE_MARGIN_M)]
+        corners = [p[:, :2] + side * margin for p, margin in around for side in (-1, 1) if len(p)]
+        if not corners:
+            raise LogError(
+                "no pose of any sensor is known, so pictures and sweeps have no place in a map of the ground"
+            )
+        (x0, y0), (x1, y1) = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+        # Whole meters, so that maps of one log lie on the same cells whichever part of it they show.
+        extent = float(np.floor(x0)), float(np.ceil(x1)), float(np.floor(y0)), float(np.ceil(y1))
         cell_m = coarsened_cell_m(extent, settings.cell_m)
         self.notes: list[str] = []
         if cell_m > settings.cell_m:
@@ -175,7 +155,9 @@ class GroundMapBuilder:
         places = self._path if len(self._path) else roadside
         self._anchors, self._z0_m = places, float(np.median(places[:, 2]))
         self._sweeps = choose_records(log, scenario, {k: self._sweep_step_m(k) for k in log.lidars}, MAX_SWEEPS)
-        self._frames = choose_records(log, scenario, dict.fromkeys(self._cameras(), PICTURE_STEP_M), MAX_PICTURES)
+        # Cameras that the scenario was made with; all of the log where it names none.
+        used = [str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras]
+        self._frames = choose_records(log, scenario, dict.fromkeys(used or log.cameras, PICTURE_STEP_M), MAX_PICTURES)
         stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
         self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
         self._standing: dict[str, tuple[View, StandingPictures]] = {}
@@ -213,9 +195,12 @@ class GroundMapBuilder:
         kept &= self._likely_ground.ravel().take(warp.cell) > 0
         if view.camera.mount == "ego":
             kept &= ~covered([self._users.ego_at(view.t_ns)], self.raster, warp.cell)
-            hiding = self._hiding_at(view.t_ns)
-            if hiding is not None:
-                kept &= ~find_hidden(view, warp, hiding)
+            # What stood above the ground in sweeps nearby in time.
+            hiding = [
+                points for t_ns, points in self._swept[1].items() if abs(t_ns - view.t_ns) <= MAX_APART_S * NS_PER_S
+            ]
+            if hiding:
+                kept &= ~find_hidden(view, warp, np.concatenate(hiding))
         colors.add(view.camera.name, image, warp.take(kept))
 
     def build(self) -> GroundMap:
@@ -232,14 +217,17 @@ class GroundMapBuilder:
             self._colors = None
         standing = draw_footprints([self._users.standing()], self.raster) > 0
         alpha[standing], color[standing] = 0, 0
-        height, intensity = self._measured()
+        surface, factor = self._surface, round(self._surface.raster.resolution_m / self.raster.resolution_m)
+        height = upsample(surface.z_m, factor, shape) + np.float32(self._z0_m)
+        known = np.repeat(np.repeat(surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
+        height[~known] = np.nan
+        intensity = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster))
         for name in ("_swept", "_surface", "_laid", "_likely_ground"):
             self.__dict__.pop(name, None)
         for layer in (height, intensity):
             layer[standing] = np.nan
-        whole = GroundMap(
-            color, alpha, height, intensity, self.raster.resolution_m, self.raster.extent_m, tuple(self.notes)
-        )
+        place = self.raster.resolution_m, self.raster.extent_m
+        whole = GroundMap(color, alpha, height, intensity, *place, tuple(self.notes))
         return whole.around(whole.known)
 
     def _sweep_step_m(self, lidar: str) -> float:
@@ -251,20 +239,16 @@ class GroundMapBuilder:
                 return sweep_step_m(len(sweep.xyz_m))
         return sweep_step_m(0)
 
-    def _cameras(self) -> list[str]:
-        """Cameras that the scenario was made with; all of the log where it names none."""
-        used = [str(c["name"]) for c in self._scenario.cameras if c.get("used") and c["name"] in self._log.cameras]
-        return used or list(self._log.cameras)
-
     @cached_property
     def _swept(self) -> tuple[GroundPoints, dict[int, Array]]:
         """Read the sweeps: points near the ground and, by stamp, points (H, 3), m, map frame, of what stands above it."""
         chosen = [(name, int(i)) for name, indices in self._sweeps.items() for i in indices]
-        chosen.sort(key=lambda key: int(self._log.streams[key[0]].t_ns[key[1]]))
+        stamps = {(name, i): int(self._log.streams[name].t_ns[i]) for name, i in chosen}
+        chosen.sort(key=stamps.__getitem__)
         most = MAX_POINTS // max(len(chosen), 1)
 
         def take(key: tuple[str, int]) -> tuple[GroundPoints, Array] | None:
-            name, sweep, t_ns = key[0], self._records.get(*key), self._stamp(key)
+            name, sweep, t_ns = key[0], self._records.get(*key), stamps[key]
             if sweep is None or self._records.watch.lidars[name].repeated.get(t_ns, False):
                 return None
             users, hides = [self._users.at(t_ns), self._users.ego_at(t_ns)], self._colors is not None
@@ -275,14 +259,12 @@ class GroundMapBuilder:
         for done, (key, taken) in enumerate(zip(chosen, work_ahead(take, chosen))):
             if taken is not None:
                 parts.append(taken[0])
-                before = hiding.get(self._stamp(key), np.zeros((0, 3)))
-                hiding[self._stamp(key)] = np.concatenate([before, taken[1]])
+                hiding[stamps[key]] = np.concatenate([hiding.get(stamps[key], np.zeros((0, 3))), taken[1]])
             self._progress(done + 1, len(chosen))
         points = GroundPoints.join(parts)
         if not len(points.z):
-            self.notes.append(
-                "no height and no intensity: there is no sweep with ground; pictures are laid on flat ground"
-            )
+            flat = "no height and no intensity: there is no sweep with ground; pictures are laid on flat ground"
+            self.notes.append(flat)
         elif not np.isfinite(points.intensity).any():
             self.notes.append("no intensity: the sweeps of this log have none")
         return points, hiding
@@ -295,9 +277,6 @@ class GroundMapBuilder:
     def _laid(self) -> Surface:
         """The surface on which pictures are laid."""
         return self._surface.smoothed()
-
-    def _stamp(self, key: tuple[str, int]) -> int:
-        return int(self._log.streams[key[0]].t_ns[key[1]])
 
     @cached_property
     def _likely_ground(self) -> NDArray[np.uint8]:
@@ -314,23 +293,6 @@ class GroundMapBuilder:
         factor = round(surface.raster.resolution_m / self.raster.resolution_m)
         rows, columns = self.raster.shape
         return np.ascontiguousarray(np.repeat(np.repeat(near, factor, axis=0), factor, axis=1)[:rows, :columns])
-
-    def _hiding_at(self, t_ns: int) -> Array | None:
-        """Return points (H, 3), m, map frame, of what stood above the ground at a time; None where no sweep is near."""
-        hiding = self._swept[1]
-        stamps = np.array(sorted(hiding), dtype=np.int64)
-        near = stamps[np.abs(stamps - t_ns) <= MAX_APART_S * NS_PER_S]
-        return np.concatenate([hiding[t] for t in near.tolist()]) if len(near) else None
-
-    def _measured(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Height, m, and intensity on the cells of the map (R, C), NaN where no sweep tells."""
-        surface, shape = self._surface, self.raster.shape
-        factor = round(surface.raster.resolution_m / self.raster.resolution_m)
-        height = upsample(surface.z_m, factor, shape) + np.float32(self._z0_m)
-        known = np.repeat(np.repeat(surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
-        height[~known] = np.nan
-        intensity = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster))
-        return height, intensity
 
     def _road(self, raster: Raster, half_width_m: float = ROAD_HALF_WIDTH_M) -> NDArray[np.bool_]:
         """Mask (R, C) of the cells that the ego drove over, or past at a distance."""

@@ -12,7 +12,7 @@ from log2sim.datatypes import COLOR_NAMES, AgentTable, Log, Scenario
 from log2sim.datatypes.color_names import to_rgb
 from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera, inverse, project
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
-from log2sim.road.color_network import ColorNetwork, crop, shipped_network
+from log2sim.road.color_network import crop, shipped_network
 
 # Pictures in turn differ little: light and direction change over meters, which takes about this long.
 MIN_STEP_S = 0.5
@@ -22,33 +22,28 @@ MAX_HIDDEN = 0.5  # share of the width; of what is hidden further the box shows 
 
 
 def choose_views(log: Log, scenario: Scenario, wanted: Sequence[str]) -> dict[str, dict[int, list[str]]]:
-    """Choose frames in which to look at agents.
-
-    `wanted`: ids of the agents.
-
-    Returns dict of str to dict of int to list of str: by camera and index of the frame: ids of the agents to look at
-    there.
-    """
+    """Choose frames in which to look at agents, by their ids: by camera and index of the frame, the agents to look at there."""
     agents = scenario.others
-    rows = [k for k, agent in enumerate(agents) if agent.id in set(wanted)]
-    scores: list[tuple[str, int, Array]] = []
+    frames: list[tuple[str, int]] = []
+    heights: list[Array] = []
     for name, camera in log.cameras.items():
-        frames = _spaced(log.streams[name].t_ns) if name in log.streams else np.zeros(0, np.int64)
-        t_ns = log.streams[name].t_ns[frames] if len(frames) else frames
-        poses, known = log.map_T_sensor(name, t_ns) if len(frames) else (np.zeros((0, 4, 4)), np.zeros(0, bool))
-        boxes = AgentTable.of(agents, (t_ns - scenario.t0_ns) / NS_PER_S, permanent=True)
+        if name not in log.streams or not len(log.streams[name].t_ns):
+            continue
+        t_ns = log.streams[name].t_ns
+        spaced = np.unique((t_ns - t_ns[0]) // round(MIN_STEP_S * NS_PER_S), return_index=True)[1]
+        poses, known = log.map_T_sensor(name, t_ns[spaced])
+        boxes = AgentTable.of(agents, (t_ns[spaced] - scenario.t0_ns) / NS_PER_S, permanent=True)
         for k in np.flatnonzero(known):
-            score = _clear_heights(camera, inverse(poses[k]), boxes.center_m[:, k], boxes.size_m)
-            scores.append((name, int(frames[k]), score))
-    return _best_views(scores, [(row, agents[row].id) for row in rows])
-
-
-def _spaced(t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return indices of frames that are `MIN_STEP_S` apart or somewhat more."""
-    if len(t_ns) == 0:
-        return np.zeros(0, np.int64)
-    slot = (t_ns - t_ns[0]) // round(MIN_STEP_S * NS_PER_S)
-    return np.unique(slot, return_index=True)[1].astype(np.int64)
+            frames.append((name, int(spaced[k])))
+            heights.append(_clear_heights(camera, inverse(poses[k]), boxes.center_m[:, k], boxes.size_m))
+    table = np.array(heights).reshape(len(frames), -1)
+    views: dict[str, dict[int, list[str]]] = {}
+    for row in [k for k, agent in enumerate(agents) if agent.id in set(wanted)] if frames else ():
+        for k in np.argsort(-table[:, row], kind="stable")[:MAX_VIEWS].tolist():
+            if table[k, row] >= MIN_HEIGHT_PX:
+                name, index = frames[k]
+                views.setdefault(name, {}).setdefault(index, []).append(agents[row].id)
+    return views
 
 
 def _clear_heights(camera: Camera, cam_T_map: Array, center: Array, size: Array) -> Array:
@@ -73,18 +68,6 @@ def _clear_heights(camera: Camera, cam_T_map: Array, center: Array, size: Array)
         if hidden <= MAX_HIDDEN:
             out[row] = camera.K[1, 1] * size[row, 2] / depth[row] * (1 - hidden)
     return out
-
-
-def _best_views(scores: list[tuple[str, int, Array]], wanted: list[tuple[int, str]]) -> dict[str, dict[int, list[str]]]:
-    table = np.array([score for _, _, score in scores]).reshape(len(scores), -1)
-    views: dict[str, dict[int, list[str]]] = {}
-    for row, agent in wanted:
-        order = np.argsort(-table[:, row], kind="stable")[:MAX_VIEWS] if len(table) else np.zeros(0, np.intp)
-        for k in order.tolist():
-            if table[k, row] >= MIN_HEIGHT_PX:
-                name, index, _ = scores[k]
-                views.setdefault(name, {}).setdefault(index, []).append(agent)
-    return views
 
 
 Image = NDArray[np.uint8]
@@ -123,13 +106,15 @@ class ColorSampler:
             self.gray.add(camera)
             return
         t_ns = int(self._log.streams[camera].t_ns[index])
-        view = view_of(self._log, camera, t_ns)
-        if view is None:
+        view, agents = view_of(self._log, camera, t_ns), self._views.get(camera, {}).get(index)
+        if view is None or not agents:
             return
-        agents = self._views.get(camera, {}).get(index, ())
-        if not agents:
-            return
-        boxes = self._boxes_in(camera)
+        if (
+            camera not in self._boxes
+        ):  # of all agents in the frames that it wants of a camera, made for all of them at once
+            t_s = (self._log.streams[camera].t_ns[self.frames()[camera]] - self._scenario.t0_ns) / NS_PER_S
+            self._boxes[camera] = AgentTable.of(self._scenario.others, t_s, permanent=True)
+        boxes = self._boxes[camera]
         place = int(np.searchsorted(self.frames()[camera], index))
         rows = [next(k for k, other in enumerate(boxes.agents) if other.id == agent) for agent in agents]
         found = project_boxes_in_view(view, boxes.center_m[rows, place], boxes.size_m[rows], boxes.yaw_rad[rows, place])
@@ -139,17 +124,20 @@ class ColorSampler:
             for k, look in zip(seen.tolist(), raw):
                 self._looks.setdefault(agents[k], []).append(look)
 
-    def _boxes_in(self, camera: str) -> AgentTable:
-        """Return the boxes of all agents in the frames that it wants of a camera, made for all of them at once."""
-        if camera not in self._boxes:
-            t_ns = self._log.streams[camera].t_ns[self.frames()[camera]]
-            t_s = (t_ns - self._scenario.t0_ns) / NS_PER_S
-            self._boxes[camera] = AgentTable.of(self._scenario.others, t_s, permanent=True)
-        return self._boxes[camera]
-
     def colors(self) -> dict[str, dict[str, Any]]:
         """Return the color of each vehicle that was seen, by id, as `Agent.color` holds it."""
-        return {agent: decide_color(self._network, np.array(looks)) for agent, looks in self._looks.items()}
+        found = {}
+        for agent, looks in self._looks.items():
+            lab, probability = self._network.decide(np.array(looks))
+            best = int(np.argmax(probability))
+            found[agent] = {
+                "rgb": [int(v) for v in to_rgb(lab)[0]],
+                "name": COLOR_NAMES[best],
+                "confidence": round(float(probability[best]), 3),
+                "lab": [round(float(v), 2) for v in lab],
+                "frames": len(looks),
+            }
+        return found
 
     def notes(self) -> tuple[str, ...]:
         """Say which vehicles have no color, and why."""
@@ -160,16 +148,3 @@ class ColorSampler:
         if self.gray:
             reason += f"; pictures of {', '.join(sorted(self.gray))} are gray"
         return (f"no color of {len(missing)} of {len(self._vehicles)} vehicles: {reason}",)
-
-
-def decide_color(network: ColorNetwork, raw: Array) -> dict[str, Any]:
-    """Name a color by the outputs (N, 13) of the network for pictures of one vehicle, as `Agent.color` holds it."""
-    lab, probability = network.decide(raw)
-    best = int(np.argmax(probability))
-    return {
-        "rgb": [int(v) for v in to_rgb(lab)[0]],
-        "name": COLOR_NAMES[best],
-        "confidence": round(float(probability[best]), 3),
-        "lab": [round(float(v), 2) for v in lab],
-        "frames": len(raw),
-    }

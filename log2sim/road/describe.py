@@ -83,8 +83,13 @@ def describe(
     }
     planned = [plan.decision(stage) for stage in said]
     decisions = [replace(d, reason=said[d.stage]) if d.kept else d for d in planned]
+    mapped = None
+    if features is not None:
+        kinds, origins = (m.kind for m in features.markings), (lane.inferred_from for lane in features.lanes)
+        mapped = {"markings": dict(Counter(kinds)), "borders": len(features.borders), "lanes": dict(Counter(origins))}
+        mapped |= {"notes": list(features.notes)}
     figures = {
-        "map_features": None if features is None else count_features(features),
+        "map_features": mapped,
         "colors": dict(Counter(str(agent.color["name"]) for agent in agents if agent.color is not None)),
         "signals": len(signals),
     }
@@ -114,13 +119,3 @@ def _appearance(
         colors, uncolored = sampler.colors(), sampler.notes()
     signals = find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
     return colors, uncolored, *signals
-
-
-def count_features(features: MapFeatures) -> dict[str, Any]:
-    """Count markings by kind, borders, and lanes by what they are inferred from."""
-    return {
-        "markings": dict(Counter(marking.kind for marking in features.markings)),
-        "borders": len(features.borders),
-        "lanes": dict(Counter(lane.inferred_from for lane in features.lanes)),
-        "notes": list(features.notes),
-    }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -44,29 +44,21 @@ class DrivenPath:
     rank: int  # 0 for the ego, 1 for vehicles, 2 for two-wheelers: in this order paths make lanes
     confidence: float  # of the agent
 
-    def replace_points(self, points_m: Array) -> DrivenPath:
-        """Return the same path along other points (N, 3)."""
-        return replace(self, line=Polyline.through(points_m))
-
 
 def collect_paths(scenario: Scenario) -> list[DrivenPath]:
     """Return the paths of all vehicles of a scenario that are `MIN_PATH_M` long: the ego's first, then long before short."""
-    found = [path for agent in scenario.agents if not agent.static for path in _paths_of(agent)]
+    found = []
+    for agent in scenario.agents:
+        drives = GROUP_OF[agent.category] in ("vehicle", "two_wheeler") and not agent.static
+        if not drives or len(agent.waypoints) < 2:
+            continue
+        rank = 0 if agent.id == EGO else 1 if agent.category in VEHICLES_FIRST else 2
+        for points in directed_paths(agent):
+            line = Polyline.through(points)
+            line = line if rank == 0 else _smoothed(line)
+            if line.length_m >= MIN_PATH_M:
+                found.append(DrivenPath(agent.id, line, agent.size_m[1], rank, agent.confidence))
     return sorted(found, key=lambda p: (p.rank, -round(p.line.length_m, 2), p.agent))
-
-
-def _paths_of(agent: Agent) -> list[DrivenPath]:
-    group = GROUP_OF[agent.category]
-    if group not in ("vehicle", "two_wheeler") or len(agent.waypoints) < 2:
-        return []
-    rank = 0 if agent.id == EGO else 1 if agent.category in VEHICLES_FIRST else 2
-    lines = [Polyline.through(points) for points in directed_paths(agent)]
-    lines = lines if rank == 0 else [_smoothed(line) for line in lines]
-    return [
-        DrivenPath(agent.id, line, agent.size_m[1], rank, agent.confidence)
-        for line in lines
-        if line.length_m >= MIN_PATH_M
-    ]
 
 
 def _smoothed(line: Polyline) -> Polyline:
@@ -88,25 +80,19 @@ def directed_paths(agent: Agent) -> list[Array]:
     points, yaw, jump = _dense(agent)
     found = []
     for rows in np.split(np.arange(len(points)), np.flatnonzero(jump) + 1):
-        progress = _progress(points[rows], yaw[rows])
-        for first, last, sign in _monotone_stretches(progress):
+        for first, last, sign in _monotone_stretches(_progress(points[rows], yaw[rows])):
             stretch = rows[first : last + 1][::sign]
-            kept = _forward_rows(points[stretch], yaw[stretch])
+            kept = [stretch[0]]
+            # Points that lie ahead of the ones before, by more than aside: no wheel rolls sideways.
+            for k in stretch[1:]:
+                dx, dy = (points[k] - points[kept[-1]])[:2]
+                c, s = np.cos(yaw[k]), np.sin(yaw[k])
+                ahead, aside = dx * c + dy * s, dy * c - dx * s
+                if ahead >= MIN_STEP_M and ahead >= abs(aside):
+                    kept.append(k)
             if len(kept) > 1:
-                found.append(points[stretch[kept]])
+                found.append(points[kept])
     return found
-
-
-def _forward_rows(points: Array, yaw: Array) -> list[int]:
-    """Return the rows of points (N, 3) that lie ahead of the ones before, by more than aside: no wheel rolls sideways."""
-    kept = [0]
-    for k in range(1, len(points)):
-        dx, dy = (points[k] - points[kept[-1]])[:2]
-        c, s = np.cos(yaw[k]), np.sin(yaw[k])
-        ahead, aside = dx * c + dy * s, dy * c - dx * s
-        if ahead >= MIN_STEP_M and ahead >= abs(aside):
-            kept.append(k)
-    return kept
 
 
 def _dense(agent: Agent) -> tuple[Array, Array, Array]:
@@ -193,57 +179,38 @@ def match(routes: Sequence[Polyline], line: Polyline, enter_m: float = ENTER_M, 
         at = route.project(line.points_m[:, :2], line.heading_rad)
         s[r], aside[r], turn[r] = at.s_m, at.aside_m, at.turn_rad
         stay[r] = at.inside & (np.abs(at.aside_m) <= stay_m) & (np.abs(at.turn_rad) <= MAX_TURN_RAD)
-    route_of = _choose(s, np.where(stay, np.abs(aside), np.inf), enter_m)
-    runs = _runs(route_of, s)
-    runs = _absorb(runs, route_of, stay, s)
-    pick = np.maximum(route_of, 0), np.arange(n)
-    on = route_of >= 0
     if not len(routes):
-        return Match(runs, *(np.full(n, np.nan) for _ in range(3)))
-    return Match(runs, *(np.where(on, column[pick], np.nan) for column in (s, aside, turn)))
+        return Match((Run(-1, 0, n - 1),), *(np.full(n, np.nan) for _ in range(3)))
+    route_of = _choose(s, np.where(stay, np.abs(aside), np.inf), enter_m)
+    # Stretches that were never far from one route are on it.
+    for run in _runs(route_of, s):
+        if run.route < 0:
+            rows = slice(run.first, run.last + 1)
+            held = stay[:, rows].all(axis=1) & (np.abs(np.diff(s[:, rows], axis=1)) <= JUMP_M).all(axis=1)
+            if held.any():
+                beside = [route_of[k] for k in (run.first - 1, run.last + 1) if 0 <= k < n]
+                route_of[rows] = next((r for r in beside if r >= 0 and held[r]), np.flatnonzero(held)[0])
+    pick = np.maximum(route_of, 0), np.arange(n)
+    columns = (np.where(route_of >= 0, column[pick], np.nan) for column in (s, aside, turn))
+    return Match(_runs(route_of, s), *columns)
 
 
 def _choose(s: Array, distance: Array, enter_m: float) -> NDArray[np.intp]:
     """Choose a route (N,) for each sample: the one before while it is near, else the nearest."""
-    n = distance.shape[1]
-    chosen = np.full(n, -1)
-    if not len(distance):
-        return chosen
-    nearest = distance.argmin(axis=0)
-    least = distance[nearest, np.arange(n)]
-    current = -1
-    for k in range(n):
-        if current >= 0:
-            goes_on = distance[current, k] < np.inf and abs(s[current, k] - s[current, k - 1]) <= JUMP_M
-            if goes_on and (distance[current, k] <= enter_m or least[k] > enter_m):
-                chosen[k] = current
-                continue
-        current = int(nearest[k]) if least[k] <= enter_m else -1
-        chosen[k] = current
+    nearest, least = distance.argmin(axis=0), distance.min(axis=0)
+    chosen = np.where(least <= enter_m, nearest, -1)
+    for k in range(1, len(chosen)):
+        current = chosen[k - 1]
+        goes_on = current >= 0 and distance[current, k] < np.inf and abs(s[current, k] - s[current, k - 1]) <= JUMP_M
+        if goes_on and (distance[current, k] <= enter_m or least[k] > enter_m):
+            chosen[k] = current
     return chosen
 
 
 def _runs(route_of: NDArray[np.intp], s: Array) -> tuple[Run, ...]:
     """Cut samples where the route changes or its station jumps."""
     n = len(route_of)
-    changed = np.diff(route_of) != 0
-    if len(s):
-        own = s[np.maximum(route_of, 0), np.arange(n)]
-        changed |= (np.abs(np.diff(own)) > JUMP_M) & (route_of[1:] >= 0)
+    own = s[np.maximum(route_of, 0), np.arange(n)]
+    changed = (np.diff(route_of) != 0) | ((np.abs(np.diff(own)) > JUMP_M) & (route_of[1:] >= 0))
     cuts = np.concatenate([[0], np.flatnonzero(changed) + 1, [n]])
     return tuple(Run(int(route_of[a]), int(a), int(b) - 1) for a, b in itertools.pairwise(cuts))
-
-
-def _absorb(runs: tuple[Run, ...], route_of: NDArray[np.intp], stay: NDArray[np.bool_], s: Array) -> tuple[Run, ...]:
-    """Put stretches that were never far from one route on it; `route_of` is changed in place."""
-    for run in runs:
-        if run.route >= 0 or not len(stay):
-            continue
-        rows = slice(run.first, run.last + 1)
-        level = (np.abs(np.diff(s[:, rows], axis=1)) <= JUMP_M).all(axis=1)
-        held = np.asarray(stay[:, rows].all(axis=1) & level)
-        if held.any():
-            beside = [route_of[k] for k in (run.first - 1, run.last + 1) if 0 <= k < len(route_of)]
-            best = next((r for r in beside if r >= 0 and held[r]), int(np.flatnonzero(held)[0]))
-            route_of[rows] = best
-    return _runs(route_of, s)

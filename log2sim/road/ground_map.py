@@ -152,21 +152,6 @@ class GroundMap:
         (rows, columns), d = spans, self.resolution_m
         x0, _, _, y1 = self.extent_m
         extent = (x0 + columns.start * d, x0 + columns.stop * d, y1 - rows.stop * d, y1 - rows.start * d)
-        part = (rows, columns)
-        return GroundMap(
-            self.color_bgr[part].copy(),
-            self.alpha[part].copy(),
-            self.height_m[part].copy(),
-            self.intensity[part].copy(),
-            d,
-            extent,
-            self.notes,
-        )
-
-    def cells_of(self, xy: ArrayLike) -> tuple[Array, Array]:
-        """Return rows and columns (N,), fractional, of positions (N, 2), m; whole numbers are centers of cells."""
-        return self.raster.cells_of(xy)
-
-    def xy_of(self, rows: ArrayLike, columns: ArrayLike) -> Array:
-        """Return positions (..., 2), m, of rows and columns (...), which may be fractional."""
-        return self.raster.xy_of(rows, columns)
+        layers = self.color_bgr, self.alpha, self.height_m, self.intensity
+        color, alpha, height, intensity = (layer[rows, columns].copy() for layer in layers)
+        return GroundMap(color, alpha, height, intensity, d, extent, self.notes)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
-from log2sim.geometry import Array, Polyline, wrap_angle
+from log2sim.geometry import Polyline
 from log2sim.road.driven_paths import MAX_TURN_RAD, MIN_PATH_M, DrivenPath, Match, collect_paths
 from log2sim.road.routes import (
     BESIDE_M,
@@ -29,7 +30,6 @@ from log2sim.road.routes import (
 from log2sim.road.sections import (
     Connection,
     Strip,
-    Union,
     connect,
     continuations,
     cut_sections,
@@ -48,13 +48,8 @@ MAX_STEP_M = 20.0
 
 
 def thin(lane: MapLane) -> MapLane:
-    """Drop the points of a lane that linear interpolation restores, with their widths."""
-    kept = _kept_rows(np.column_stack([lane.points_m, lane.width_m]))
-    return replace(lane, points_m=lane.points_m[kept], width_m=lane.width_m[kept])
-
-
-def _kept_rows(columns: Array) -> NDArray[np.intp]:
-    """Return the rows to keep of x, y, z, width (N, 4), by repeated splitting (Ramer 1972, Douglas and Peucker 1973)."""
+    """Drop the points of a lane that linear interpolation restores, with their widths (Ramer 1972, Douglas and Peucker 1973)."""
+    columns = np.column_stack([lane.points_m, lane.width_m])
     kept, stack = {0, len(columns) - 1}, [(0, len(columns) - 1)]
     while stack:
         a, b = stack.pop()
@@ -72,7 +67,8 @@ def _kept_rows(columns: Array) -> NDArray[np.intp]:
             k = (a + b) // 2
         kept.add(k)
         stack += [(a, k), (k, b)]
-    return np.array(sorted(kept))
+    rows = sorted(kept)
+    return replace(lane, points_m=lane.points_m[rows], width_m=lane.width_m[rows])
 
 
 # A line this near to the edge of a lane is its edge: vehicles, and so lanes along their paths, keep half a meter off the
@@ -86,29 +82,27 @@ def name_lines(lanes: Sequence[MapLane], markings: Sequence[Marking], borders: S
     """Return lanes outside of junctions with the lines at their edges, where none are named; lanes side by side share one."""
     items = list_road_lines(markings, borders)
     lines = [Polyline.through(item.points_m) for item in items]
-    names = [item.id for item in items]
-    return [lane if lane.junction is not None else _named(lane, lines, names) for lane in lanes]
-
-
-def _named(lane: MapLane, lines: Sequence[Polyline], names: Sequence[str]) -> MapLane:
-    own = Polyline(lane.points_m)
-    s = np.linspace(0.0, own.length_m, max(int(np.ceil(own.length_m)), 4) + 1)
-    points, heading = own.at(s)[:, :2], own.heading_at(s)
-    half = np.interp(s, own.s_m, lane.width_m) / 2
-    best: dict[str, tuple[float, str | None]] = {}
-    for line, name in zip(lines, names):
-        if not own.is_near(line, half.max() + NEAR_M):
+    found = list(lanes)
+    for k, lane in enumerate(lanes):
+        if lane.junction is not None:
             continue
-        for turned in (0.0, np.pi):
-            at = line.project(points, heading + turned)
-            aside = -at.aside_m if turned == 0.0 else at.aside_m
-            along = at.inside & (np.abs(wrap_angle(at.turn_rad)) <= PARALLEL_RAD)
-            for side, sign in (("left", 1), ("right", -1)):
-                near = along & (np.abs(sign * aside - half) <= NEAR_M)
-                if near.mean() >= MIN_SHARE and near.mean() > best.get(side, (0.0, None))[0]:
-                    best[side] = (float(near.mean()), name)
-    left, right = (best.get(side, (0.0, None))[1] for side in ("left", "right"))
-    return replace(lane, left=lane.left or left, right=lane.right or right)
+        own = Polyline(lane.points_m)
+        s = np.linspace(0.0, own.length_m, max(int(np.ceil(own.length_m)), 4) + 1)
+        points, heading, half = own.at(s)[:, :2], own.heading_at(s), np.interp(s, own.s_m, lane.width_m) / 2
+        best: dict[str, tuple[float, str | None]] = {"left": (0.0, lane.left), "right": (0.0, lane.right)}
+        for line, item in zip(lines, items):
+            if not own.is_near(line, half.max() + NEAR_M):
+                continue
+            for turned in (0.0, np.pi):
+                at = line.project(points, heading + turned)
+                aside = -at.aside_m if turned == 0.0 else at.aside_m
+                along = at.inside & (np.abs(at.turn_rad) <= PARALLEL_RAD)
+                for side, sign in (("left", 1), ("right", -1)):
+                    share = float((along & (np.abs(sign * aside - half) <= NEAR_M)).mean())
+                    if share >= MIN_SHARE and share > best[side][0] and getattr(lane, side) is None:
+                        best[side] = share, item.id
+        found[k] = replace(lane, left=best["left"][1], right=best["right"][1])
+    return found
 
 
 # A lane of its own overlaps the lanes that a path leaves by as much; two stretches nearer than twice of it become one.
@@ -121,33 +115,16 @@ def find_covered(lanes: Sequence[MapLane], line: Polyline, aside_m: float | None
     """Return whether each vertex (N,) of a path is within the width of some lane, or `aside_m` of its middle, along it."""
     xy, heading = line.points_m[:, :2], line.heading_rad
     covered = np.zeros(len(xy), dtype=bool)
-    low, high = line.bounds_m
     for lane in lanes:
-        reach = max(float(lane.width_m.max()) / 2, aside_m or 0.0)
-        if np.any(lane.points_m[:, :2].min(axis=0) - reach > high) or np.any(
-            lane.points_m[:, :2].max(axis=0) + reach < low
-        ):
+        own = Polyline(lane.points_m)
+        if not line.is_near(own, max(float(lane.width_m.max()) / 2, aside_m or 0.0)):
             continue
         middle = Polyline.through(lane.points_m)
         at = middle.project(xy, heading)
-        way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(lane.points_m[:, :2], axis=0).T))])
-        half = np.maximum(np.interp(at.s_m, way, lane.width_m) / 2, aside_m or 0.0)
+        half = np.maximum(np.interp(at.s_m, own.s_m, lane.width_m) / 2, aside_m or 0.0)
         along = (at.s_m >= -BEYOND_M) & (at.s_m <= middle.length_m + BEYOND_M)
         covered |= along & (np.abs(at.aside_m) <= half) & (np.abs(at.turn_rad) <= MAX_TURN_RAD)
     return covered
-
-
-def find_uncovered(lanes: Sequence[MapLane], path: DrivenPath) -> Iterator[tuple[Array, float]]:
-    """Yield points (N, 3) and a width for each stretch of a path outside all lanes, `OVERLAP_M` longer on either side."""
-    s = path.line.s_m
-    off = np.flatnonzero(~find_covered(lanes, path.line, BESIDE_M if path.rank == 2 else None))
-    if not len(off):
-        return
-    width = min(max(LANE_M, path.width_m + CLEARANCE_M), MAX_LANE_M)
-    for run in np.split(off, np.flatnonzero(np.diff(s[off]) > 2 * OVERLAP_M) + 1):
-        rows = np.flatnonzero((s >= s[run[0]] - OVERLAP_M) & (s <= s[run[-1]] + OVERLAP_M))
-        if len(rows) >= 2 and s[rows[-1]] - s[rows[0]] >= MIN_PATH_M:
-            yield path.line.points_m[rows], width
 
 
 # Traffic that comes towards a vehicle within this distance is on the same road: two lanes each way and a strip between.
@@ -201,7 +178,7 @@ def _driven(strip: LaneStrip, paths: Sequence[DrivenPath]) -> LaneStrip:
         for sign, turned in ((1, 0.0), (-1, np.pi)):
             at = strip.line.project(path.line.points_m[:, :2], path.line.heading_rad + turned)
             half = np.interp(at.s_m, strip.width_s_m, strip.width_m) / 2
-            inside = at.inside & (np.abs(at.aside_m) <= half) & (np.abs(wrap_angle(at.turn_rad)) <= MAX_TURN_RAD)
+            inside = at.inside & (np.abs(at.aside_m) <= half) & (np.abs(at.turn_rad) <= MAX_TURN_RAD)
             along += sign * int(inside.sum())
     if along == 0:
         return strip
@@ -235,17 +212,6 @@ MIN_AHEAD_M = 0.05
 MAX_CONFIDENCE = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class _Graph:
-    """Sections and connections, and what they came from."""
-
-    routes: Sequence[Route]
-    strips: Sequence[Strip]
-    connections: Sequence[Connection]
-    drivers: Sequence[Sequence[str]]
-    crossing: frozenset[int]
-
-
 def infer_lanes(
     markings: Sequence[Marking], borders: Sequence[RoadBorder], scenario: Scenario
 ) -> tuple[tuple[MapLane, ...], tuple[str, ...]]:
@@ -273,8 +239,7 @@ def infer_lanes(
         notes.append("no lanes from paths: no vehicle moves")
     if not driven and not marked:
         return (), tuple(notes)
-    graph = _graph(merge_paths(driven, marked), driven)
-    lanes = _as_lanes(graph, {path.agent: path.confidence for path in driven})
+    lanes = _linked_lanes(merge_paths(driven, marked), driven)
     lanes = [*lanes, *_free_lanes(lanes, driven)]
     return _name_opposites(name_lines(lanes, markings, borders)), tuple(notes)
 
@@ -285,28 +250,21 @@ def _marked_routes(
     """Return routes along the strips between lines, in the direction of traffic."""
     sides: dict[str, Marking | RoadBorder] = {marking.id: marking for marking in markings}
     sides |= {border.id: border for border in borders}
-    strips = direct_strips(find_strips(markings, borders), paths, sides)
-    return [
-        Route(
-            strip.line,
-            strip.width_m,
-            strip.width_s_m,
-            (True, True),
-            (0.0, strip.line.length_m),
-            strip.left,
-            strip.right,
-            strip.confidence * strip.directed,
-        )
-        for strip in strips
-    ]
+    routes = []
+    for strip in direct_strips(find_strips(markings, borders), paths, sides):
+        widths, span = (strip.width_m, strip.width_s_m), (0.0, strip.line.length_m)
+        confidence = strip.confidence * strip.directed
+        routes.append(Route(strip.line, *widths, (True, True), span, strip.left, strip.right, confidence))
+    return routes
 
 
-def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
+def _linked_lanes(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> list[MapLane]:
+    """Return the sections of routes and the connections between them as lanes with their links."""
     seen = [match_path(routes, path) for path in paths]
     whole = [continued(routes, path, match) for path, match in zip(paths, seen)]
     matches = [match_path(routes, path) for path in whole]
     beside = find_beside([route.line for route in routes])
-    areas = join_conflicts(find_conflicts(routes, whole, matches))
+    areas, crossing = join_conflicts(find_conflicts(routes, whole, matches))
     sections = cut_sections(routes, areas, beside, _passed_ends(routes, whole, matches))
     strips = lay_out(routes, sections, beside)
     drivers: list[list[str]] = [[] for _ in strips]
@@ -316,7 +274,56 @@ def _graph(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> _Graph:
             s = np.concatenate([match.s_m[r] for r in rows]) if rows else np.zeros(0)
             if np.any((s > strip.section.first_m) & (s < strip.section.last_m)) and path.agent not in drivers[k]:
                 drivers[k].append(path.agent)
-    return _Graph(routes, strips, connect(routes, strips, whole, matches), drivers, areas.crossing)
+    connections = connect(routes, strips, whole, matches)
+    first = len(strips)
+    links = [(c.origin, first + k) for k, c in enumerate(connections)]
+    links += [(first + k, c.target) for k, c in enumerate(connections)]
+    links += continuations(strips)
+    names = [f"lane-{k + 1}" for k in range(first + len(connections))]
+    after: list[list[str]] = [[] for _ in names]
+    before: list[list[str]] = [[] for _ in names]
+    for a, b in links:
+        after[a].append(names[b])
+        before[b].append(names[a])
+    junction_of = _junctions(strips, connections, crossing)
+    confidence_of = {path.agent: path.confidence for path in paths}
+    lanes = []
+    for k, strip in enumerate(strips):
+        route, begin, end = routes[strip.section.route], strip.section.first_m, strip.section.last_m
+        # Markings make the route along at least half of the section.
+        low, high = route.marked_m or (np.inf, -np.inf)
+        marked = min(end, high) - max(begin, low) >= (end - begin) / 2
+        by_paths = _confidence(drivers[k], confidence_of)
+        both = 1 - (1 - by_paths) * (1 - route.confidence) if marked else by_paths
+        lanes.append(
+            MapLane(
+                names[k],
+                strip.line.points_m,
+                strip.width_m,
+                route.left if marked else None,
+                route.right if marked else None,
+                tuple(before[k]),
+                tuple(after[k]),
+                None if strip.left is None else names[strip.left],
+                None if strip.right is None else names[strip.right],
+                inferred_from=("both" if drivers[k] else "markings") if marked else "paths",
+                confidence=round(both, 3),
+            )
+        )
+    for k, way in enumerate(connections, start=first):
+        lanes.append(
+            MapLane(
+                names[k],
+                way.line.points_m,
+                way.width_m,
+                predecessors=tuple(before[k]),
+                successors=tuple(after[k]),
+                junction=junction_of.get(way.area),
+                inferred_from="paths",
+                confidence=_confidence(way.agents, confidence_of),
+            )
+        )
+    return [thin(lane) for lane in _meeting(lanes, links)]
 
 
 def _passed_ends(
@@ -335,81 +342,20 @@ def _passed_ends(
     return passed
 
 
-def _as_lanes(graph: _Graph, confidence_of: dict[str, float]) -> list[MapLane]:
-    """Return sections and connections as lanes with their links."""
-    first = len(graph.strips)
-    links = [(c.origin, first + k) for k, c in enumerate(graph.connections)]
-    links += [(first + k, c.target) for k, c in enumerate(graph.connections)]
-    links += continuations(graph.strips)
-    names = [f"lane-{k + 1}" for k in range(first + len(graph.connections))]
-    after: list[list[str]] = [[] for _ in names]
-    before: list[list[str]] = [[] for _ in names]
-    for a, b in links:
-        after[a].append(names[b])
-        before[b].append(names[a])
-    junction_of = _junctions(graph)
-    lanes = []
-    for k, strip in enumerate(graph.strips):
-        route = graph.routes[strip.section.route]
-        marked = _is_marked(route, strip)
-        by_paths = _confidence(graph.drivers[k], confidence_of)
-        origin = ("both" if graph.drivers[k] else "markings") if marked else "paths"
-        both = 1 - (1 - by_paths) * (1 - route.confidence) if marked else by_paths
-        left, right = (None if other is None else names[other] for other in (strip.left, strip.right))
-        lanes.append(
-            MapLane(
-                names[k],
-                strip.line.points_m,
-                strip.width_m,
-                route.left if marked else None,
-                route.right if marked else None,
-                tuple(before[k]),
-                tuple(after[k]),
-                left,
-                right,
-                inferred_from=origin,
-                confidence=round(both, 3),
-            )
-        )
-    for k, way in enumerate(graph.connections, start=first):
-        lanes.append(
-            MapLane(
-                names[k],
-                way.line.points_m,
-                way.width_m,
-                predecessors=tuple(before[k]),
-                successors=tuple(after[k]),
-                junction=junction_of.get(way.area),
-                inferred_from="paths",
-                confidence=_confidence(way.agents, confidence_of),
-            )
-        )
-    return [thin(lane) for lane in _meeting(lanes, links)]
-
-
-def _is_marked(route: Route, strip: Strip) -> bool:
-    """Whether markings make the route along at least half of a section."""
-    if route.marked_m is None:
-        return False
-    first, last = strip.section.first_m, strip.section.last_m
-    return min(last, route.marked_m[1]) - max(first, route.marked_m[0]) >= (last - first) / 2
-
-
-def _junctions(graph: _Graph) -> dict[int, str]:
+def _junctions(strips: Sequence[Strip], connections: Sequence[Connection], crossing: frozenset[int]) -> dict[int, str]:
     """Name the areas in which lanes cross, branch or merge, or in which several leave one road side by side: these are one."""
-    union = Union(1 + max((c.area for c in graph.connections), default=0))
-    known = {c.area for c in graph.connections}
-    for strip in graph.strips:
+    known = {c.area for c in connections}
+    areas = DisjointSet(known)
+    for strip in strips:
         if strip.right is not None:
-            other = graph.strips[strip.right].section
+            other = strips[strip.right].section
             for one, two in ((strip.section.start, other.start), (strip.section.end, other.end)):
                 if one in known and two in known:
-                    union.unite(one, two)
-    ways = Counter(union.root(c.area) for c in graph.connections)
-    crossing = {union.root(area) for area in graph.crossing & known}
-    order = list(dict.fromkeys(union.root(c.area) for c in graph.connections))
-    names = {area: f"junction-{k + 1}" for k, area in enumerate(a for a in order if ways[a] > 1 or a in crossing)}
-    return {area: names[union.root(area)] for area in known if union.root(area) in names}
+                    areas.merge(one, two)
+    ways = Counter(areas[c.area] for c in connections)  # in the order of the connections
+    crossed = {areas[area] for area in crossing & known}
+    names = {area: f"junction-{k + 1}" for k, area in enumerate(a for a in ways if ways[a] > 1 or a in crossed)}
+    return {area: names[areas[area]] for area in known if areas[area] in names}
 
 
 def _confidence(agents: Sequence[str], confidence_of: dict[str, float]) -> float:
@@ -421,18 +367,13 @@ def _meeting(lanes: Sequence[MapLane], links: Sequence[tuple[int, int]]) -> list
     """Let linked lanes meet in exactly the same point."""
     found = list(lanes)
     for a, b in links:
-        points, lane = found[b].points_m.copy(), found[b]
+        points, lane, heading = found[b].points_m.copy(), found[b], Polyline(found[b].points_m).heading_rad[0]
         points[0] = found[a].points_m[-1]
-        ahead = (points[1:, :2] - points[0, :2]) @ _direction(lane)
+        ahead = (points[1:, :2] - points[0, :2]) @ [np.cos(heading), np.sin(heading)]
         kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > MIN_AHEAD_M))])
         if len(kept) > 1:
             found[b] = replace(lane, points_m=points[kept], width_m=lane.width_m[kept])
     return found
-
-
-def _direction(lane: MapLane) -> Array:
-    heading = Polyline(lane.points_m).heading_rad[0]
-    return np.array([np.cos(heading), np.sin(heading)])
 
 
 def add_missing_lanes(lanes: Sequence[MapLane], scenario: Scenario) -> tuple[MapLane, ...]:
@@ -441,15 +382,21 @@ def add_missing_lanes(lanes: Sequence[MapLane], scenario: Scenario) -> tuple[Map
 
 
 def _free_lanes(lanes: Sequence[MapLane], paths: Sequence[DrivenPath]) -> list[MapLane]:
-    """Return lanes without links over what is left of paths outside the lanes."""
+    """Return lanes without links over the stretches of paths outside the lanes, `OVERLAP_M` longer on either side."""
     found: list[MapLane] = []
     taken = {lane.id for lane in lanes}
     for path in paths:
-        for points, width in find_uncovered([*lanes, *found], path):
-            line = Polyline.through(points)
+        s = path.line.s_m
+        off = np.flatnonzero(~find_covered([*lanes, *found], path.line, BESIDE_M if path.rank == 2 else None))
+        width = min(max(LANE_M, path.width_m + CLEARANCE_M), MAX_LANE_M)
+        confidence = round(min(PATH_PROBABILITY * path.confidence, MAX_CONFIDENCE), 3)
+        for run in np.split(off, np.flatnonzero(np.diff(s[off]) > 2 * OVERLAP_M) + 1) if len(off) else ():
+            rows = np.flatnonzero((s >= s[run[0]] - OVERLAP_M) & (s <= s[run[-1]] + OVERLAP_M))
+            if len(rows) < 2 or s[rows[-1]] - s[rows[0]] < MIN_PATH_M:
+                continue
+            line = Polyline.through(path.line.points_m[rows])
             name = next(n for k in count(len(lanes) + len(found) + 1) if (n := f"lane-{k}") not in taken)
             taken.add(name)
-            confidence = round(min(PATH_PROBABILITY * path.confidence, MAX_CONFIDENCE), 3)
             full = np.full(len(line.points_m), width)
             found.append(thin(MapLane(name, line.points_m, full, inferred_from="paths", confidence=confidence)))
     return found

@@ -70,10 +70,10 @@ def locate_in_lanes(agent: Agent, lanes: Sequence[MapLane], t_s: Array | None = 
             own = np.interp(at.s_m, line.s_m, lane.width_m)
             held = at.inside & (np.abs(at.turn_rad) <= MAX_TURN_RAD) & (np.abs(at.aside_m) <= own / 2 + CROSSED_M)
             aside[k, there[held]], width[k, there] = at.aside_m[held], own
+    if not lanes:
+        return LanePosition(t_s, np.full(len(t_s), -1), np.full(len(t_s), np.nan), np.full(len(t_s), np.nan))
     chosen = _choose(lanes, np.abs(aside), width)
     pick = np.maximum(chosen, 0), np.arange(len(t_s))
-    if not lanes:
-        return LanePosition(t_s, chosen, np.full(len(t_s), np.nan), np.full(len(t_s), np.nan))
     return LanePosition(t_s, chosen, *(np.where(chosen >= 0, column[pick], np.nan) for column in (aside, width)))
 
 
@@ -82,7 +82,7 @@ def _choose(lanes: Sequence[MapLane], distance: Array, width: Array) -> NDArray[
     number = {lane.id: k for k, lane in enumerate(lanes)}
     chosen = np.full(distance.shape[1], -1)
     current = -1
-    for t in range(len(chosen) if len(lanes) else 0):
+    for t in range(len(chosen)):
         inside = np.flatnonzero(distance[:, t] <= np.where(np.isnan(width[:, t]), 0.0, width[:, t]) / 2)
         if current >= 0 and np.isfinite(distance[current, t]):
             chosen[t] = current
@@ -125,23 +125,14 @@ def summarize_lane_keeping(agent: Agent, lanes: Sequence[MapLane]) -> dict[str, 
         return None
     marked = known.copy()
     marked[known] = [lanes[k].inferred_from != "paths" for k in position.lane[known]]
-    return {
-        "in_lane": round(float(known.mean()), 3),
-        "in_marked_lane": round(float(marked.mean()), 3),
-        **(_figures(position, marked, agent.size_m[1]) if marked.any() else {}),
-        "changes": [vars(change) for change in find_lane_changes(position, lanes)],
-    }
-
-
-def _figures(position: LanePosition, marked: NDArray[np.bool_], vehicle_m: float) -> dict[str, Any]:
-    aside, width = position.aside_m[marked], position.width_m[marked]
-    over = np.abs(aside) + vehicle_m / 2 > width / 2
-    figures = {"mean": aside.mean(), "sd": aside.std(), "leftmost": aside.max(), "rightmost": aside.min()}
-    return {
-        "aside_m": {key: round(float(value), 3) for key, value in figures.items()},
-        "width_m": round(float(np.median(width)), 2),
-        "over_line": round(float(over.mean()), 3),
-    }
+    found: dict[str, Any] = {"in_lane": round(float(known.mean()), 3), "in_marked_lane": round(float(marked.mean()), 3)}
+    if marked.any():
+        aside, width = position.aside_m[marked], position.width_m[marked]
+        over = np.abs(aside) + agent.size_m[1] / 2 > width / 2
+        figures = {"mean": aside.mean(), "sd": aside.std(), "leftmost": aside.max(), "rightmost": aside.min()}
+        found["aside_m"] = {key: round(float(value), 3) for key, value in figures.items()}
+        found["width_m"], found["over_line"] = round(float(np.median(width)), 2), round(float(over.mean()), 3)
+    return found | {"changes": [vars(change) for change in find_lane_changes(position, lanes)]}
 
 
 def summarize_scenario(scenario: Scenario) -> dict[str, Any]:

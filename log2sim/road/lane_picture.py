@@ -43,43 +43,32 @@ def find_vanishing_point(image_bgr: NDArray[np.uint8], *, rng: np.random.Generat
     scale = WIDTH_PX / image_bgr.shape[1]
     small = cv2.resize(image_bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     height, width = small.shape[:2]
-    segments = _segments(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8))
-    left, right = _sides(segments, width, height)
+    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY))[0]
+    segments = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4)
+    upside = segments[:, 1] > segments[:, 3]
+    segments[upside] = segments[upside][:, [2, 3, 0, 1]]  # the upper end first
+    # Those left of a road lean to the right, those right of it to the left; masts do not.
+    d = segments[:, 2:] - segments[:, :2]
+    length = np.linalg.norm(d, axis=1)
+    chosen = (np.abs(d[:, 1]) > np.sin(LEAST_SLOPE_RAD) * length) & (np.abs(d[:, 0]) >= 0.05 * length)
+    chosen &= (length > MIN_LENGTH * width) & (segments[:, 3] > ROWS[0] * height)
+    left, right = segments[chosen & (d[:, 0] < 0)], segments[chosen & (d[:, 0] > 0)]
     if not len(left) or not len(right):
         return None
     pairs = rng.integers(0, (len(left), len(right)), (TRIALS, 2))
-    points = _meet(left[pairs[:, 0]], right[pairs[:, 1]])
+    meeting = np.cross(_line(left[pairs[:, 0]]), _line(right[pairs[:, 1]]))
+    with np.errstate(all="ignore"):
+        points = meeting[:, :2] / meeting[:, 2:]
     low, high = np.array([COLUMNS[0] * width, ROWS[0] * height]), np.array([COLUMNS[1] * width, ROWS[1] * height])
     points = points[np.all((points > low) & (points < high), axis=1)]
     if not len(points):
         return None
-    support = np.array([_support(side, points, LONGEST * width) for side in (left, right)]).min(axis=0)
+    support = np.min([_weights(side, points, LONGEST * width).sum(axis=0) for side in (left, right)], axis=0)
     best = int(np.argmax(support))
     if support[best] < MIN_SUPPORT * width:
         return None
     u, v = _refine(np.concatenate([left, right]), points[best])
     return float(u / scale), float(v / scale)
-
-
-def _segments(gray: NDArray[np.uint8]) -> Array:
-    """Detect straight segments (N, 4): both ends, the upper one first."""
-    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(gray)[0]
-    if found is None:
-        return np.zeros((0, 4))
-    lines = np.asarray(found, np.float64).reshape(-1, 4)
-    upside = lines[:, 1] > lines[:, 3]
-    lines[upside] = lines[upside][:, [2, 3, 0, 1]]
-    return lines
-
-
-def _sides(segments: Array, width: int, height: int) -> tuple[Array, Array]:
-    """Part segments into those that lean to the right, as left of a road, and to the left."""
-    d = segments[:, 2:] - segments[:, :2]
-    length = np.linalg.norm(d, axis=1)
-    steep = np.abs(d[:, 1]) > np.sin(LEAST_SLOPE_RAD) * length
-    chosen = steep & (length > MIN_LENGTH * width) & (segments[:, 3] > ROWS[0] * height)
-    upright = np.abs(d[:, 0]) < 0.05 * length  # masts
-    return segments[chosen & ~upright & (d[:, 0] < 0)], segments[chosen & ~upright & (d[:, 0] > 0)]
 
 
 def _line(segments: Array) -> Array:
@@ -88,12 +77,6 @@ def _line(segments: Array) -> Array:
     b = np.column_stack([segments[:, 2:], np.ones(len(segments))])
     lines = np.cross(a, b)
     return np.asarray(lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True))
-
-
-def _meet(a: Array, b: Array) -> Array:
-    meeting = np.cross(_line(a), _line(b))
-    with np.errstate(all="ignore"):
-        return np.asarray(meeting[:, :2] / meeting[:, 2:])
 
 
 def _weights(segments: Array, points: Array, longest_px: float) -> Array:
@@ -106,10 +89,6 @@ def _weights(segments: Array, points: Array, longest_px: float) -> Array:
     sine = cross / np.maximum(length[:, None] * np.linalg.norm(to, axis=2), 1e-9)
     below = segments[:, 1][:, None] > points[None, :, 1] - 2
     return np.asarray(below * np.minimum(length, longest_px)[:, None] * np.exp(-0.5 * (sine / ANGLE_SIGMA_RAD) ** 2))
-
-
-def _support(segments: Array, points: Array, longest_px: float) -> Array:
-    return np.asarray(_weights(segments, points, longest_px).sum(axis=0))
 
 
 def _refine(segments: Array, point: Array) -> Array:
@@ -139,7 +118,10 @@ AROUND_M = 0.3
 def keep_road(ground: GroundMap, camera_x_m: float, camera_y_m: float) -> GroundMap:
     """Hide what has not the color of the ground in front of the camera; all is kept where that is no wide surface."""
     seen = ground.alpha > 0
-    bright, yellow = (_remove_narrow(a, ground.resolution_m) for a in log_color(ground.color_bgr))
+    # What is narrow across the road, which runs along the rows, is removed: bright lines first, then dark ones.
+    across = np.ones((2 * round(NARROW_M / ground.resolution_m / 2) + 1, 1), np.uint8)
+    opened = (cv2.morphologyEx(cv2.blur(a, (5, 5)), cv2.MORPH_OPEN, across) for a in log_color(ground.color_bgr))
+    bright, yellow = (cv2.morphologyEx(a, cv2.MORPH_CLOSE, across) for a in opened)
     near = np.zeros(seen.shape, bool)
     x0, _, _, y1 = ground.extent_m
     rows = slice(*(max(round((y1 - camera_y_m + side * BESIDE_M) / ground.resolution_m), 0) for side in (-1, 1)))
@@ -156,15 +138,6 @@ def keep_road(ground: GroundMap, camera_x_m: float, camera_y_m: float) -> Ground
     whole = cv2.morphologyEx(road.astype(np.uint8), cv2.MORPH_OPEN, np.ones(size, np.uint8))
     wider = cv2.dilate(whole, np.ones((size[0] // 2 | 1,) * 2, np.uint8))
     return replace(ground, alpha=np.where(wider > 0, ground.alpha, 0).astype(np.uint8))
-
-
-def _remove_narrow(values: NDArray[np.float32], cell_m: float) -> NDArray[np.float32]:
-    """Remove what is narrow across the road, which runs along the rows: bright lines first, then dark ones."""
-    across = np.ones((2 * round(NARROW_M / cell_m / 2) + 1, 1), np.uint8)
-    soft = cv2.blur(values, (5, 5))
-    return np.asarray(
-        cv2.morphologyEx(cv2.morphologyEx(soft, cv2.MORPH_OPEN, across), cv2.MORPH_CLOSE, across), np.float32
-    )
 
 
 TOLERANCE_M, TOLERANCE_PER_M = 0.12, 0.01  # of a line's course: its own error, and that of a ground that is not flat
@@ -228,24 +201,15 @@ def join_lines(markings: list[Marking], shape: RoadShape, near_m: float, far_m: 
         order = sorted(group, key=lambda k: points[k][:, 0].min())
         own = np.concatenate([points[k] for k in order])
         own = own[np.argsort(own[:, 0], kind="stable")]
-        lines.append(
-            LaneLine(
-                float(np.mean([offsets[k] for k in group])),
-                tuple(markings[k] for k in order),
-                _continued(own, shape, near_m, far_m),
-            )
-        )
+        # To both ends it goes on beside the course where it was seen last: by the median of 5 m, as single points would shift
+        # all that lies beyond.
+        x = np.arange(min(near_m, own[0, 0]), max(far_m, own[-1, 0]) + STEP_M, STEP_M)
+        beside, some = own[:, 1] - shape.course(own[:, 0]), 1 + int(5 / STEP_M)
+        first, last = float(np.median(beside[:some])), float(np.median(beside[-some:]))
+        y = shape.course(x) + np.interp(x, own[:, 0], beside, left=first, right=last)
+        course = np.column_stack([x, y, np.full(len(x), float(np.median(own[:, 2])))])
+        lines.append(LaneLine(float(np.mean([offsets[k] for k in group])), tuple(markings[k] for k in order), course))
     return sorted(lines, key=lambda line: -line.offset_m)
-
-
-def _continued(points: Array, shape: RoadShape, near_m: float, far_m: float) -> Array:
-    """Continue a line to both ends, beside the course where it was seen last."""
-    x = np.arange(min(near_m, points[0, 0]), max(far_m, points[-1, 0]) + STEP_M, STEP_M)
-    beside = points[:, 1] - shape.course(points[:, 0])
-    # Medians of the nearest 5 m, as single points would shift all that lies beyond.
-    first, last = (float(np.median(part)) for part in (beside[: 1 + int(5 / STEP_M)], beside[-1 - int(5 / STEP_M) :]))
-    y = shape.course(x) + np.interp(x, points[:, 0], beside, left=first, right=last)
-    return np.column_stack([x, y, np.full(len(x), float(np.median(points[:, 2])))])
 
 
 def _even(points: Array) -> Array:
@@ -377,26 +341,24 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M, symbols=False)
     notes = ("markings by a camera only: light streaks are harder to tell from paint",)
     found = PictureMarkings(markings, (), (), camera, ground, notes)
-    lines = [m for m in markings if m.is_lane_line and not _is_upright(m, camera)]
-    weights = np.array([_visible(found, m) * m.confidence for m in lines]) / (LONG_LINE * camera.height_px)
-    large = [k for k in range(len(lines)) if weights[k] >= SHORT_LINE / LONG_LINE]
-    lines, weights = [lines[k] for k in large], weights[large]
-    shape = find_shape(lines, weights)
+    lines, shares = [], []
+    for m in markings:
+        if m.is_lane_line:
+            slope, offset = np.polyfit(*(m.points_m[:, :2] - camera.mount_T_cam[:2, 3]).T, 1)
+            share = _visible(found, m) * m.confidence / (LONG_LINE * camera.height_px)
+            # Upright things that are laid out flat point to below the camera, but not along the road.
+            upright = abs(slope) > UPRIGHT_SLOPE and abs(offset) < UPRIGHT_OFFSET_M
+            if not upright and share >= SHORT_LINE / LONG_LINE:
+                lines.append(m)
+                shares.append(share)
+    shape = find_shape(lines, np.array(shares))
+    others = tuple(m for m in markings if not m.is_lane_line)
     if shape is None:
-        others = tuple(m for m in markings if not m.is_lane_line)
         return replace(found, markings=others, notes=(*notes, "no lane lines seen: none run beside each other"))
     kept = [lines[k] for k in shape[1]]
     x = camera.mount_T_cam[0, 3]
     joined = join_lines(kept, shape[0], x + NEAR_M, x + FAR_M)
-    others = tuple(m for m in markings if not m.is_lane_line)
     return replace(found, markings=(*kept, *others), lane_lines=tuple(joined))
-
-
-def _is_upright(marking: Marking, camera: Camera) -> bool:
-    """Whether a line points to below the camera but not along the road, as upright things do that are laid out flat."""
-    x, y = marking.points_m[:, 0] - camera.mount_T_cam[0, 3], marking.points_m[:, 1] - camera.mount_T_cam[1, 3]
-    slope, offset = np.polyfit(x, y, 1)
-    return bool(abs(slope) > UPRIGHT_SLOPE and abs(offset) < UPRIGHT_OFFSET_M)
 
 
 def _seen_rows(found: PictureMarkings) -> float:
@@ -450,39 +412,26 @@ def _make_parallel(found: PictureMarkings, image_bgr: Image, height_m: float) ->
     the line y = a + b x becomes y = a + (b + a d / (f h)) x. So b grows by a line with a.
     """
     camera = found.camera
-    rows = [row for m in found.markings if m.is_lane_line and (row := _offset_and_slope(m.points_m)) is not None]
+    rows = []  # offset and slope of lines where they pass the camera, and their weights
+    for x, y in (m.points_m[:, :2].T for m in found.markings if m.is_lane_line):
+        span = float(np.ptp(x))
+        if span >= max(MIN_LINE_M, 3 * np.ptp(y)):
+            # A bend at least as long as the line reaches beyond it would be uncertain.
+            fit = np.polyfit(x, y, 2 if span > 25 and x.min() < 15 else 1)
+            rows.append((float(fit[-1]), float(fit[-2]), span))
     if len(rows) < 2:
         return None
     a, b, w = np.array(rows).T
     if np.ptp(a) < MIN_APART_M:
         return None
-    rate, level = _robust_line(a, b, w)
+    # The line through most of them: weighted medians of pairs (Theil and Sen).
+    i, j = np.triu_indices(len(a), 1)
+    apart = np.abs(a[i] - a[j]) >= MIN_APART_M
+    i, j = i[apart], j[apart]
+    rate = weighted_quantile((b[i] - b[j]) / (a[i] - a[j]), w[i] * w[j] * np.abs(a[i] - a[j]), 0.5)
+    level = weighted_quantile(b - rate * a, w, 0.5)
     focal = camera.K[0, 0]
     forward = camera.K @ np.linalg.inv(camera.mount_T_cam[:3, :3]) @ np.array([1.0, level, 0.0])
     limit = MAX_PITCH_STEP_RAD * focal
-    point = (
-        float(forward[0] / forward[2]),
-        float(forward[1] / forward[2] - np.clip(rate * focal * height_m, -limit, limit)),
-    )
-    return _camera_towards(image_bgr, point, height_m)
-
-
-def _robust_line(x: Array, y: Array, weight: Array) -> tuple[float, float]:
-    """Slope and intercept of the line through most of some points: weighted medians of pairs (Theil and Sen)."""
-    i, j = np.triu_indices(len(x), 1)
-    apart = np.abs(x[i] - x[j]) >= MIN_APART_M
-    i, j = i[apart], j[apart]
-    slope = weighted_quantile((y[i] - y[j]) / (x[i] - x[j]), weight[i] * weight[j] * np.abs(x[i] - x[j]), 0.5)
-    return slope, weighted_quantile(y - slope * x, weight, 0.5)
-
-
-def _offset_and_slope(points: Array) -> tuple[float, float, float] | None:
-    """Offset and slope of a line where it passes the camera, and its weight; None for one that is short or across."""
-    x, y = points[:, 0], points[:, 1]
-    span = float(np.ptp(x))
-    if span < MIN_LINE_M or span < 3 * np.ptp(y):
-        return None
-    # A bend at least as long as the line reaches beyond it would be uncertain.
-    degree = 2 if span > 25 and x.min() < 15 else 1
-    fit = np.polyfit(x, y, degree)
-    return float(fit[-1]), float(fit[-2]), span
+    u, v = forward[:2] / forward[2]
+    return _camera_towards(image_bgr, (float(u), float(v - np.clip(rate * focal * height_m, -limit, limit))), height_m)

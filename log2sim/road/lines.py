@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, wrap_angle
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.paint import Pieces, log_odds_of_line
 from log2sim.road.ridges import Mask
-from log2sim.road.strokes import Curve, Stretch, Trace, fit_curve, stretches_of, trace
+from log2sim.road.strokes import Curve, fit_curve, stretches_of, trace
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
 # The longest gaps of dashed lines are 12 m (Germany: 12 m at 6 m dashes; MUTCD: 30 ft = 9.1 m; UK: 7 m; Japan: 12 m).
@@ -84,9 +85,8 @@ def _beside(pieces: Pieces, end: int, inner: int) -> bool:
     angle = pieces.direction[inner]
     offset = pieces.xy[end] - pieces.xy[inner]
     turn = abs((pieces.direction[end] - angle + np.pi / 2) % np.pi - np.pi / 2)
-    return bool(
-        abs(offset[1] * np.cos(angle) - offset[0] * np.sin(angle)) > 1.2 * POSITION_SIGMA_M or turn > MAX_END_TURN_RAD
-    )
+    across_m = abs(offset[1] * np.cos(angle) - offset[0] * np.sin(angle))
+    return bool(across_m > 1.2 * POSITION_SIGMA_M or turn > MAX_END_TURN_RAD)
 
 
 def dashed_chains(pieces: Pieces, chains: list[Chain]) -> list[Chain]:
@@ -106,25 +106,13 @@ def _join(
     ends = _ends_of(pieces, chains, base_m)
     first, second, cost = _candidates(ends, max_gap_m, min_radius_m)
     partner: dict[int, int] = {}
-    root = list(range(len(chains)))
-
-    def find(k: int) -> int:
-        while root[k] != k:
-            root[k] = root[root[k]]
-            k = root[k]
-        return k
-
+    joined = DisjointSet(range(len(chains)))
     for k in np.argsort(cost, kind="stable"):
         a, b = int(first[k]), int(second[k])
         # A ring stays open at one place, as a line has two ends.
-        if a not in partner and b not in partner and find(a // 2) != find(b // 2):
+        if a not in partner and b not in partner and joined.merge(a // 2, b // 2):
             partner[a], partner[b] = b, a
-            root[find(a // 2)] = find(b // 2)
-    return _assemble(chains, partner)
-
-
-def _assemble(chains: list[Chain], partner: dict[int, int]) -> list[Chain]:
-    """Walk from every free end to the other one."""
+    # From every free end to the other one.
     done, out = set(), []
     for start in range(2 * len(chains)):
         if start // 2 in done or start in partner:
@@ -172,13 +160,9 @@ def _ends_of_single(pieces: Pieces, chains: list[Chain], contrasts: Array) -> _E
     length = np.hypot(chord[:, 0], chord[:, 1])
     # First the end at which the piece begins, from which it points backwards.
     outward = np.stack([np.arctan2(-chord[:, 1], -chord[:, 0]), np.arctan2(chord[:, 1], chord[:, 0])], axis=1)
-    sigma, width, contrast, length = (
-        np.repeat(values, 2)
-        for values in (
-            POSITION_SIGMA_M * 2 / np.maximum(length, 0.3), pieces.width_m[member], contrasts[member], length
-        )
-    )  # fmt: skip
-    return _Ends(ends.reshape(-1, 2), outward.ravel(), sigma, width, contrast, length)
+    sigma = POSITION_SIGMA_M * 2 / np.maximum(length, 0.3)
+    both = (np.repeat(values, 2) for values in (sigma, pieces.width_m[member], contrasts[member], length))
+    return _Ends(ends.reshape(-1, 2), outward.ravel(), *both)
 
 
 def _direction(points: Array) -> tuple[float, float]:
@@ -204,7 +188,7 @@ def _candidates(
     keep = a // 2 != b // 2
     a, b = a[keep], b[keep]
     out_a, in_b = ends.outward[a], ends.outward[b] + np.pi
-    turn = _wrapped(in_b - out_a)
+    turn = wrap_angle(in_b - out_a)
     mean = out_a + turn / 2
     chord = ends.xy[b] - ends.xy[a]
     gap = chord[:, 0] * np.cos(mean) + chord[:, 1] * np.sin(mean)
@@ -231,10 +215,6 @@ def _alike_chains(values: Array, a: NDArray[np.int64], b: NDArray[np.int64], rat
     return np.asarray(np.maximum(values[a], values[b]) <= ratio * np.minimum(values[a], values[b]))
 
 
-def _wrapped(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
-
-
 MIN_LINE_M = 1.0
 # Contrast of yellowness: paint is 0.5 to 1.2 in daylight, gray and white are below 0.1.
 MIN_YELLOW = 0.2
@@ -257,7 +237,6 @@ class PaintedLine:
     kind: str  # "solid" or "dashed"
     width_m: float
     pieces: Pieces  # what shows it
-    painted_m: float  # length with paint
     dashes: int
     log_odds: float  # that it is a marking
 
@@ -265,16 +244,6 @@ class PaintedLine:
     def length_m(self) -> float:
         """Length from end to end."""
         return float(np.linalg.norm(np.diff(self.xy, axis=0), axis=1).sum())
-
-    @property
-    def color(self) -> str | None:
-        """White or yellow; None where no camera saw it."""
-        return color_of(self.pieces)
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Sensors that show it."""
-        return sources_of(self.pieces)
 
 
 def color_of(pieces: Pieces) -> str | None:
@@ -305,28 +274,18 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             continue
         own = pieces.take(chain.members)
         curve = fit_curve(corners)
-        width = float(np.median(own.width_m))
-        traced = trace(ground, curve, width)
+        traced, s = trace(ground, curve, float(np.median(own.width_m))), curve.s
+        nearest = s[cKDTree(curve.xy).query(own.xy)[1]]
         for stretch in stretches_of(traced.strokes()):
-            line = _line_of(curve, own, stretch, traced)
-            if line is not None:
-                out.append(line)
+            begin, end = stretch.begin_m, min(stretch.end_m, float(s[-1]))
+            member = own.take((nearest > begin - 1.0) & (nearest < stretch.end_m + 1.0))
+            if not len(member) or end - begin < MIN_LINE_M:
+                continue
+            xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
+            odds = log_odds_of_line(member, traced.painted_m(begin, end), dashes=stretch.dashes)
+            width_m = float(np.median(member.width_m))
+            out.append(PaintedLine(xy, stretch.kind, width_m, member, stretch.dashes, odds))
     return _in_context(drop_repeats(out))
-
-
-def _line_of(curve: Curve, pieces: Pieces, stretch: Stretch, traced: Trace) -> PaintedLine | None:
-    s = curve.s
-    nearest = s[cKDTree(curve.xy).query(pieces.xy)[1]]
-    member = (nearest > stretch.begin_m - 1.0) & (nearest < stretch.end_m + 1.0)
-    end = min(stretch.end_m, float(s[-1]))
-    if not member.any() or end - stretch.begin_m < MIN_LINE_M:
-        return None
-    inner = s[(s > stretch.begin_m + 0.1) & (s < end - 0.1)]
-    xy = curve.at(np.concatenate([[stretch.begin_m], inner, [end]]))
-    own = pieces.take(member)
-    painted_m = traced.painted_m(stretch.begin_m, end)
-    odds = log_odds_of_line(own, painted_m, dashes=stretch.dashes)
-    return PaintedLine(xy, stretch.kind, float(np.median(own.width_m)), own, painted_m, stretch.dashes, odds)
 
 
 def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
@@ -361,7 +320,9 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     dense = [_dense(line.xy)[::5] for line in lines]
     owner = np.repeat(np.arange(len(lines)), [len(d) for d in dense])
     points = np.concatenate(dense)
-    heading = np.concatenate([_headings(d) for d in dense])
+    steps = [np.gradient(d, axis=0) if len(d) > 1 else np.tile([1.0, 0.0], (len(d), 1)) for d in dense]
+    dx, dy = np.concatenate(steps).T
+    heading = np.arctan2(dy, dx) % np.pi
     pairs = cKDTree(points).query_pairs(BESIDE_M[1], output_type="ndarray")
     a, b = np.concatenate([pairs, pairs[:, ::-1]]).T
     a, b = a[owner[a] != owner[b]], b[owner[a] != owner[b]]
@@ -403,10 +364,3 @@ def _alike(lines: list[PaintedLine], contrast: Array, one: NDArray[np.intp], oth
     same = np.maximum(width[one], width[other]) <= 2 * np.minimum(width[one], width[other])
     same &= np.maximum(contrast[one], contrast[other]) <= 2 * np.minimum(contrast[one], contrast[other])
     return np.asarray(same & (odds[other] > odds[one] - 2))
-
-
-def _headings(points: Array) -> Array:
-    if len(points) < 2:
-        return np.zeros(len(points))
-    d = np.gradient(points, axis=0)
-    return np.asarray(np.arctan2(d[:, 1], d[:, 0]) % np.pi)

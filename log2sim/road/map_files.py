@@ -5,7 +5,6 @@ After OGC GeoTIFF 1.1 (19-008r4): sections 7.1 (layout of the key directory) and
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -75,20 +74,14 @@ def geokeys_of(frame: MapFrame) -> GeoKeys:
     method, keys = METHODS[operation.method_name]
     parameters = {keys[p.code]: float(p.value) for p in operation.params if p.code in keys}
     projected = {PROJECTED_TYPE: USER_DEFINED, PROJECTION: USER_DEFINED, METHOD: method, LINEAR_UNITS: METERS}
-    return _directory({**base, **_geographic(crs), **projected, **parameters})
-
-
-def _geographic(crs: Any) -> dict[int, int | float | str]:
-    """Keys of the ellipsoid; WGS 84 where that is the datum or the ellipsoid of an unnamed one."""
-    body = crs.ellipsoid
-    if "WGS 84" in body.name or "WGS84" in body.name:
-        return {GEOGRAPHIC_TYPE: WGS84}
+    body: Any = crs.ellipsoid
+    if "WGS 84" in body.name or "WGS84" in body.name:  # the datum, or the ellipsoid of an unnamed one
+        return _directory({**base, GEOGRAPHIC_TYPE: WGS84, **projected, **parameters})
     round_one = body.inverse_flattening == 0
     shape = {SEMI_MINOR: body.semi_minor_metre} if round_one else {INVERSE_FLATTENING: body.inverse_flattening}
-    return {
-        GEOGRAPHIC_TYPE: USER_DEFINED, DATUM: USER_DEFINED, ANGULAR_UNITS: DEGREES, ELLIPSOID: USER_DEFINED,
-        SEMI_MAJOR: float(body.semi_major_metre), **{k: float(v) for k, v in shape.items()},
-    }  # fmt: skip
+    geographic = {GEOGRAPHIC_TYPE: USER_DEFINED, DATUM: USER_DEFINED, ANGULAR_UNITS: DEGREES, ELLIPSOID: USER_DEFINED}
+    shape = {SEMI_MAJOR: float(body.semi_major_metre)} | {k: float(v) for k, v in shape.items()}
+    return _directory({**base, **geographic, **shape, **projected, **parameters})
 
 
 def _directory(keys: dict[int, int | float | str], problem: str | None = None) -> GeoKeys:
@@ -145,16 +138,16 @@ def write_map(
     """
     check_name(path)
     refuse_existing(path, overwrite=overwrite)
-    encode: dict[str, Callable[[], bytes]] = {
-        ".png": lambda: _encode(".png", _png_values(ground, layer)),
-        ".jpg": lambda: _encode(".jpg", on_white(ground, layer)),
-    }
-    suffix = {".jpeg": ".jpg", ".tiff": ".tif"}.get(path.suffix.lower(), path.suffix.lower())
+    suffix = path.suffix.lower()
     with replaced(path) as temporary:
-        if suffix == ".tif":
+        if suffix in (".tif", ".tiff"):
             _write_geotiff(ground, temporary, layer, frame or MapFrame())
-        else:
-            temporary.write_bytes(encode[suffix]())
+            return
+        image = _png_values(ground, layer) if suffix == ".png" else on_white(ground, layer)
+        done, data = cv2.imencode(suffix, image)
+        if not done:
+            raise ConfigError(f"OpenCV cannot encode a picture of {image.shape[1]} x {image.shape[0]} px as {suffix}")
+        temporary.write_bytes(data.tobytes())
 
 
 def write_world_file(ground: GroundMap, path: Path, frame: MapFrame, *, overwrite: bool = False) -> None:
@@ -176,7 +169,11 @@ def known_cells(ground: GroundMap, layer: Layer) -> NDArray[np.bool_]:
 def on_white(ground: GroundMap, layer: Layer) -> NDArray[np.uint8]:
     """Return a layer as a picture (R, C) or (R, C, 3) on white."""
     if layer != "color":
-        values = ground.intensity if layer == "intensity" else _spread(ground.height_m)
+        values = ground.intensity if layer == "intensity" else ground.height_m
+        if layer == "height" and np.isfinite(values).any():
+            # From 0, the lowest, to 1, the highest, without the last hundredth of both.
+            low, high = np.percentile(values[np.isfinite(values)], [1, 99])
+            values = np.clip((values - low) / max(high - low, HEIGHT_STEP_M), 0, 1).astype(np.float32)
         return np.where(np.isfinite(values), np.rint(255 * np.nan_to_num(values)), 255).astype(np.uint8)
     alpha = ground.alpha[..., None].astype(np.float32) / 255
     return np.asarray(np.rint(ground.color_bgr * alpha + 255 * (1 - alpha)).astype(np.uint8))
@@ -220,15 +217,6 @@ def _read_world_file(path: Path) -> tuple[float, float, float]:
     return d, x, y
 
 
-def _spread(height_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Heights from 0, the lowest, to 1, the highest, without the last hundredth of both."""
-    known = height_m[np.isfinite(height_m)]
-    if not len(known):
-        return height_m
-    low, high = np.percentile(known, [1, 99])
-    return np.asarray(np.clip((height_m - low) / max(high - low, HEIGHT_STEP_M), 0, 1), dtype=np.float32)
-
-
 def _png_values(ground: GroundMap, layer: Layer) -> NDArray[Any]:
     if layer == "color":
         return np.dstack([ground.color_bgr, ground.alpha])
@@ -247,13 +235,6 @@ def lowest_m(ground: GroundMap) -> float:
     """Height of the step 1 of a PNG of heights, m: the lowest of the map."""
     known = np.isfinite(ground.height_m)
     return float(ground.height_m[known].min()) if known.any() else 0.0
-
-
-def _encode(suffix: str, image: NDArray[Any]) -> bytes:
-    done, data = cv2.imencode(suffix, image)
-    if not done:
-        raise ConfigError(f"OpenCV cannot encode a picture of {image.shape[1]} x {image.shape[0]} px as {suffix}")
-    return bytes(data.tobytes())
 
 
 def _write_geotiff(ground: GroundMap, path: Path, layer: Layer, frame: MapFrame) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,8 +20,8 @@ from log2sim.road.lines import Chain, PaintedLine, color_of, dashed_chains, find
 from log2sim.road.paint import Pieces, at_height, find_pieces, fit_lines, log_odds_of_line, no_pieces, probability
 from log2sim.road.ridges import (
     Layer,
-    Mask,
     RidgePoints,
+    coarse_means,
     find_ridges,
     log_color,
     log_intensity,
@@ -80,13 +79,23 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
     bars = [(k, bar) for k, chain in enumerate(chains) if (bar := _bar_of(ground, pieces, chain)) is not None]
     if len(bars) < MIN_BARS:
         return [], chains
-    group = _group(_beside([bar for _, bar in bars]))
+    count, group = connected_components(coo_matrix(_beside([bar for _, bar in bars])), directed=False)
     areas, used = [], set()
-    for label in range(int(group.max()) + 1):
+    for label in range(count):
         chosen = [bars[k] for k in np.flatnonzero(group == label)]
-        if len(chosen) >= MIN_BARS:
-            areas.append(_crosswalk(pieces, [bar for _, bar in chosen]))
-            used |= {k for k, _ in chosen}
+        if len(chosen) < MIN_BARS:
+            continue
+        used |= {k for k, _ in chosen}
+        own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
+        lengths = [bar.length_m for _, bar in chosen]
+        odds = log_odds_of_line(own, sum(lengths), dashes=len(chosen), alone=False)
+        if not np.isfinite(own.color).any() and len(chosen) < SURE_BARS:
+            odds += FEW_BARS
+        corners = np.concatenate([_corners(bar) for _, bar in chosen])
+        origin = corners.mean(axis=0)
+        hull = cv2.approxPolyDP(cv2.convexHull((corners - origin).astype(np.float32)), HULL_ERROR_M, True)
+        outline = np.asarray(hull, np.float64).reshape(-1, 2) + origin
+        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, odds))
     return areas, [chain for k, chain in enumerate(chains) if k not in used]
 
 
@@ -117,37 +126,16 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     along, across = np.abs(offset[..., 0] * c + offset[..., 1] * s), np.abs(offset[..., 1] * c - offset[..., 0] * s)
     shorter = np.minimum(length[:, None], length)
     near = (across >= BAR_STEP_M[0]) & (across <= BAR_STEP_M[1]) & (along <= BARS_IN_LINE * shorter)
-    alike = (np.maximum(width[:, None], width) <= 1.6 * np.minimum(width[:, None], width)) & (
-        np.maximum(length[:, None], length) <= 2.0 * shorter
-    )
+    alike = np.maximum(width[:, None], width) <= 1.6 * np.minimum(width[:, None], width)
+    alike &= np.maximum(length[:, None], length) <= 2.0 * shorter
     beside = near & alike & (turn <= MAX_BAR_TURN_RAD)
     return np.asarray(beside | beside.T)
-
-
-def _group(linked: NDArray[np.bool_]) -> NDArray[np.int32]:
-    return np.asarray(connected_components(coo_matrix(linked), directed=False)[1], np.int32)
-
-
-def _crosswalk(pieces: Pieces, bars: list[_Bar]) -> PaintedArea:
-    corners = np.concatenate([_corners(bar) for bar in bars])
-    own = pieces.take(np.concatenate([bar.members for bar in bars]))
-    odds = log_odds_of_line(own, sum(bar.length_m for bar in bars), dashes=len(bars), alone=False)
-    if not np.isfinite(own.color).any() and len(bars) < SURE_BARS:
-        odds += FEW_BARS
-    return PaintedArea("crosswalk", _hull(corners), float(np.median([bar.length_m for bar in bars])), own, odds)
 
 
 def _corners(bar: _Bar) -> Array:
     d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
     n = np.array([-np.sin(bar.direction), np.cos(bar.direction)]) * bar.width_m / 2
     return np.array([bar.middle + d + n, bar.middle + d - n, bar.middle - d - n, bar.middle - d + n])
-
-
-def _hull(points: Array) -> Array:
-    origin = points.mean(axis=0)
-    hull = cv2.convexHull((points - origin).astype(np.float32))
-    simple = np.asarray(cv2.approxPolyDP(hull, HULL_ERROR_M, True), np.float64)
-    return np.asarray(simple.reshape(-1, 2) + origin)
 
 
 def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[PaintedLine]]:
@@ -157,27 +145,21 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
     for line in lines:
         wide = STOP_WIDTH_M[0] <= line.width_m <= STOP_WIDTH_M[1]
         fits = wide and STOP_LENGTH_M[0] <= line.length_m <= STOP_LENGTH_M[1] and line.dashes < 3
-        angle = _angle_to_lanes(line, [one for one in lanes if one is not line]) if fits else 0.0
+        middle, chord = line.xy.mean(axis=0), line.xy[-1] - line.xy[0]
+        nearest, angle = LANE_LINE_WITHIN_M, None  # of the lane lines; the angle to it in [0, pi / 2]
+        for lane in lanes if fits else ():
+            distance = np.linalg.norm(lane.xy - middle, axis=1)
+            k = int(np.argmin(distance))
+            if lane is not line and distance[k] < nearest:
+                nearest = float(distance[k])
+                tangent = lane.xy[min(k + 1, len(lane.xy) - 1)] - lane.xy[max(k - 1, 0)]
+                cross = chord[0] * tangent[1] - chord[1] * tangent[0]
+                angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
             stops.append(replace(line, log_odds=line.log_odds + (ALONE if angle is None else 0.0)))
         else:
             others.append(line)
     return stops, others
-
-
-def _angle_to_lanes(line: PaintedLine, lanes: list[PaintedLine]) -> float | None:
-    """Angle in [0, pi / 2] to the nearest of the lane lines; None where none is near."""
-    middle, chord = line.xy.mean(axis=0), line.xy[-1] - line.xy[0]
-    best, angle = LANE_LINE_WITHIN_M, None
-    for lane in lanes:
-        distance = np.linalg.norm(lane.xy - middle, axis=1)
-        k = int(np.argmin(distance))
-        if distance[k] < best:
-            best = float(distance[k])
-            tangent = lane.xy[min(k + 1, len(lane.xy) - 1)] - lane.xy[max(k - 1, 0)]
-            cross = chord[0] * tangent[1] - chord[1] * tangent[0]
-            angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
-    return angle
 
 
 def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[PaintedArea], list[PaintedLine]]:
@@ -235,10 +217,8 @@ def _outline_around(ground: GroundMap, line: PaintedLine, xy: Array) -> Array | 
     if area > PLAIN_SHARE * extent.prod() and (extent.min() < 0.3 or extent.max() > PLAIN_ASPECT * extent.min()):
         return None
     simple = cv2.approxPolyDP(contour, OUTLINE_ERROR_M / res, True).reshape(-1, 2).astype(np.float64)
-    outline = np.stack(
-        [x0 + (simple[:, 0] + columns.start + 0.5) * res, y1 - (simple[:, 1] + rows.start + 0.5) * res], 1
-    )
-    return outline if len(outline) >= 3 else None
+    x, y = x0 + (simple[:, 0] + columns.start + 0.5) * res, y1 - (simple[:, 1] + rows.start + 0.5) * res
+    return np.stack([x, y], 1) if len(simple) >= 3 else None
 
 
 CELL_M = 0.2
@@ -281,15 +261,19 @@ def find_borders(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[tupl
     if not lines:
         return (), ("no borders of roads seen: without lane lines it is not known which surface is the road",)
     coarse = _coarsen(ground)
-    road = _road_at(coarse, ground, np.concatenate(lines))
+    around = [xy + shift for xy in lines for shift in ((0.6, 0.6), (-0.6, -0.6), (0.6, -0.6), (-0.6, 0.6))]
+    cells = _cells(coarse, ground, np.concatenate(around))
+    road = np.full(2, np.nan)  # its yellowness and intensity
+    for k in range(2):
+        known = coarse.known[k][cells] > 0
+        if known.any():
+            road[k] = np.median(coarse.values[k][cells][known])
     points = _steps(coarse, ground, road)
     fitted = fit_lines(points, coarse.cell_m)
     pieces = no_pieces(len(fitted), xy=fitted[:, :2], direction=fitted[:, 2], length_m=fitted[:, 3])
     found = [_border_of(coarse, ground, chain.corners(pieces), lines) for chain in touching_chains(pieces)]
     kept = sorted((b for b in found if b is not None), key=lambda b: -b.confidence)
-    named = tuple(
-        RoadBorder(f"border-{k + 1}", b.kind, b.points_m, b.confidence, b.sources) for k, b in enumerate(kept)
-    )
+    named = tuple(replace(border, id=f"border-{k + 1}") for k, border in enumerate(kept))
     return named, () if named else ("no borders of roads seen: the surface does not change beside the lane lines",)
 
 
@@ -297,26 +281,14 @@ def _coarsen(ground: GroundMap) -> _Coarse:
     factor = max(1, round(CELL_M / ground.resolution_m))
     rows, columns = (size // factor for size in ground.alpha.shape)
     part = (slice(rows * factor), slice(columns * factor))
-
-    def mean(values: Callable[[], NDArray[np.float32]], valid: Mask) -> tuple[Layer, Layer]:
-        if not valid.any():
-            return np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
-        size = (columns, rows)
-        share = np.asarray(cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
-        total = cv2.resize(np.where(valid, values(), 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        return np.divide(total, share, out=np.zeros_like(share), where=share > 0), share
-
-    seen, hit, level = (
-        ground.alpha[part] > 0,
-        np.isfinite(ground.intensity[part]),
-        np.isfinite(ground.height_m[part]),
-    )
+    intensity, height_m = ground.intensity[part], ground.height_m[part]
     layers = (
-        mean(lambda: log_color(ground.color_bgr[part])[1] / np.float32(YELLOW_SIGMA), seen),
-        mean(lambda: log_intensity(ground.intensity[part]) / np.float32(INTENSITY_SIGMA), hit),
-        mean(lambda: ground.height_m[part] / np.float32(HEIGHT_SIGMA_M), level),
+        (log_color(ground.color_bgr[part])[1] / np.float32(YELLOW_SIGMA), ground.alpha[part] > 0),
+        (log_intensity(intensity) / np.float32(INTENSITY_SIGMA), np.isfinite(intensity)),
+        (height_m / np.float32(HEIGHT_SIGMA_M), np.isfinite(height_m)),
     )
-    values, known = (np.stack([layer[k] for layer in layers]) for k in (0, 1))
+    means = [coarse_means(values, valid, factor) for values, valid in layers]
+    values, known = (np.stack(column) for column in zip(*means))
     return _Coarse(values, (known > 0).astype(np.float32), factor * ground.resolution_m)
 
 
@@ -325,18 +297,6 @@ def _cells(coarse: _Coarse, ground: GroundMap, xy: Array) -> tuple[NDArray[np.in
     columns = ((xy[:, 0] - ground.extent_m[0]) / coarse.cell_m).astype(np.int64)
     shape = coarse.values.shape[1:]
     return np.clip(rows, 0, shape[0] - 1), np.clip(columns, 0, shape[1] - 1)
-
-
-def _road_at(coarse: _Coarse, ground: GroundMap, on_lines: Array) -> Array:
-    """Yellowness and intensity (2,) of the road: medians around lane lines; NaN where unknown."""
-    around = np.concatenate([on_lines + shift for shift in ((0.6, 0.6), (-0.6, -0.6), (0.6, -0.6), (-0.6, 0.6))])
-    rows, columns = _cells(coarse, ground, around)
-    out = np.full(2, np.nan)
-    for k in range(2):
-        known = coarse.known[k, rows, columns] > 0
-        if known.any():
-            out[k] = np.median(coarse.values[k, rows, columns][known])
-    return out
 
 
 def _steps(coarse: _Coarse, ground: GroundMap, road: Array) -> RidgePoints:
@@ -421,7 +381,12 @@ def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[A
         return None
     curve = fit_curve(corners, sigma_m=coarse.cell_m / 2)
     distance = cKDTree(np.concatenate(lines)).query(curve.xy[::4])[0]
-    steps = _steps_along(coarse, ground, curve.xy, curve.normal)
+    # Steps of each layer across the line, in sigmas, where both sides are known.
+    reach, steps = GAP_M + ACROSS_M / 2, []
+    left, right = (_cells(coarse, ground, curve.xy + side * reach * curve.normal) for side in (1, -1))
+    for values, known in zip(coarse.values, coarse.known):
+        both = np.minimum(known[left], known[right]) > 0
+        steps.append((values[left] - values[right])[both].astype(np.float64))
     by_color, by_lidar, by_height = (float(abs(np.median(s))) if len(s) > 3 else 0.0 for s in steps)
     sigmas = float(_surface_step(np.array(by_color), np.array(by_lidar), np.array(len(steps[1]) > 3)))
     curb = CURB_M[0] <= by_height * HEIGHT_SIGMA_M <= CURB_M[1]
@@ -431,17 +396,6 @@ def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[A
     shown = (("camera", by_color > 1), ("lidar", by_lidar > 1 or curb))
     sources = tuple(name for name, shows in shown if shows)
     return RoadBorder("", "curb" if curb else "edge", at_height(ground, thin(curve.xy)), probability(odds), sources)
-
-
-def _steps_along(coarse: _Coarse, ground: GroundMap, xy: Array, normal: Array) -> list[Array]:
-    """Measure the steps (N,) of each layer across a line, in sigmas, where both sides are known."""
-    reach = GAP_M + ACROSS_M / 2
-    sides = [_cells(coarse, ground, xy + side * reach * normal) for side in (-1, 1)]
-    out = []
-    for values, known in zip(coarse.values, coarse.known):
-        both = np.minimum(*(known[cells] for cells in sides)) > 0
-        out.append((values[sides[1]] - values[sides[0]])[both].astype(np.float64))
-    return out
 
 
 MIN_CONFIDENCE = 0.5  # what is rather not there than there is left out
@@ -462,12 +416,22 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
     bars are crosswalks, and wide strokes across lanes are stop lines (`areas`). Each is rated by both sensors
     (`evidence`). The cost grows with the area that was seen.
     """
+    by_camera, by_lidar = ground.has_color, bool(np.isfinite(ground.intensity).any())
+    if not by_camera and not by_lidar:
+        return (), (), ("no markings seen: no sensor saw the ground",)
     markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_LINE_M)
-    notes = _notes(ground, markings)
-    if not np.any(ground.alpha) and not np.isfinite(ground.intensity).any():
-        return (), (), notes
-    borders, more = find_borders(ground, markings)
-    return markings, borders, (*notes, *more)
+    borders, notes = find_borders(ground, markings)
+    if not markings:
+        notes = ("no markings seen: no paint stands out from the ground", *notes)
+    if not by_lidar:
+        alone = (
+            "markings by cameras only: no LiDAR intensity of the ground; light streaks are harder to tell from paint"
+        )
+        notes = (alone, *notes)
+    if not by_camera:
+        alone = "markings by LiDAR intensity only: no camera saw the ground; their colors are unknown"
+        notes = (alone, *notes)
+    return markings, borders, notes
 
 
 def list_markings(
@@ -481,36 +445,14 @@ def list_markings(
     if symbols:
         small, lines = part_symbols(ground, lines)
         areas += small
-    found = [_marking_of_area(ground, area) for area in areas]
-    found += [_marking_of_line(ground, line, "stop_line") for line in stops]
     long = [line for line in lines if line.kind == "dashed" or line.length_m >= min_line_m]
-    found += [_marking_of_line(ground, line, line.kind) for line in long]
-    markings = sorted((m for m in found if m.confidence >= min_confidence), key=lambda m: -m.confidence)
+    painted: list[tuple[str, Array, PaintedArea | PaintedLine]] = [(area.kind, area.outline, area) for area in areas]
+    painted += [("stop_line", thin(line.xy), line) for line in stops]
+    painted += [(line.kind, thin(line.xy), line) for line in long]
+    found = []
+    for kind, xy, one in painted:
+        shown_by = color_of(one.pieces), probability(one.log_odds), sources_of(one.pieces)
+        if shown_by[1] >= min_confidence:
+            found.append(Marking("", kind, at_height(ground, xy), one.width_m, *shown_by))
+    markings = sorted(found, key=lambda m: -m.confidence)
     return tuple(replace(marking, id=f"marking-{k + 1}") for k, marking in enumerate(markings))
-
-
-def _marking_of_line(ground: GroundMap, line: PaintedLine, kind: str) -> Marking:
-    points = at_height(ground, thin(line.xy))
-    return Marking("", kind, points, line.width_m, line.color, probability(line.log_odds), line.sources)
-
-
-def _marking_of_area(ground: GroundMap, area: PaintedArea) -> Marking:
-    points = at_height(ground, area.outline)
-    shown_by = (color_of(area.pieces), probability(area.log_odds), sources_of(area.pieces))
-    return Marking("", area.kind, points, area.width_m, *shown_by)
-
-
-def _notes(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[str, ...]:
-    notes = []
-    by_camera, by_lidar = bool(np.any(ground.alpha)), bool(np.isfinite(ground.intensity).any())
-    if not by_camera and not by_lidar:
-        return ("no markings seen: no sensor saw the ground",)
-    if not by_camera:
-        notes.append("markings by LiDAR intensity only: no camera saw the ground; their colors are unknown")
-    if not by_lidar:
-        notes.append(
-            "markings by cameras only: no LiDAR intensity of the ground; light streaks are harder to tell from paint"
-        )
-    if not markings:
-        notes.append("no markings seen: no paint stands out from the ground")
-    return tuple(notes)

@@ -58,8 +58,8 @@ class Pieces:
     # where no camera saw it
     color: Array
     color_sigma: Array
-    edge_m: Array  # (N,): length in which the edges rise from a quarter to three quarters of the contrast
     uneven: Array  # (N,): difference of both sides
+    edge_m: Array  # (N,): length in which the edges rise from a quarter to three quarters of the contrast
     # (N,): logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side
     outshines: Array
     yellow: Array  # (N,): contrast of yellowness
@@ -108,34 +108,18 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     left, right, edge = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
     shift, width = (left + right) / 2, right - left
     inside = np.abs(across - shift[:, None]) <= np.maximum(width / 2 - 0.02, 0.03)[:, None]
-    sides = [_side(across, shift, width, side) for side in (-1, 1)]
-    contrast, sigma, uneven = _contrast(samples.paint, inside, sides, one_side=True)
+    # From the edges of the paint outwards, on either side: the road beside it, near and farther.
+    away = [side * (across - shift[:, None]) - width[:, None] / 2 for side in (-1, 1)]
+    sides = [[(distance > low) & (distance < high) for low, high in SIDES_M] for distance in away]
+    by_color = _contrast(samples.paint, inside, sides, one_side=True)
     yellow = _contrast(samples.yellow, inside, sides, one_side=True)[0]
-    intensity, intensity_sigma, _ = _contrast(samples.intensity, inside, sides, one_side=False)
+    by_lidar = _contrast(samples.intensity, inside, sides, one_side=False)
     xy = lines[:, :2] + shift[:, None] * np.stack([-s, c], 1)
-    bright = np.where(inside, color, np.nan)
-    around = [
-        _quiet(
-            np.nanquantile, np.where(side * (across - shift[:, None]) > width[:, None] / 2 + 0.1, color, np.nan), q=0.75
-        )
-        for side in (-1, 1)
-    ]
+    far = [side * (across - shift[:, None]) > width[:, None] / 2 + 0.1 for side in (-1, 1)]
+    around = [_quiet(np.nanquantile, np.where(part, color, np.nan), q=0.75) for part in far]
     # Beside a road there are brighter grounds; the road itself is on one side at least.
-    outshines = _quiet(np.nanmean, bright) - np.fmin(*around)
-    return Pieces(
-        xy,
-        lines[:, 2],
-        lines[:, 3],
-        width,
-        contrast,
-        sigma,
-        edge,
-        uneven,
-        outshines,
-        yellow,
-        intensity,
-        intensity_sigma,
-    )
+    outshines = _quiet(np.nanmean, np.where(inside, color, np.nan)) - np.fmin(*around)
+    return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, edge, outshines, yellow, *by_lidar[:2])
 
 
 def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
@@ -150,36 +134,27 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
 
     The third result is the length in which they fall from three quarters to one.
     """
-    filled, soft = _fill_gaps(profile)
+    # Gaps, where LiDAR hit no cell, are filled from their neighbors; `soft` is blurred, too.
+    known = np.isfinite(profile).astype(np.float64)
+    total, count = cv2.blur(np.nan_to_num(profile), (3, 1)), cv2.blur(known, (3, 1))
+    soft = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    filled = np.where(known > 0, profile, soft)
     near = np.abs(across) <= MAX_SHIFT_M
     peak = np.argmax(np.where(near, soft, -np.inf), axis=1)
-    index = np.arange(len(profile))
-    top = soft[index, peak]
+    top = soft[np.arange(len(profile)), peak]
     # Lines wider than the blur have a flat top: its mean is nearer to the paint than its largest value.
     edges, falls = [], []
     distance = across - across[peak][:, None]
-    roads = [_darkest(soft, (side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1])) for side in (-1, 1)]
+    roads = []
+    for side in (-1, 1):
+        flank = (side * distance > FLANK_M[0]) & (side * distance < FLANK_M[1]) & np.isfinite(soft)
+        roads.append(np.where(flank, soft, np.inf).min(axis=1))
     for side, road, other in zip((-1, 1), roads, roads[::-1]):
-        road = np.where(np.isfinite(road), road, other)
+        road = np.where(np.isfinite(road), road, np.where(np.isfinite(other), other, np.nan))
         high, half, low = (_crossing(filled, peak, road + q * (top - road), side, across) for q in (0.75, 0.5, 0.25))
         edges.append(half)
         falls.append(side * (low - high))
     return edges[0], edges[1], np.fmax(falls[0], falls[1])
-
-
-def _darkest(soft: Array, where: NDArray[np.bool_]) -> Array:
-    """Least value (N,) of profiles (N, P) somewhere; NaN where nothing is known there."""
-    least = np.where(where & np.isfinite(soft), soft, np.inf).min(axis=1)
-    return np.where(np.isfinite(least), least, np.nan)
-
-
-def _fill_gaps(profile: Array) -> tuple[Array, Array]:
-    """Fill gaps of profiles (N, P), where LiDAR hit no cell, from their neighbors; also blur them, without gaps."""
-    known = np.isfinite(profile).astype(np.float64)
-    total, count = cv2.blur(np.nan_to_num(profile), (3, 1)), cv2.blur(known, (3, 1))
-    soft = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
-    soft[count == 0] = np.nan
-    return np.where(known > 0, profile, soft), np.asarray(soft)
 
 
 def _crossing(profile: Array, peak: NDArray[Any], half: Array, side: int, across: Array) -> Array:
@@ -200,35 +175,22 @@ def _crossing(profile: Array, peak: NDArray[Any], half: Array, side: int, across
     return at
 
 
-def _side(across: Array, shift: Array, width: Array, side: int) -> list[NDArray[np.bool_]]:
-    """Masks (N, P) of the road beside the paint, near and farther, on one side."""
-    distance = side * (across - shift[:, None]) - width[:, None] / 2
-    return [np.asarray((distance > low) & (distance < high)) for low, high in SIDES_M]
-
-
 def _contrast(
     values: Layer, inside: NDArray[np.bool_], sides: list[list[NDArray[np.bool_]]], *, one_side: bool
 ) -> tuple[Array, Array, Array]:
     """Contrast (N,) of samples (N, along, across) to the brighter side, its standard error, and the sides' difference."""
-    middle = _masked_mean(values, inside)
-    beside = [_darker([_masked_mean(values, part) for part in side]) for side in sides]
+    middle, beside = _masked_mean(values, inside), []
+    for near, far in ([_masked_mean(values, part) for part in side] for side in sides):
+        # The part whose mean is darker.
+        mean, other = _quiet(np.nanmean, near), _quiet(np.nanmean, far)
+        beside.append(np.where((mean < other)[:, None] | ~np.isfinite(other)[:, None], near, far))
     left, right = (_quiet(np.nanmean, b) for b in beside)
     ridge = middle - np.maximum(*beside)
     count = np.isfinite(ridge).sum(1)
     mean = _quiet(np.nanmean, middle) - (np.fmax if one_side else np.maximum)(left, right)
     sigma = _quiet(np.nanstd, ridge) / np.sqrt(np.maximum(count - 1, 1))
-    enough = count >= 3
-    return (
-        np.where(enough, mean, np.nan),
-        np.where(enough, sigma, np.nan),
-        np.where(enough, np.abs(left - right), np.nan),
-    )
-
-
-def _darker(parts: list[Array]) -> Array:
-    """Choose, for each profile, that of two parts (N, along) whose mean is darker."""
-    means = [_quiet(np.nanmean, part) for part in parts]
-    return np.where((means[0] < means[1])[:, None] | ~np.isfinite(means[1])[:, None], parts[0], parts[1])
+    contrast, error, uneven = (np.where(count >= 3, v, np.nan) for v in (mean, sigma, np.abs(left - right)))
+    return contrast, error, uneven
 
 
 def _masked_mean(values: Layer, mask: NDArray[Any]) -> Array:
@@ -268,15 +230,20 @@ def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bo
     """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
     odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
     odds += DASHES * min(max(dashes - 2, 0), 2) / 2
-    by_camera = _median_known(pieces.color)
-    if np.isfinite(by_camera):
+    by_camera = bool(np.isfinite(pieces.color).any())
+    if by_camera:
         odds += _by_shape(pieces, alone=alone)
-    odds += _by_width(pieces)
-    if alone and dashes > 1 and np.median(pieces.width_m) > MAX_DASH_WIDTH_M:
+    width = float(np.median(pieces.width_m))
+    by_width = 0.0 if MIN_WIDTH_M <= width <= MAX_WIDTH_M else WIDTH_UNUSUAL
+    if len(pieces) >= 3:
+        varies = float(np.median(np.abs(pieces.width_m - width))) / width
+        by_width += WIDTH_VARIES * float(np.clip((varies - 0.2) / 0.3, 0, 1))
+    odds += by_width
+    if alone and dashes > 1 and width > MAX_DASH_WIDTH_M:
         odds += WIDE_DASHES
     odds = min(odds, MAX_BY_CAMERA)
     lidar = by_lidar(pieces)
-    if np.isfinite(by_camera):
+    if by_camera:
         return odds + lidar
     # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen.
     return min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
@@ -296,15 +263,6 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
         odds += FADING
     typical = _median_known(pieces.color)
     return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
-
-
-def _by_width(pieces: Pieces) -> float:
-    middle = float(np.median(pieces.width_m))
-    odds = 0.0 if MIN_WIDTH_M <= middle <= MAX_WIDTH_M else WIDTH_UNUSUAL
-    if len(pieces) >= 3:
-        varies = float(np.median(np.abs(pieces.width_m - middle))) / middle
-        odds += WIDTH_VARIES * float(np.clip((varies - 0.2) / 0.3, 0, 1))
-    return odds
 
 
 def by_lidar(pieces: Pieces) -> float:

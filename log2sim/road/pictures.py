@@ -33,18 +33,14 @@ def sample_at(
     for k in range(highest + 1):
         chosen = np.flatnonzero(level == k)
         if len(chosen):
-            out[chosen] = _sample(image, u[chosen] * np.float32(0.5**k), v[chosen] * np.float32(0.5**k))
+            # In rows, since OpenCV takes no longer ones.
+            rows = -(-len(chosen) // SAMPLES_A_ROW), SAMPLES_A_ROW
+            at = [np.resize(a[chosen] * np.float32(0.5**k), rows) for a in (u, v)]
+            seen = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            out[chosen] = seen.reshape(-1, 3)[: len(chosen)]
         if k < highest:
             image = np.asarray(cv2.pyrDown(image), dtype=np.uint8)
     return out
-
-
-def _sample(image: Image, u: NDArray[np.float32], v: NDArray[np.float32]) -> Image:
-    """Interpolate colors (N, 3) at pixels (N,); they are put into rows, since OpenCV takes no longer ones."""
-    rows = -(-len(u) // SAMPLES_A_ROW)
-    at = [np.resize(a, (rows, SAMPLES_A_ROW)) for a in (u, v)]
-    seen = cv2.remap(image, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(seen, dtype=np.uint8).reshape(-1, 3)[: len(u)]
 
 
 # Cells longer than this under one pixel are left out: four times the width of a lane marking.
@@ -113,17 +109,14 @@ def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster, coarses
     window = _window(view, surface, z0_m, coarsest_m)
     if window is None:
         return None
-    rows, columns = window
     every = [np.arange(k.start, k.stop) for k in window]
     uv, depth, usable = _project_nodes(view, surface, z0_m, every[0], every[1])
     factor = round(surface.raster.resolution_m / raster.resolution_m)
     scale, opacity = _quality(view.camera, uv, usable, factor, coarsest_m / raster.resolution_m)
     if not opacity.any():
         return None
-    shape = (
-        min(rows.stop * factor, raster.shape[0]) - rows.start * factor,
-        min(columns.stop * factor, raster.shape[1]) - columns.start * factor,
-    )
+    row, column = (k.start * factor for k in window)
+    shape = min(window[0].stop * factor, raster.shape[0]) - row, min(window[1].stop * factor, raster.shape[1]) - column
     fine_opacity = upsample(opacity, factor, shape)
     seen = np.flatnonzero(fine_opacity > MIN_OPACITY)
     nodes = np.where(np.isfinite(uv), uv, -1e4).astype(np.float32)
@@ -131,8 +124,7 @@ def warp_onto(view: View, surface: Surface, z0_m: float, raster: Raster, coarses
         upsample(np.ascontiguousarray(layer, np.float32), factor, shape).ravel().take(seen)
         for layer in (nodes[..., 0], nodes[..., 1], scale, depth)
     )
-    corner = rows.start * factor * raster.shape[1] + columns.start * factor
-    cell = seen // shape[1] * raster.shape[1] + seen % shape[1] + corner
+    cell = seen // shape[1] * raster.shape[1] + seen % shape[1] + row * raster.shape[1] + column
     return Warp(cell, u, v, fine_scale, fine_opacity.ravel().take(seen), fine_depth)
 
 
@@ -153,11 +145,11 @@ def _window(view: View, surface: Surface, z0_m: float, coarsest_m: float) -> tup
     _, _, usable = _project_nodes(view, surface, z0_m, nodes[0], nodes[1])
     if not usable.any():
         return None
-    found = [nodes[axis][usable.any(axis=1 - axis)] for axis in (0, 1)]
-    spans = [
-        slice(max(int(k[0]) - PROBE_STEP, a), min(int(k[-1]) + PROBE_STEP, b)) for k, a, b in zip(found, low, high)
-    ]
-    return spans[0], spans[1]
+    found = [nodes[axis][usable.any(axis=1 - axis)][[0, -1]].tolist() for axis in (0, 1)]
+    rows, columns = (
+        slice(max(first - PROBE_STEP, a), min(last + PROBE_STEP, b)) for (first, last), a, b in zip(found, low, high)
+    )
+    return rows, columns
 
 
 def _project_nodes(
@@ -268,13 +260,7 @@ class ColorRaster:
             color[..., k] = np.clip(np.rint(mean), 0, 255)
         return color, np.where(seen, np.maximum(self._opacity, 1), 0).astype(np.uint8)
 
-    def _gain(
-        self,
-        camera: str,
-        color: NDArray[np.float32],
-        weight: NDArray[np.float32],
-        warp: Warp,
-    ) -> Array:
+    def _gain(self, camera: str, color: NDArray[np.float32], weight: NDArray[np.float32], warp: Warp) -> Array:
         """Gains (3,) of a picture's channels that fit it to what is mapped so far."""
         cell, width = warp.cell, self.raster.shape[1]
         some = np.flatnonzero((warp.opacity > MIN_COMMON_OPACITY) & (weight > 0))

@@ -48,11 +48,6 @@ class CoarseTile:
     origin: tuple[int, int]  # (int, int): row and column of the coarse map at which the tile begins
 
 
-def coarse_factor(ground: GroundMap) -> int:
-    """Count the cells of a map along the edge of a coarse one."""
-    return max(1, round(COARSE_M / ground.resolution_m))
-
-
 def log_color(bgr: NDArray[np.uint8]) -> tuple[Layer, Layer]:
     """Compute brightness and yellowness (...,) of colors (..., 3), as logarithms of ratios of pixel values."""
     b, g, r = (bgr[..., k].astype(np.float32) + np.float32(DARK_LEVEL) for k in range(3))
@@ -71,9 +66,8 @@ def log_intensity(intensity: NDArray[np.floating]) -> Layer:
     return np.asarray(np.log(np.maximum(intensity, 0) + np.float32(DARK_INTENSITY)), np.float32)
 
 
-def iterate_tiles(ground: GroundMap, margin_cells: int) -> Iterator[CoarseTile]:
-    """Yield the parts of a map that some sensor saw."""
-    factor = coarse_factor(ground)
+def iterate_tiles(ground: GroundMap, factor: int, margin_cells: int) -> Iterator[CoarseTile]:
+    """Yield the parts of a map that some sensor saw, in cells `factor` times as long."""
     rows, columns = (size // factor for size in ground.alpha.shape)
     for r in range(0, rows, TILE_CELLS):
         for c in range(0, columns, TILE_CELLS):
@@ -88,28 +82,22 @@ def iterate_tiles(ground: GroundMap, margin_cells: int) -> Iterator[CoarseTile]:
                 paint, seen, peak, dip, intensity, share = (nothing,) * 6
                 if by_camera:
                     values = log_paint(ground.color_bgr[fine])
-                    paint, seen = _coarse(values, alpha, factor)
-                    peak, dip = _extremes(values, alpha, factor)
+                    paint, seen = coarse_means(values, alpha, factor)
+                    parts = [(slice(i, None, factor), slice(j, None, factor)) for i, j in np.ndindex(factor, factor)]
+                    peak = np.max([np.where(alpha[part], values[part], -np.inf) for part in parts], axis=0)
+                    dip = np.min([np.where(alpha[part], values[part], np.inf) for part in parts], axis=0)
+                    peak, dip = (np.where(seen > 0, layer, 0).astype(np.float32) for layer in (peak, dip))
                 if by_lidar:
-                    intensity, share = _coarse(log_intensity(ground.intensity[fine]), hit, factor)
+                    intensity, share = coarse_means(log_intensity(ground.intensity[fine]), hit, factor)
                 yield CoarseTile(paint, peak, dip, seen, intensity, (share > 0).astype(np.float32), core, (r0, c0))
 
 
-def _coarse(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
-    """Average valid values in squares of cells; the second result is the share that is valid."""
+def coarse_means(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
+    """Average valid values (R, C) in squares of `factor` cells along an edge; the second result is the share that is valid."""
     size = (values.shape[1] // factor, values.shape[0] // factor)
     share = np.asarray(cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
     total = cv2.resize(np.where(valid, values, 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.divide(total, share, out=np.zeros_like(share), where=share > 0), share
-
-
-def _extremes(values: Layer, valid: Mask, factor: int) -> tuple[Layer, Layer]:
-    """Take the largest and the least valid value in squares of cells, 0 where there is none."""
-    corners = [(slice(i, None, factor), slice(j, None, factor)) for i in range(factor) for j in range(factor)]
-    high = np.max([np.where(valid[c], values[c], -np.inf) for c in corners], axis=0)
-    low = np.min([np.where(valid[c], values[c], np.inf) for c in corners], axis=0)
-    known = np.isfinite(high)
-    return np.where(known, high, 0).astype(np.float32), np.where(known, low, 0).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,28 +168,19 @@ class RidgePoints:
 
 def find_ridges(ground: GroundMap) -> RidgePoints:
     """Find points on ridges of color, LiDAR intensity, or both together."""
-    cell = ground.resolution_m * coarse_factor(ground)
-    margin = round(MARGIN_M / cell)
-    found = [_ridges_of(tile, cell) for tile in iterate_tiles(ground, margin)]
-    points = np.concatenate([np.zeros((0, 4)), *found])
+    factor = max(1, round(COARSE_M / ground.resolution_m))
+    cell = ground.resolution_m * factor
+    found = [np.zeros((0, 4))]  # column, row, direction and strength, in cells of the coarse map
+    for tile in iterate_tiles(ground, factor, round(MARGIN_M / cell)):
+        response, direction, noise = _respond(_join(tile, cell), cell)
+        # What is so bright is looked at however rough its surroundings are; intensities of grass are as bright.
+        noise = np.where(tile.seen > MIN_SEEN, np.minimum(noise, CLEAR_CONTRAST / MIN_SIGMAS), noise)
+        found.append(_crests(response / noise, direction, tile) + np.array([tile.origin[1], tile.origin[0], 0, 0]))
+    points = np.concatenate(found)
     if len(points) > MAX_POINTS:
         points = points[np.argsort(-points[:, 3], kind="stable")[:MAX_POINTS]]
-    xy = np.stack(
-        [ground.extent_m[0] + (points[:, 0] + 0.5) * cell, ground.extent_m[3] - (points[:, 1] + 0.5) * cell], 1
-    )
-    return RidgePoints(xy, points[:, 2], points[:, 3])
-
-
-def _ridges_of(tile: CoarseTile, cell_m: float) -> Array:
-    """List column, row, direction and strength (N, 4) of ridge points of a tile, in cells of the coarse map."""
-    layers = _join(tile, cell_m)
-    response, direction, noise = _respond(layers, cell_m)
-    # What is so bright is looked at however rough its surroundings are; intensities of grass are as bright.
-    noise = np.where(tile.seen > MIN_SEEN, np.minimum(noise, CLEAR_CONTRAST / MIN_SIGMAS), noise)
-    found = _crests(response / noise, direction, tile)
-    found[:, 0] += tile.origin[1]
-    found[:, 1] += tile.origin[0]
-    return found
+    x, y = ground.extent_m[0] + (points[:, 0] + 0.5) * cell, ground.extent_m[3] - (points[:, 1] + 0.5) * cell
+    return RidgePoints(np.stack([x, y], 1), points[:, 2], points[:, 3])
 
 
 def _join(tile: CoarseTile, cell_m: float) -> tuple[Layer, Layer, Layer]:
@@ -256,10 +235,15 @@ def _respond(layers: tuple[Layer, Layer, Layer], cell_m: float) -> tuple[Layer, 
         there, back, size = turn_image(flat.shape, np.pi * k / DIRECTIONS)
         # By LiDAR alone all three are one layer, which is warped and blurred once.
         turned = {id(layer): layer for layer in layers}
-        turned = {key: _blur(warp(layer, there, size), _cells(ALONG_M, cell_m), 1) for key, layer in turned.items()}
+        length = _cells(ALONG_M, cell_m), 1
+        turned = {key: cv2.blur(warp(layer, there, size), length) for key, layer in turned.items()}
         along, brightest, darkest = (turned[id(layer)] for layer in layers)
         if k == 0:
-            plain = _mean_contrast(along, brightest, cell_m)
+            # Contrast of ridges of the least width to the mean of both sides, as texture has it, too.
+            flank = cv2.blur(along, (1, _cells(FLANK_M, cell_m)))
+            reach, plain = _reach(WIDTHS_M[0], cell_m), np.zeros_like(along)
+            inner = _middle(along, brightest, WIDTHS_M[0], cell_m)[reach:-reach]
+            plain[reach:-reach] = inner - (flank[: -2 * reach] + flank[2 * reach :]) / 2
             noise = _block_sigma(warp(plain, back, (flat.shape[1], flat.shape[0])), cell_m)
         response = _across(along, brightest, darkest, cell_m)
         response = warp(response, back, (flat.shape[1], flat.shape[0]))
@@ -276,8 +260,11 @@ def warp(image: Layer, matrix: Array, size: tuple[int, int]) -> Layer:
 
 def _across(along: Layer, brightest: Layer, darkest: Layer, cell_m: float) -> Layer:
     """Respond to ridges along the rows by the lesser contrast of the best width; the layers are means along the rows."""
-    best = _narrow(brightest, darkest)
-    flank = _blur(along, 1, _cells(FLANK_M, cell_m))
+    # A line of a cell's width has dark gaps of a cell's width beside it, as between a line and a curb: the darker of the first
+    # and the second cell, as gaps may straddle both.
+    gap, best = np.minimum(darkest[1:], darkest[:-1]), np.zeros_like(brightest)
+    np.maximum(brightest[2:-2] - np.maximum(gap[3:], gap[:-3]), 0, out=best[2:-2])
+    flank = cv2.blur(along, (1, _cells(FLANK_M, cell_m)))
     for width_m in WIDTHS_M:
         reach = _reach(width_m, cell_m)
         contrast = np.maximum(flank[: -2 * reach], flank[2 * reach :])
@@ -286,18 +273,10 @@ def _across(along: Layer, brightest: Layer, darkest: Layer, cell_m: float) -> La
     return best
 
 
-def _mean_contrast(along: Layer, brightest: Layer, cell_m: float) -> Layer:
-    """Contrast of ridges of the least width to the mean of both sides, as texture has it, too."""
-    flank, reach, out = _blur(along, 1, _cells(FLANK_M, cell_m)), _reach(WIDTHS_M[0], cell_m), np.zeros_like(along)
-    inner = _middle(along, brightest, WIDTHS_M[0], cell_m)[reach:-reach]
-    out[reach:-reach] = inner - (flank[: -2 * reach] + flank[2 * reach :]) / 2
-    return out
-
-
 def _middle(along: Layer, brightest: Layer, width_m: float, cell_m: float) -> Layer:
     """Mean over the width of the paint."""
     middle = _cells(width_m, cell_m) | 1
-    return brightest if middle == 1 else _blur(along, 1, middle)
+    return brightest if middle == 1 else np.asarray(cv2.blur(along, (1, middle)), np.float32)
 
 
 def _reach(width_m: float, cell_m: float) -> int:
@@ -307,21 +286,6 @@ def _reach(width_m: float, cell_m: float) -> int:
 
 def _cells(length_m: float, cell_m: float) -> int:
     return max(1, round(length_m / cell_m))
-
-
-def _narrow(brightest: Layer, darkest: Layer) -> Layer:
-    """Respond to a line of a cell's width with dark gaps of a cell's width beside it, as between a line and a curb; else 0."""
-    # The darker of the first and the second cell beside it, as gaps may straddle both.
-    gap = np.minimum(darkest[1:], darkest[:-1])
-    out = np.zeros_like(brightest)
-    contrast = np.maximum(gap[3:], gap[:-3])
-    np.subtract(brightest[2:-2], contrast, out=contrast)
-    np.maximum(contrast, 0, out=out[2:-2])
-    return out
-
-
-def _blur(image: Layer, columns: int, rows: int) -> Layer:
-    return np.asarray(cv2.blur(image, (columns, rows)), np.float32)
 
 
 def turn_image(shape: tuple[int, ...], angle: float) -> tuple[Array, Array, tuple[int, int]]:

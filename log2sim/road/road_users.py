@@ -46,8 +46,14 @@ class RoadUsers:
         self._t_ns = np.unique(np.asarray(t_ns, dtype=np.int64))
         self._agents = [agent for agent in scenario.others if len(agent.waypoints)]
         t_s = (self._t_ns - scenario.t0_ns) / NS_PER_S
-        self._rows = np.stack([_rows_of(agent, t_s) for agent in self._agents], axis=1) if self._agents else None
-        self._ego = _ego_rows(log, self._t_ns)
+        rows = [_rows_of(agent, t_s) for agent in self._agents]
+        self._rows = np.stack(rows, axis=1) if rows else np.zeros((len(t_s), 0, 7))
+        self._ego = np.full((len(self._t_ns), 7), np.nan)
+        if log.ego is not None:
+            map_T_ego, known = log.ego.at(self._t_ns)
+            yaw = np.arctan2(map_T_ego[:, 1, 0], map_T_ego[:, 0, 0])
+            size = np.broadcast_to(np.asarray(log.ego_vehicle.size_m) + 2 * MARGIN_M, (len(yaw), 3))
+            self._ego[known] = np.column_stack([log.ego_centers(map_T_ego), size, yaw])[known]
 
     def inputs(self) -> list[Any]:
         """Return all boxes at all times, and who never moves."""
@@ -55,8 +61,6 @@ class RoadUsers:
 
     def at(self, t_ns: int) -> Boxes:
         """Return the boxes of the agents that are there at one of the times, without the ego's."""
-        if self._rows is None:
-            return Boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         rows = self._rows[int(np.searchsorted(self._t_ns, t_ns))]
         return _boxes_of(rows[np.isfinite(rows).all(axis=1)])
 
@@ -67,10 +71,8 @@ class RoadUsers:
 
     def standing(self) -> Boxes:
         """Return the boxes of the agents that never move."""
-        rows = np.zeros((0, 7)) if self._rows is None else self._rows
-        chosen = [k for k, agent in enumerate(self._agents) if agent.static]
-        first = [rows[np.isfinite(rows[:, k]).all(axis=1)][:1, k] for k in chosen]
-        return _boxes_of(np.concatenate(first) if first else np.zeros((0, 7)))
+        rows = [np.zeros((0, 7)), *(self._rows[:, k] for k, agent in enumerate(self._agents) if agent.static)]
+        return _boxes_of(np.concatenate([own[np.isfinite(own).all(axis=1)][:1] for own in rows]))
 
 
 def _rows_of(agent: Agent, t_s: Array) -> Array:
@@ -86,16 +88,6 @@ def _rows_of(agent: Agent, t_s: Array) -> Array:
         place = np.stack([states.x_m, states.y_m, states.z_m, states.yaw_rad], axis=1)
     size = np.asarray(agent.size_m) + 2 * margin[:, None] * [1, 1, 0] + [0, 0, MARGIN_M]
     return np.column_stack([place[:, :3], size, place[:, 3]])
-
-
-def _ego_rows(log: Log, t_ns: NDArray[np.int64]) -> Array:
-    rows = np.full((len(t_ns), 7), np.nan)
-    if log.ego is not None:
-        map_T_ego, known = log.ego.at(t_ns)
-        yaw = np.arctan2(map_T_ego[:, 1, 0], map_T_ego[:, 0, 0])
-        size = np.broadcast_to(np.asarray(log.ego_vehicle.size_m) + 2 * MARGIN_M, (len(t_ns), 3))
-        rows[known] = np.column_stack([log.ego_centers(map_T_ego), size, yaw])[known]
-    return rows
 
 
 def _boxes_of(rows: Array) -> Boxes:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from log2sim.geometry import SPACING_M, Array, Polyline, wrap_angle
+from log2sim.geometry import SPACING_M, Array, Polyline
 from log2sim.road.driven_paths import ENTER_M, MAX_TURN_RAD, SHORT_M, STAY_M, DrivenPath, Match, Run, match
 
 # Stations at which distances are taken.
@@ -41,8 +40,16 @@ def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
         points, heading = line.at(s)[:, :2], line.heading_at(s)
         candidates = []
         for j, other in enumerate(lines):
-            if i != j and line.is_near(other, MAX_APART_M):
-                candidates += [(j, same, *_next_to(points, heading, other, same)) for same in (True, False)]
+            if i == j or not line.is_near(other, MAX_APART_M):
+                continue
+            for same in (True, False):
+                at = other.project(points, heading if same else heading + np.pi)
+                apart = np.abs(at.aside_m)
+                good = (
+                    at.inside & (np.abs(at.turn_rad) <= PARALLEL_RAD) & (apart >= MIN_APART_M) & (apart <= MAX_APART_M)
+                )
+                aside = -at.aside_m if same else at.aside_m
+                candidates.append((j, same, np.where(good, at.s_m, np.nan), np.where(good, aside, np.nan)))
         for sign in (1, -1):
             found += _nearest(i, s, [c for c in candidates if np.any(sign * c[3] > 0)], sign)
     return found
@@ -63,17 +70,6 @@ def _stations(line: Polyline, lines: Sequence[Polyline]) -> Array:
     return np.unique(np.round(np.concatenate([s, at, at - 1e-3, at + 1e-3]).clip(0.0, line.length_m), 6))
 
 
-def _next_to(points: Array, heading: Array, other: Polyline, same: bool) -> tuple[Array, Array]:
-    """Stations on another polyline (K,) and its offset (K,) to the left of the points; NaN where it is not beside them."""
-    at = other.project(points, heading if same else heading + np.pi)
-    turn = np.abs(wrap_angle(at.turn_rad))
-    good = (
-        at.inside & (turn <= PARALLEL_RAD) & (np.abs(at.aside_m) >= MIN_APART_M) & (np.abs(at.aside_m) <= MAX_APART_M)
-    )
-    aside = -at.aside_m if same else at.aside_m
-    return np.where(good, at.s_m, np.nan), np.where(good, aside, np.nan)
-
-
 def _nearest(route: int, s: Array, candidates: list[tuple[int, bool, Array, Array]], sign: int) -> list[Beside]:
     """Return the stretches of the nearest of candidates on one side."""
     if not candidates:
@@ -84,17 +80,12 @@ def _nearest(route: int, s: Array, candidates: list[tuple[int, bool, Array, Arra
     found = []
     for k, (other, same, other_s, offset) in enumerate(candidates):
         rows = np.flatnonzero(best == k)
-        long = [run for run in _stretches(rows, other_s) if s[run[-1]] - s[run[0]] >= MIN_LENGTH_M]
+        # Cut where one is missing or the other's station jumps.
+        cut = (np.diff(rows) > 1) | (np.abs(np.diff(other_s[rows])) > 3 * STEP_M)
+        runs = np.split(rows, np.flatnonzero(cut) + 1) if len(rows) else []
+        long = [run for run in runs if s[run[-1]] - s[run[0]] >= MIN_LENGTH_M]
         found += [Beside(route, other, s[run], other_s[run], offset[run], same) for run in long]
     return found
-
-
-def _stretches(rows: NDArray[np.intp], other_s: Array) -> list[NDArray[np.intp]]:
-    """Cut rows where one is missing or the other's station jumps."""
-    if not len(rows):
-        return []
-    cut = (np.diff(rows) > 1) | (np.abs(np.diff(other_s[rows])) > 3 * STEP_M)
-    return np.split(rows, np.flatnonzero(cut) + 1)
 
 
 # Width of a lane where none is measured: 3.5 m on rural roads (RAL 2012), 3.25 to 3.75 m elsewhere.
@@ -185,10 +176,22 @@ def _add(routes: list[Route], path: DrivenPath) -> None:
         before = runs[k - 1].route if k > 0 else -1
         after = runs[k + 1].route if k + 1 < len(runs) and back is None else -1
         free = (first == 0, last == len(s) - 1)
+        own = path.line.s_m[first : last + 1]
         if before >= 0 and _is_at_end(routes[before], found.s_m[first - 1]):
-            routes[before] = _lengthened(routes[before], path, (first, last), found.aside_m[first - 1], free[1])
+            # From as far aside as the path was at the end of the route before.
+            route = routes[before]
+            moved = path.line.offset(own, -found.aside_m[first - 1] * (1 - _ease((own - own[0]) / BLEND_M)))
+            head = route.line.points_m[:-1] if route.line.length_m > s[1] else route.line.points_m
+            line = Polyline.through(_forward(np.concatenate([head, moved])))
+            routes[before] = replace(route, line=line, free=(route.free[0], free[1]))
         elif after >= 0 and _is_at_start(routes[after], found.s_m[last + 1]):
-            routes[after] = _preceded(routes[after], path, (first, last), found.aside_m[last + 1], free[0])
+            route = routes[after]
+            moved = path.line.offset(own, -found.aside_m[last + 1] * (1 - _ease((own[-1] - own) / BLEND_M)))
+            line = Polyline.through(_forward(np.concatenate([moved, route.line.points_m[1:]])[::-1])[::-1])
+            later = line.length_m - route.line.length_m
+            marked = None if route.marked_m is None else (route.marked_m[0] + later, route.marked_m[1] + later)
+            width_s_m, ends = route.width_s_m + later, (free[0], route.free[1])
+            routes[after] = replace(route, line=line, width_s_m=width_s_m, marked_m=marked, free=ends)
         elif last > first:
             width = min(max(LANE_M, path.width_m + CLEARANCE_M), MAX_LANE_M)
             line = Polyline.through(path.line.points_m[first : last + 1])
@@ -246,27 +249,6 @@ def _first_return(line: Polyline, first: int, last: int) -> int | None:
     return None
 
 
-def _lengthened(route: Route, path: DrivenPath, rows: tuple[int, int], aside_m: float, free: bool) -> Route:
-    """Lengthen a route by samples of a path that was `aside_m` left of its end."""
-    first, last = rows
-    s = path.line.s_m[first : last + 1]
-    moved = path.line.offset(s, -aside_m * (1 - _ease((s - s[0]) / BLEND_M)))
-    head = route.line.points_m[:-1] if route.line.length_m > path.line.s_m[1] else route.line.points_m
-    return replace(route, line=Polyline.through(_forward(np.concatenate([head, moved]))), free=(route.free[0], free))
-
-
-def _preceded(route: Route, path: DrivenPath, rows: tuple[int, int], aside_m: float, free: bool) -> Route:
-    """Put samples of a path that comes to `aside_m` left of a route before its start."""
-    first, last = rows
-    s = path.line.s_m[first : last + 1]
-    moved = path.line.offset(s, -aside_m * (1 - _ease((s[-1] - s) / BLEND_M)))
-    points = np.concatenate([moved, route.line.points_m[1:]])
-    grown = Polyline.through(_forward(points[::-1])[::-1])
-    later = grown.length_m - route.line.length_m
-    marked = None if route.marked_m is None else (route.marked_m[0] + later, route.marked_m[1] + later)
-    return replace(route, line=grown, width_s_m=route.width_s_m + later, marked_m=marked, free=(free, route.free[1]))
-
-
 def _forward(points: Array) -> Array:
     """Drop points (N, 3) that lie behind those before them, where two parts overlap."""
     kept = [0]
@@ -298,24 +280,16 @@ def _center(route: Route, k: int, paths: Sequence[DrivenPath], matches: Sequence
     route = replace(route, width_m=np.array([width]), width_s_m=np.zeros(1))
     if len(asides) < 2:
         return route
-    shift = _smoothed(_middle(np.array(asides)), GRID_M)
-    moved = route.line.offset(route.line.s_m, np.interp(route.line.s_m, grid, shift))
-    return replace(route, line=Polyline.through(moved)) if np.any(shift) else route
-
-
-def _middle(asides: Array) -> Array:
-    """Return the medians (K,) of offsets (P, K), as near to every path as `KEEP_M` demands; zero where there is none."""
-    known = np.isfinite(asides).any(axis=0)
-    held = np.where(known, asides, 0.0)
-    middle, low, high = np.nanmedian(held, axis=0), np.nanmin(held, axis=0), np.nanmax(held, axis=0)
-    near = np.clip(middle, high - KEEP_M, np.maximum(low + KEEP_M, high - KEEP_M))
-    return np.asarray(np.where(high - low > 2 * KEEP_M, (high + low) / 2, near))
-
-
-def _smoothed(values: Array, step_m: float) -> Array:
     from scipy.ndimage import gaussian_filter1d
 
-    return np.asarray(gaussian_filter1d(values, SMOOTH_M / step_m, mode="nearest"))
+    # The median, as near to every path as `KEEP_M` demands; zero where there is none.
+    held = np.where(np.isfinite(asides).any(axis=0), asides, 0.0)
+    middle, low, high = np.nanmedian(held, axis=0), np.nanmin(held, axis=0), np.nanmax(held, axis=0)
+    near = np.clip(middle, high - KEEP_M, np.maximum(low + KEEP_M, high - KEEP_M))
+    middle = np.where(high - low > 2 * KEEP_M, (high + low) / 2, near)
+    shift = gaussian_filter1d(middle, SMOOTH_M / GRID_M, mode="nearest")
+    moved = route.line.offset(route.line.s_m, np.interp(route.line.s_m, grid, shift))
+    return replace(route, line=Polyline.through(moved)) if np.any(shift) else route
 
 
 # How far: through a junction of four lanes each way.
@@ -331,7 +305,7 @@ def continued(routes: Sequence[Route], path: DrivenPath, match: Match) -> Driven
     after = _along(routes, match, last, last.last, 1)
     if not len(before) and not len(after):
         return path
-    return path.replace_points(np.concatenate([before, path.line.points_m, after]))
+    return replace(path, line=Polyline.through(np.concatenate([before, path.line.points_m, after])))
 
 
 def _along(routes: Sequence[Route], match: Match, run: Run, k: int, sign: int) -> Array:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
 
 from log2sim.geometry import Array, Polyline, Projection, crossings
 from log2sim.road.driven_paths import JUMP_M, STAY_M, DrivenPath, Match, Run
@@ -26,19 +26,10 @@ MAX_HALF_M = 15.0
 
 
 @dataclass(frozen=True)
-class Interval:
-    """A stretch of a route in a conflict or junction."""
-
-    route: int
-    first_m: float
-    last_m: float
-
-
-@dataclass(frozen=True)
 class Conflict:
     """Stretches of routes that share ground."""
 
-    intervals: tuple[Interval, ...]
+    intervals: tuple[tuple[int, float, float], ...]  # route, and its stations from and to, m
     crossing: bool  # whether lanes cross there; else they branch, merge or follow each other
 
 
@@ -56,29 +47,26 @@ def find_conflicts(routes: Sequence[Route], paths: Sequence[DrivenPath], matches
     for path, match in zip(paths, matches):
         if path.rank < 2 or len({run.route for run in match.runs}) > 1:
             for one, two in find_transitions(match):
-                conflict = _transition(routes, path, match, one, two)
-                found += [conflict] if conflict is not None else []
+                if not is_lane_change(routes, path, one, two):
+                    found.append(_transition(routes, path, match, one, two))
     for i, a in enumerate(routes):
         for j, b in enumerate(routes[i:], start=i):
-            found += [_crossing(routes, i, j, float(s), float(t)) for s, t in crossings(a.line, b.line)]
+            for s, t in crossings(a.line, b.line):
+                turn = float(a.line.heading_at(s) - b.line.heading_at(t))
+                sine, cosine = max(abs(np.sin(turn)), 1e-3), abs(np.cos(turn))
+                wide_a, wide_b = float(a.width_at(s)), float(b.width_at(t))
+                half_a, half_b = (
+                    min((other / 2 + own / 2 * cosine) / sine, MAX_HALF_M) + MARGIN_M
+                    for own, other in ((wide_a, wide_b), (wide_b, wide_a))
+                )
+                intervals = _held(routes, i, s - half_a, s + half_a), _held(routes, j, t - half_b, t + half_b)
+                found.append(Conflict(intervals, crossing=True))
     return found
 
 
-def _crossing(routes: Sequence[Route], i: int, j: int, s: float, t: float) -> Conflict:
-    one, two = routes[i], routes[j]
-    turn = float(one.line.heading_at(np.array(s)) - two.line.heading_at(np.array(t)))
-    sine, cosine = max(abs(np.sin(turn)), 1e-3), abs(np.cos(turn))
-    wide = [float(r.width_at(np.array(x))) for r, x in ((one, s), (two, t))]
-    intervals = []
-    for k, x, own, other in ((i, s, wide[0], wide[1]), (j, t, wide[1], wide[0])):
-        half = min((other / 2 + own / 2 * cosine) / sine, MAX_HALF_M) + MARGIN_M
-        intervals.append(hold(routes[k], k, x - half, x + half))
-    return Conflict(tuple(intervals), crossing=True)
-
-
-def hold(route: Route, k: int, first: float, last: float) -> Interval:
+def _held(routes: Sequence[Route], k: int, first: float, last: float) -> tuple[int, float, float]:
     """Return a stretch of route k as far as the route goes."""
-    return Interval(k, max(first, 0.0), min(last, route.line.length_m))
+    return k, max(float(first), 0.0), min(float(last), routes[k].line.length_m)
 
 
 def is_lane_change(routes: Sequence[Route], path: DrivenPath, one: Run, two: Run) -> bool:
@@ -94,55 +82,39 @@ def is_lane_change(routes: Sequence[Route], path: DrivenPath, one: Run, two: Run
     return True
 
 
-def _transition(routes: Sequence[Route], path: DrivenPath, match: Match, one: Run, two: Run) -> Conflict | None:
-    """Return the stretches between leaving a route and following another, None for a change of lanes."""
-    if is_lane_change(routes, path, one, two):
-        return None
+def _transition(routes: Sequence[Route], path: DrivenPath, match: Match, one: Run, two: Run) -> Conflict:
+    """Return the stretches between leaving a route and following another."""
     rows = np.arange(one.first, two.last + 1)
     xy, heading, s = path.line.points_m[rows, :2], path.line.heading_rad[rows], path.line.s_m[rows]
     a, b = (routes[run.route].line.project(xy, heading) for run in (one, two))
     leave, arrive = one.last - one.first, two.first - one.first
-    straight = np.flatnonzero(
-        (np.abs(a.turn_rad[: leave + 1]) <= ALIGNED_RAD) & (s[: leave + 1] >= s[leave] - MAX_TURNOFF_M)
-    )
-    begin = int(straight[-1]) if len(straight) else int(np.searchsorted(s, s[leave] - MAX_TURNOFF_M))
-    aligned = np.flatnonzero((np.abs(b.turn_rad[arrive:]) <= ALIGNED_RAD) & (s[arrive:] <= s[arrive] + MAX_TURNOFF_M))
-    end = (
-        arrive + int(aligned[0])
-        if len(aligned)
-        else int(np.searchsorted(s, s[arrive] + MAX_TURNOFF_M, side="right")) - 1
-    )
-    apart = _first(_is_apart(a)[leave:]) + leave
-    together = arrive - _first(_is_apart(b)[arrive::-1])
+    # The last row before and the first one after that are aligned with the route, else the ones farthest away.
+    before, after = np.arange(leave + 1), np.arange(arrive, len(s))
+    before = before[s[before] >= s[leave] - MAX_TURNOFF_M]
+    after = after[s[after] <= s[arrive] + MAX_TURNOFF_M]
+    straight = before[np.abs(a.turn_rad[before]) <= ALIGNED_RAD]
+    aligned = after[np.abs(b.turn_rad[after]) <= ALIGNED_RAD]
+    begin = straight[-1] if len(straight) else before[0]
+    end = aligned[0] if len(aligned) else after[-1]
+    apart, together = leave + _until_apart(a, slice(leave, None)), arrive - _until_apart(b, slice(arrive, None, -1))
     own = match.s_m[rows]
     first = own[max(min(begin, together), 0)] if together <= leave else own[begin]
-    last = max(own[leave], min(a.s_m[apart], routes[one.route].line.length_m))
+    length = routes[one.route].line.length_m
+    last = max(own[leave], min(a.s_m[apart], length))
     enter = min(own[arrive], max(b.s_m[together], 0.0)) if b.inside[together] else own[arrive]
     out = max(own[end], own[apart] if apart >= arrive else -np.inf)
-    length = routes[one.route].line.length_m
     room = JUMP_M if s[arrive] - s[leave] < JUMP_M else 0.0
     if length - own[leave] < JOIN_M and own[arrive] < JOIN_M:  # one goes on as the other
-        return Conflict((Interval(one.route, length - room, length), Interval(two.route, 0.0, room)), crossing=False)
-    return Conflict(
-        (
-            hold(
-                routes[one.route],
-                one.route,
-                min(first, own[leave] - JUMP_M),
-                length if length - own[leave] < JOIN_M else last,
-            ),
-            hold(routes[two.route], two.route, 0.0 if own[arrive] < JOIN_M else enter, max(out, own[arrive] + JUMP_M)),
-        ),
-        crossing=False,
-    )
+        return Conflict(((one.route, length - room, length), (two.route, 0.0, room)), crossing=False)
+    last = length if length - own[leave] < JOIN_M else last
+    enter = 0.0 if own[arrive] < JOIN_M else enter
+    left = _held(routes, one.route, min(first, own[leave] - JUMP_M), last)
+    return Conflict((left, _held(routes, two.route, enter, max(out, own[arrive] + JUMP_M))), crossing=False)
 
 
-def _is_apart(at: Projection) -> NDArray[np.bool_]:
-    return np.asarray((np.abs(at.aside_m) >= LANE_M) | ~at.inside)
-
-
-def _first(mask: NDArray[np.bool_]) -> int:
-    """Return the first index at which a mask holds, the last index if it never does."""
+def _until_apart(at: Projection, rows: slice) -> int:
+    """Return after how many of some rows a path is a lane beside a route, or off its ends; the last of them if it never is."""
+    mask = (np.abs(at.aside_m[rows]) >= LANE_M) | ~at.inside[rows]
     return int(mask.argmax()) if mask.any() else len(mask) - 1
 
 
@@ -152,56 +124,27 @@ MIN_SECTION_M = 4.0
 Stretch = tuple[float, float, int]
 
 
-@dataclass(frozen=True)
-class Areas:
-    """Conflicts that belong together."""
+def join_conflicts(conflicts: Sequence[Conflict]) -> tuple[dict[int, list[Stretch]], frozenset[int]]:
+    """Join conflicts whose stretches overlap, or leave no section between them, on any route, to areas.
 
-    stretches: Mapping[int, Sequence[Stretch]]  # by route, in order and apart
-    crossing: frozenset[int]  # areas in which lanes cross
-
-
-class Union:
-    """Sets of the numbers below `count` that are united step by step (Tarjan 1975)."""
-
-    def __init__(self, count: int) -> None:
-        self._parent = list(range(count))
-
-    def root(self, k: int) -> int:
-        """Return the number that stands for the set of k."""
-        while self._parent[k] != k:
-            self._parent[k] = self._parent[self._parent[k]]
-            k = self._parent[k]
-        return k
-
-    def unite(self, one: int, two: int) -> None:
-        """Make one set of two."""
-        one, two = self.root(one), self.root(two)
-        self._parent[max(one, two)] = min(one, two)
-
-
-def join_conflicts(conflicts: Sequence[Conflict]) -> Areas:
-    """Join conflicts whose stretches overlap, on any route."""
-    union = Union(len(conflicts))
+    Returns `stretches`: by route, in order and apart; `crossing`: areas in which lanes cross.
+    """
+    areas = DisjointSet(range(len(conflicts)))
     stretches: dict[int, list[Stretch]] = {}
     for k, conflict in enumerate(conflicts):
-        for interval in conflict.intervals:
-            stretches.setdefault(interval.route, []).append((interval.first_m, interval.last_m, k))
-    stretches = {route: _merge(items, union) for route, items in stretches.items()}
-    crossing = frozenset(union.root(k) for k, conflict in enumerate(conflicts) if conflict.crossing)
-    merged = {route: _merge(items, union) for route, items in stretches.items()}
-    return Areas({route: [(a, b, union.root(k)) for a, b, k in items] for route, items in merged.items()}, crossing)
-
-
-def _merge(items: Iterable[Stretch], union: Union) -> list[Stretch]:
-    """Unite stretches that overlap or leave no section between them."""
-    out: list[Stretch] = []
-    for first, last, k in sorted(items):
-        if out and first - out[-1][1] < MIN_SECTION_M:
-            union.unite(k, out[-1][2])
-            out[-1] = (out[-1][0], max(out[-1][1], last), union.root(k))
-        else:
-            out.append((first, last, union.root(k)))
-    return out
+        for route, first, last in conflict.intervals:
+            stretches.setdefault(route, []).append((first, last, k))
+    for route, items in stretches.items():
+        merged: list[Stretch] = []
+        for first, last, k in sorted(items):
+            if merged and first - merged[-1][1] < MIN_SECTION_M:
+                areas.merge(k, merged[-1][2])
+                merged[-1] = (merged[-1][0], max(merged[-1][1], last), k)
+            else:
+                merged.append((first, last, k))
+        stretches[route] = merged
+    crossing = frozenset(areas[k] for k, conflict in enumerate(conflicts) if conflict.crossing)
+    return {route: [(a, b, areas[k]) for a, b, k in items] for route, items in stretches.items()}, crossing
 
 
 # What a section ends at, if not at a junction: nothing that is known, or its own continuation beside other lanes.
@@ -237,54 +180,42 @@ class Strip:
 
 
 def cut_sections(
-    routes: Sequence[Route], areas: Areas, beside: Sequence[Beside], ends: set[tuple[int, bool]]
+    routes: Sequence[Route],
+    areas: Mapping[int, Sequence[Stretch]],
+    beside: Sequence[Beside],
+    ends: set[tuple[int, bool]],
 ) -> list[Section]:
     """Return the sections between junctions, cut where a lane beside them begins or ends.
 
-    `ends` names the routes, and whether it is the start, whose first or last station a path enters or leaves by another route.
+    `areas` are the stretches of junctions by route. `ends` names the routes, and whether it is the start, whose first or last station a path enters or leaves by another route.
     """
     cuts = _find_cuts(routes, areas, beside)
     found = []
     for k, route in enumerate(routes):
-        length = route.line.length_m
-        first, start = 0.0, FREE
-        for low, high, area in areas.stretches.get(k, []):
-            low, high = _leave_ends(low, high, length, ((k, True) in ends, (k, False) in ends))
-            if low - first > 1e-6:
-                found += _pieces(k, (first, low), (start, area), cuts.get(k, []))
+        length, first, start = route.line.length_m, 0.0, FREE
+        for low, high, area in (*areas.get(k, ()), (length, length, FREE)):
+            if area != FREE:
+                # Where the route itself begins or ends in a junction, a section is left before and after it.
+                room = min(FIRST_M, (high - low) / 3)
+                low = room if low < room and (k, True) not in ends else low
+                high = length - room if high > length - room and (k, False) not in ends else high
+            if low - first >= MIN_LENGTH_M:
+                inner = [c for c in sorted(cuts[k]) if first + MIN_SECTION_M < c < low - MIN_SECTION_M]
+                at, kinds = [first, *inner, low], [start, *([CUT] * len(inner)), area]
+                found += [Section(k, a, b, x, y) for a, b, x, y in zip(at, at[1:], kinds, kinds[1:])]
             first, start = high, area
-        if length - first > 1e-6:
-            found += _pieces(k, (first, length), (start, FREE), cuts.get(k, []))
     return found
 
 
-def _leave_ends(low: float, high: float, length: float, entered: tuple[bool, bool]) -> tuple[float, float]:
-    """Leave a section before and after a stretch of a junction where the route itself begins or ends in it."""
-    room = min(FIRST_M, (high - low) / 3)
-    if low < room and not entered[0]:
-        low = room
-    if high > length - room and not entered[1]:
-        high = length - room
-    return low, high
-
-
-def _pieces(k: int, span: tuple[float, float], ends: tuple[int, int], cuts: Iterable[float]) -> list[Section]:
-    if span[1] - span[0] < MIN_LENGTH_M:
-        return []
-    inner = [c for c in sorted(cuts) if span[0] + MIN_SECTION_M < c < span[1] - MIN_SECTION_M]
-    at = [span[0], *inner, span[1]]
-    kinds = [ends[0], *([CUT] * len(inner)), ends[1]]
-    return [Section(k, a, b, x, y) for a, b, x, y in zip(at, at[1:], kinds, kinds[1:])]
-
-
-def _find_cuts(routes: Sequence[Route], areas: Areas, beside: Sequence[Beside]) -> dict[int, list[float]]:
+def _find_cuts(
+    routes: Sequence[Route], areas: Mapping[int, Sequence[Stretch]], beside: Sequence[Beside]
+) -> dict[int, list[float]]:
     """Return stations of routes at which a lane beside them begins or ends, and those across from them."""
     cuts: dict[int, list[float]] = {k: [] for k in range(len(routes))}
 
     def add(route: int, s: float) -> bool:
-        if any(abs(s - c) < MIN_SECTION_M for c in (*cuts[route], 0.0, routes[route].line.length_m)):
-            return False
-        if any(low - MIN_SECTION_M < s < high + MIN_SECTION_M for low, high, _ in areas.stretches.get(route, [])):
+        near = any(abs(s - c) < MIN_SECTION_M for c in (*cuts[route], 0.0, routes[route].line.length_m))
+        if near or any(low - MIN_SECTION_M < s < high + MIN_SECTION_M for low, high, _ in areas.get(route, ())):
             return False
         cuts[route].append(s)
         return True
@@ -309,12 +240,25 @@ def _find_cuts(routes: Sequence[Route], areas: Areas, beside: Sequence[Beside]) 
 
 def lay_out(routes: Sequence[Route], sections: Sequence[Section], beside: Sequence[Beside]) -> list[Strip]:
     """Give sections their ground: those side by side share their edges, and begin and end at the same line across."""
-    strips: list[Strip | None] = [None] * len(sections)
-    halves = _end_halves(routes, sections, groups := _groups(sections, beside))
+    strips: dict[int, Strip] = {}
+    halves_at = _end_halves(routes, sections, groups := _groups(sections, beside))
     for group in groups:
-        for k, strip in zip(group, _lay_out_group(routes, sections, group, halves)):
-            strips[k] = strip
-    return [strip for strip in strips if strip is not None]
+        line, _, halves, heights, edges = _offsets(routes, sections, group)
+        ends = ("start", "first_m", line.s_m), ("end", "last_m", line.length_m - line.s_m)
+        for row, side in ((0, 1), (-1, -1)):
+            section = sections[group[row]]
+            for kind, station, since in ends:
+                wanted = halves_at.get((section.route, getattr(section, station), side))
+                if getattr(section, kind) == CUT and wanted is not None:
+                    taper = np.clip(1 - since / min(TAPER_M, line.length_m), 0.0, 1.0)
+                    edges[row] += side * (taper * taper * (3 - 2 * taper)) * (wanted - halves[row])
+        for row, k in enumerate(group):
+            points = line.offset(line.s_m, (edges[row] + edges[row + 1]) / 2)
+            points[:, 2] = heights[row]
+            left = group[row - 1] if row > 0 else None
+            right = group[row + 1] if row + 1 < len(group) else None
+            strips[k] = Strip(sections[k], Polyline(points), edges[row] - edges[row + 1], left, right)
+    return [strips[k] for k in range(len(sections))]
 
 
 def _groups(sections: Sequence[Section], beside: Sequence[Beside]) -> list[list[int]]:
@@ -330,14 +274,13 @@ def _groups(sections: Sequence[Section], beside: Sequence[Beside]) -> list[list[
             first, last = sections[k].first_m, sections[k].last_m
             if min(last, pair.s_m[-1]) - max(first, pair.s_m[0]) < 0.5 * (last - first):
                 continue
-            ends = np.interp([sections[k].first_m, sections[k].last_m], pair.s_m, pair.other_s_m)
-            ends += np.array([min(sections[k].first_m - pair.s_m[0], 0.0), max(sections[k].last_m - pair.s_m[-1], 0.0)])
+            ends = np.interp([first, last], pair.s_m, pair.other_s_m)
+            ends += np.array([min(first - pair.s_m[0], 0.0), max(last - pair.s_m[-1], 0.0)])
             for j in by_route.get(pair.other, []):
                 off = np.abs(ends - [sections[j].first_m, sections[j].last_m])
                 if off.max() <= 1.5 * MIN_SECTION_M and k not in right_of and j not in right_of.values():
                     right_of[k] = j
-    starts = [k for k in range(len(sections)) if k not in right_of.values()]
-    chains = [[k] for k in starts]
+    chains = [[k] for k in range(len(sections)) if k not in right_of.values()]
     for chain in chains:
         while chain[-1] in right_of:
             chain.append(right_of[chain[-1]])
@@ -346,38 +289,31 @@ def _groups(sections: Sequence[Section], beside: Sequence[Beside]) -> list[list[
 
 def _offsets(
     routes: Sequence[Route], sections: Sequence[Section], group: Sequence[int]
-) -> tuple[Polyline, Array, Array, Array]:
-    """Return the base line of a group, and of its lanes (G, N): offsets from it, default half widths and heights."""
+) -> tuple[Polyline, Array, Array, Array, Array]:
+    """Return the base line of a group, and of its G lanes: offsets from it, default half widths and heights (G, N), and edges.
+
+    Edges (G + 1, N) are from the left to the right; neighbors meet in the middle.
+    """
     base = min(group, key=lambda k: sections[k].route)
     section = sections[base]
     line = Polyline.through(routes[section.route].line.part(section.first_m, section.last_m))
-    heading = line.heading_rad
-    along, left = (
-        np.column_stack([np.cos(heading), np.sin(heading)]),
-        np.column_stack([-np.sin(heading), np.cos(heading)]),
-    )
-    offsets, halves, heights = [], [], []
+    c, s = np.cos(line.heading_rad), np.sin(line.heading_rad)
+    along, left = np.column_stack([c, s]), np.column_stack([-s, c])
+    columns = []
     for k in group:
         other = routes[sections[k].route]
         if k == base:
-            s, points = section.first_m + line.s_m, line.points_m
+            at, points = section.first_m + line.s_m, line.points_m
         else:
-            s = other.line.project(line.points_m[:, :2], heading).s_m
+            at = other.line.project(line.points_m[:, :2], line.heading_rad).s_m
             for _ in range(4):
-                points = other.line.at(s)
-                s = s - ((points - line.points_m)[:, :2] * along).sum(axis=1)
-            points = other.line.at(s)
-        offsets.append(((points - line.points_m)[:, :2] * left).sum(axis=1) if k != base else np.zeros(len(s)))
-        halves.append(other.width_at(s) / 2)
-        heights.append(points[:, 2])
-    return line, np.array(offsets), np.array(halves), np.array(heights)
-
-
-def _edges(offsets: Array, halves: Array) -> Array:
-    """Return the edges (G + 1, N) of G lanes from the left to the right: neighbors meet in the middle."""
-    outer_left, outer_right = offsets[:1] + halves[:1], offsets[-1:] - halves[-1:]
+                at = at - ((other.line.at(at) - line.points_m)[:, :2] * along).sum(axis=1)
+            points = other.line.at(at)
+        columns.append((((points - line.points_m)[:, :2] * left).sum(axis=1), other.width_at(at) / 2, points[:, 2]))
+    offsets, halves, heights = (np.array(column) for column in zip(*columns))
     inner = (offsets[:-1] - halves[:-1] + offsets[1:] + halves[1:]) / 2
-    return np.concatenate([outer_left, inner, outer_right])
+    edges = np.concatenate([offsets[:1] + halves[:1], inner, offsets[-1:] - halves[-1:]])
+    return line, offsets, halves, heights, edges
 
 
 def _end_halves(
@@ -388,8 +324,7 @@ def _end_halves(
     for group in groups:
         if len(group) == 1:
             continue
-        _, offsets, halves, _ = _offsets(routes, sections, group)
-        edges = _edges(offsets, halves)
+        _, offsets, _, _, edges = _offsets(routes, sections, group)
         for row, k in enumerate(group):
             section = sections[k]
             for kind, s, at in ((section.start, section.first_m, 0), (section.end, section.last_m, -1)):
@@ -400,36 +335,6 @@ def _end_halves(
                 if row < len(group) - 1:
                     found[section.route, s, -1] = float(offsets[row, at] - edges[row + 1, at])
     return found
-
-
-def _lay_out_group(
-    routes: Sequence[Route],
-    sections: Sequence[Section],
-    group: Sequence[int],
-    halves_at: Mapping[tuple[int, float, int], float],
-) -> list[Strip]:
-    line, offsets, halves, heights = _offsets(routes, sections, group)
-    edges = _edges(offsets, halves)
-    for row, lane, side in ((0, 0, 1), (-1, len(group) - 1, -1)):
-        section = sections[group[lane]]
-        for kind, s, since in (
-            (section.start, section.first_m, line.s_m),
-            (section.end, section.last_m, line.length_m - line.s_m),
-        ):
-            wanted = halves_at.get((section.route, s, side))
-            if kind == CUT and wanted is not None:
-                taper = np.clip(1 - since / min(TAPER_M, line.length_m), 0.0, 1.0)
-                eased = taper * taper * (3 - 2 * taper)
-                edges[row] += side * eased * (wanted - halves[lane])
-    out = []
-    for row, k in enumerate(group):
-        middle, width = (edges[row] + edges[row + 1]) / 2, edges[row] - edges[row + 1]
-        points = line.offset(line.s_m, middle)
-        points[:, 2] = heights[row]
-        left = group[row - 1] if row > 0 else None
-        right = group[row + 1] if row + 1 < len(group) else None
-        out.append(Strip(sections[k], Polyline(points), width, left, right))
-    return out
 
 
 # Over this length from its ends a connection comes from the lanes' middles to the path that was driven.
@@ -465,7 +370,10 @@ def connect(
     for (origin, target), ways in sorted(driven.items()):
         lead = min(path.rank == 2 for path, _ in ways)
         kept = [(path, points) for path, points in ways if (path.rank == 2) == lead]
-        line = Polyline(_mean([points for _, points in kept]))
+        lines = [Polyline(points) for _, points in kept]
+        share = np.linspace(0.0, 1.0, max(len(line.points_m) for line in lines))
+        middle = np.median([line.at(share * line.length_m) for line in lines], axis=0)
+        line = Polyline(middle) if len(lines) > 1 else lines[0]
         ends = strips[origin].width_m[-1], strips[target].width_m[0]
         width = np.interp(line.s_m, [0.0, line.length_m], ends)
         names = tuple(dict.fromkeys(path.agent for path, _ in kept))
@@ -477,7 +385,15 @@ def _passages(
     routes: Sequence[Route], strips: Sequence[Strip], path: DrivenPath, match: Match
 ) -> Iterator[tuple[int, int, tuple[float, float]]]:
     """Yield pairs of sections that a path passes in turn, and its stations at the end of one and the start of the other."""
-    visits = _visits(strips, match)
+    visits: list[tuple[int, int, int]] = []  # of sections: which, and the first and last sample there
+    for run in match.runs:
+        rows = np.arange(run.first, run.last + 1)
+        own = [k for k, strip in enumerate(strips) if strip.section.route == run.route]
+        for k in sorted(own, key=lambda k: strips[k].section.first_m):
+            section = strips[k].section
+            inside = rows[(match.s_m[rows] >= section.first_m - 1e-6) & (match.s_m[rows] <= section.last_m + 1e-6)]
+            if len(inside):
+                visits.append((k, int(inside[0]), int(inside[-1])))
     for (one, _, k), (two, j, _) in pairwise(visits):
         a, b = strips[one].section, strips[two].section
         if a.end < 0 or a.end != b.start:
@@ -490,22 +406,6 @@ def _passages(
         span = float(path.line.s_m[k] + out), float(path.line.s_m[j] - into)
         if span[1] - span[0] >= MIN_CONNECTION_M:
             yield one, two, span
-
-
-def _visits(strips: Sequence[Strip], match: Match) -> list[tuple[int, int, int]]:
-    """Return the sections that a path visits, each with its first and last sample there."""
-    visits: list[tuple[int, int, int]] = []
-    for run in match.runs:
-        if run.route < 0:
-            continue
-        own = [k for k, strip in enumerate(strips) if strip.section.route == run.route]
-        rows = np.arange(run.first, run.last + 1)
-        for k in sorted(own, key=lambda k: strips[k].section.first_m):
-            section = strips[k].section
-            inside = rows[(match.s_m[rows] >= section.first_m - 1e-6) & (match.s_m[rows] <= section.last_m + 1e-6)]
-            if len(inside):
-                visits.append((k, int(inside[0]), int(inside[-1])))
-    return visits
 
 
 def _fitted(points: Array, origin: Strip, target: Strip) -> Array:
@@ -523,20 +423,6 @@ def _fitted(points: Array, origin: Strip, target: Strip) -> Array:
         fade, swing = (1 - u) ** 2 * (1 + 2 * u), u * (1 - u) ** 2 * reach
         moved += fade[:, None] * gap + swing[:, None] * slope
     return moved
-
-
-def _mean(ways: Sequence[Array]) -> Array:
-    """Return the median of polylines (N, 3) that begin and end together, at equal shares of their lengths."""
-    if len(ways) == 1:
-        return ways[0]
-    count = max(len(points) for points in ways)
-    share = np.linspace(0.0, 1.0, count)
-    columns = []
-    for points in ways:
-        line = Polyline(points)
-        columns.append(line.at(share * line.length_m))
-    middle: Array = np.median(columns, axis=0)
-    return middle
 
 
 def continuations(strips: Sequence[Strip]) -> list[tuple[int, int]]:

@@ -50,26 +50,21 @@ def lamp_evidence(crop_bgr: NDArray[np.uint8]) -> Array:
         log[STATES.index("off")] = 0.0
         return log
     upright = crop_bgr.shape[0] > UPRIGHT * crop_bgr.shape[1]
-    log = np.empty(len(STATES))
+    shares, log = shares / total, np.empty(len(STATES))
     for k, state in enumerate(STATES):
         lamps = {"red": [0], "red_yellow": [0, 1], "yellow": [1], "green": [2], "off": []}[state]
-        log[k] = np.log(OFF_WHERE_LIT) if not lamps else _log_of(lamps, shares / total, places, upright)
-    return np.asarray(np.maximum(log - log.max(), -MAX_EVIDENCE))
-
-
-def _log_of(lamps: list[int], shares: Array, places: Array, upright: bool) -> float:
-    """Return the log-likelihood of colors (3,), as shares of what shines, at places (3,), while lamps are lit."""
-    log = float(shares @ np.log(SEEN_AS[lamps].mean(axis=0)))
-    if len(lamps) == 2:
-        # Both shine, one below the other.
-        apart = not upright or places[1] - places[0] > MIN_APART
-        log += 0.0 if min(shares[0], shares[1]) > SEEN_SHARE and apart else np.log(LIT_WHERE_DARK)
-    seen = shares > SEEN_SHARE
-    if upright:
-        for color in np.flatnonzero(seen):
+        if not lamps:
+            log[k] = np.log(OFF_WHERE_LIT)
+            continue
+        log[k] = float(shares @ np.log(SEEN_AS[lamps].mean(axis=0)))
+        if len(lamps) == 2:
+            # Both shine, one below the other.
+            apart = not upright or places[1] - places[0] > MIN_APART
+            log[k] += 0.0 if min(shares[0], shares[1]) > SEEN_SHARE and apart else np.log(LIT_WHERE_DARK)
+        for color in np.flatnonzero(shares > SEEN_SHARE) if upright else ():
             off = min(abs(places[color] - PLACES[lamp]) for lamp in lamps) / PLACE_SIGMA
-            log -= 0.5 * float(shares[color]) * off**2
-    return log
+            log[k] -= 0.5 * float(shares[color]) * off**2
+    return np.asarray(np.maximum(log - log.max(), -MAX_EVIDENCE))
 
 
 def find_lamps(crop_bgr: NDArray[np.uint8]) -> tuple[Array, Array]:
@@ -84,7 +79,10 @@ def find_lamps(crop_bgr: NDArray[np.uint8]) -> tuple[Array, Array]:
     shares, places = np.zeros(3), np.full(3, np.nan)
     if lit.mean() > MAX_LIT_SHARE:
         return shares, places
-    hue = _hues(rgb, chroma)
+    red, green, blue = np.moveaxis(rgb, 2, 0)
+    safe, top = np.where(chroma > 0, chroma, 1.0), rgb.argmax(axis=2)
+    by_top = [((green - blue) / safe) % 6, (blue - red) / safe + 2]
+    hue = 60 * np.select([top == 0, top == 1], by_top, (red - green) / safe + 4)  # degrees
     color = np.full(hue.shape, -1)
     color[_between(hue, RED_HUES)], color[_between(hue, YELLOW_HUES)], color[_between(hue, GREEN_HUES)] = 0, 1, 2
     rows = (np.arange(len(rgb)) + 0.5) / len(rgb)
@@ -95,17 +93,6 @@ def find_lamps(crop_bgr: NDArray[np.uint8]) -> tuple[Array, Array]:
         if part.sum() > 0:
             places[k] = float(part @ rows / part.sum())
     return shares, places
-
-
-def _hues(rgb: Array, chroma: Array) -> Array:
-    """Return the hues (h, w) in degrees of colors (h, w, 3); 0 where there is none."""
-    red, green, blue = np.moveaxis(rgb, 2, 0)
-    safe = np.where(chroma > 0, chroma, 1.0)
-    top = rgb.argmax(axis=2)
-    hue = np.select(
-        [top == 0, top == 1], [((green - blue) / safe) % 6, (blue - red) / safe + 2], (red - green) / safe + 4
-    )
-    return np.asarray(60 * hue)
 
 
 def _between(hue: Array, bounds: tuple[float, float]) -> NDArray[np.bool_]:
@@ -131,16 +118,6 @@ LEAST_CYCLE_S = 5.0
 MIN_STATE_S = 0.25  # shorter changes are of single pictures
 
 
-def rates() -> Array:
-    """Return the rates (S, S) per s of the changes from each of `STATES` to each."""
-    out = np.zeros((len(STATES), len(STATES)))
-    for k, state in enumerate(STATES):
-        for following, share in FOLLOWS[state].items():
-            out[k, STATES.index(following)] = share / DURATION_S[state]
-        out[k, k] = -out[k].sum()
-    return out
-
-
 def most_probable_states(t_s: Array, evidence: Array) -> tuple[NDArray[np.intp], Array]:
     """Return the most probable course of states (T,), and the probability (T,) of each given all pictures.
 
@@ -152,10 +129,15 @@ def most_probable_states(t_s: Array, evidence: Array) -> tuple[NDArray[np.intp],
     Viterbi (1967) for the course, forward-backward (Rabiner 1989) for the probabilities, with the transitions of a Markov process
     in continuous time.
     """
-    gaps = np.round(np.diff(t_s), 3)
-    of_gap = {gap: expm(rates() * gap) for gap in set(gaps.tolist())}
-    steps = [of_gap[gap] for gap in gaps.tolist()]
     count = len(STATES)
+    rates = np.zeros((count, count))  # of changes per s, from each state to each
+    for k, state in enumerate(STATES):
+        for following, share in FOLLOWS[state].items():
+            rates[k, STATES.index(following)] = share / DURATION_S[state]
+        rates[k, k] = -rates[k].sum()
+    gaps = np.round(np.diff(t_s), 3).tolist()
+    of_gap = {gap: expm(rates * gap) for gap in set(gaps)}
+    steps = [of_gap[gap] for gap in gaps]
     best, origin = np.zeros((len(t_s), count)), np.zeros((len(t_s), count), np.intp)
     best[0] = evidence[0]
     forward, backward = np.zeros((len(t_s), count)), np.ones((len(t_s), count))
@@ -249,8 +231,20 @@ def place_lights(log: Log, boxes: Sequence[LightBox]) -> list[Housing]:
         frames.setdefault((box.t_ns, box.camera), []).append(box)
     for (t_ns, camera), seen in sorted(frames.items(), key=lambda item: item[0]):
         poses, known = log.map_T_sensor(camera, t_ns)
-        if known[0]:
-            _take_frame(log, housings, [_sight_of(log, box, poses[0]) for box in seen], poses[0])
+        if not known[0]:
+            continue
+        # Each sight of a frame is given to the housing that it fits best, or makes a new one.
+        sights = [_sight_of(log, box, poses[0]) for box in seen]
+        sights = [sight for sight in sights if np.isfinite(sight.ray).all() and sight.side_rad > 0]
+        positions = np.array([housing.position for housing in housings]).reshape(-1, 3)
+        covariances = np.array([housing.covariance for housing in housings]).reshape(-1, 3, 3)
+        cost = np.array([_misfits(positions, covariances, s) for s in sights]).reshape(len(sights), len(housings))
+        taken = set()
+        for row, column in zip(*linear_sum_assignment(np.minimum(cost, 10 * GATE))):
+            if cost[row, column] <= GATE:
+                _update(housings[column], sights[row])
+                taken.add(row)
+        housings += [_new_housing(sight) for k, sight in enumerate(sights) if k not in taken]
     return _merged(housings)
 
 
@@ -266,21 +260,6 @@ def _sight_of(log: Log, box: LightBox, map_T_cam: Array) -> _Sight:
     pixel_rad = side_rad / max(u1 - u0, v1 - v0)
     sigma = float(np.linalg.norm([PIXEL_SIGMA * pixel_rad, SHARE_SIGMA * side_rad, ANGLE_SIGMA_RAD]))
     return _Sight(box, map_T_cam[:3, 3], map_T_cam[:3, :3] @ rays[0], sigma, side_rad)
-
-
-def _take_frame(log: Log, housings: list[Housing], sights: list[_Sight], map_T_cam: Array) -> None:
-    """Give each sight of a frame to the housing that it fits best, or make a new one."""
-    sights = [sight for sight in sights if np.isfinite(sight.ray).all() and sight.side_rad > 0]
-    positions = np.array([housing.position for housing in housings]).reshape(-1, 3)
-    covariances = np.array([housing.covariance for housing in housings]).reshape(-1, 3, 3)
-    cost = np.array([_misfits(positions, covariances, sight) for sight in sights]).reshape(len(sights), len(housings))
-    rows, columns = linear_sum_assignment(np.minimum(cost, 10 * GATE))
-    taken = set()
-    for row, column in zip(rows.tolist(), columns.tolist()):
-        if cost[row, column] <= GATE:
-            _update(housings[column], sights[row])
-            taken.add(row)
-    housings += [_new_housing(sight) for k, sight in enumerate(sights) if k not in taken]
 
 
 def _misfits(positions: Array, covariances: Array, sight: _Sight) -> Array:
@@ -354,9 +333,8 @@ def _merged(housings: list[Housing]) -> list[Housing]:
     for housing in sorted(housings, key=lambda h: -len(h.boxes)):
         for other in kept:
             off = housing.position - other.position
-            close = (
-                off @ np.linalg.solve(housing.covariance + other.covariance + np.eye(3) * PART_M**2, off) < MERGE_GATE
-            )
+            spread = housing.covariance + other.covariance + np.eye(3) * PART_M**2
+            close = off @ np.linalg.solve(spread, off) < MERGE_GATE
             both = {(b.t_ns, b.camera) for b in housing.boxes} & {(b.t_ns, b.camera) for b in other.boxes}
             few = len(both) <= MAX_SHARED * min(len(housing.boxes), len(other.boxes))
             apart = float(np.linalg.norm(off))
@@ -396,21 +374,18 @@ def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tup
     signals: list[Signal] = []
     housings = sorted(place_lights(log, boxes), key=lambda housing: min(box.t_ns for box in housing.boxes))
     for housing in housings:
-        signal = _signal(f"signal_{len(signals) + 1}", housing, scenario) if _is_plausible(log, housing) else None
-        signals += [] if signal is None else [signal]
+        # Seen often enough, placed well enough, and where signals hang.
+        if len(housing.boxes) < MIN_BOXES or housing.sigma_m > MAX_SIGMA_M:
+            continue
+        height = housing.position[2] - ground_height(log, housing)
+        margin = HEIGHT_MARGIN_M + float(np.sqrt(housing.covariance[2, 2]))
+        if HEIGHT_M[0] - margin <= height <= HEIGHT_M[1] + margin:
+            signal = _signal(f"signal_{len(signals) + 1}", housing, scenario)
+            signals += [] if signal is None else [signal]
     text = f"{len(signals)} traffic light{'' if len(signals) == 1 else 's'}"
     if left_out := len(housings) - len(signals):
         text += f"; {left_out} places left out: seen too rarely, placed too roughly, not where signals hang, no lamp lit, or too unsure"
     return tuple(signals), text
-
-
-def _is_plausible(log: Log, housing: Housing) -> bool:
-    """Return whether a housing was seen often enough, is placed well enough, and hangs where signals do."""
-    if len(housing.boxes) < MIN_BOXES or housing.sigma_m > MAX_SIGMA_M:
-        return False
-    height = housing.position[2] - ground_height(log, housing)
-    margin = HEIGHT_MARGIN_M + float(np.sqrt(housing.covariance[2, 2]))
-    return bool(HEIGHT_M[0] - margin <= height <= HEIGHT_M[1] + margin)
 
 
 def ground_height(log: Log, housing: Housing) -> float:
@@ -434,7 +409,11 @@ def _signal(name: str, housing: Housing, scenario: Scenario) -> Signal | None:
     times, states = changes_of(t_s, course)
     if lit.mean() < MIN_LIT_SHARE or set(states) <= {"off", "unknown"}:
         return None
-    heading = _heading([housing.eyes[k] for k, shines in zip(order, lit) if shines], housing.position)
+    heading = None  # the mean direction from which lamps were seen lit
+    if lit.any():
+        away = np.array([housing.eyes[k] for k, shines in zip(order, lit) if shines])[:, :2] - housing.position[:2]
+        x, y = (away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0)
+        heading = float(np.arctan2(y, x))
     score = float(np.mean([box.score for box in boxes]))
     repeated = 1 - (1 - score) ** (len(boxes) / SURE_BOXES * 2)
     confidence = repeated * float(probability.mean())
@@ -450,13 +429,3 @@ def _signal(name: str, housing: Housing, scenario: Scenario) -> Signal | None:
         confidence=round(confidence, 3),
         cameras=tuple(sorted({box.camera for box in boxes})),
     )
-
-
-def _heading(eyes: list[Array], position: Array) -> float | None:
-    """Return the mean direction from which lamps were seen lit; None where they were not."""
-    if not eyes:
-        return None
-    away = np.array(eyes)[:, :2] - position[:2]
-    unit = away / np.linalg.norm(away, axis=1, keepdims=True)
-    mean = unit.mean(axis=0)
-    return float(np.arctan2(mean[1], mean[0]))

@@ -65,9 +65,19 @@ def find_strips(markings: Sequence[Marking], borders: Sequence[RoadBorder]) -> l
         back = Polyline(lines[i].points_m[::-1])
         for line, own in ((lines[i], sides[i]), (back, _Sides.of(back, i, lines))):
             for j in {int(v) for v in own.left[own.left >= 0]}:
-                found += [
-                    _strip(own, rows, line, (items[j], item)) for rows in _mutual(own, line, sides[j], lines[j], (i, j))
-                ]
+                left, theirs = items[j], sides[j]
+                # Stretches of rows at which each line is the nearest of the other.
+                rows = np.flatnonzero(own.left == j)
+                gap = line.at(own.s_m[rows])[:, None, :2] - lines[j].at(theirs.s_m)[None, :, :2]
+                across = np.hypot(gap[..., 0], gap[..., 1]).argmin(axis=1)
+                rows = rows[(theirs.left[across] == i) | (theirs.right[across] == i)]
+                for run in np.split(rows, np.flatnonzero(np.diff(rows) > 2) + 1):
+                    if len(run) < 2 or own.s_m[run[-1]] - own.s_m[run[0]] < STEP_M:
+                        continue
+                    s, width = own.s_m[run], own.left_m[run]
+                    middle = Polyline.through(line.offset(s, width / 2))
+                    at = (s - s[0]) / (s[-1] - s[0]) * middle.length_m
+                    found.append(LaneStrip(middle, width, at, left.id, item.id, left.confidence * item.confidence))
     return [strip for strip in _chained(_once(found)) if strip.line.length_m >= MIN_LENGTH_M]
 
 
@@ -94,7 +104,7 @@ class _Sides:
                 at = other.project(points, heading + turned)
                 aside = -at.aside_m if turned == 0.0 else at.aside_m
                 there = (at.s_m >= -STEP_M / 2) & (at.s_m <= other.length_m + STEP_M / 2)
-                good = there & (np.abs(wrap_angle(at.turn_rad)) <= PARALLEL_RAD)
+                good = there & (np.abs(at.turn_rad) <= PARALLEL_RAD)
                 for sign in (1, -1):
                     near = good & (sign * aside >= SAME_LINE_M) & (sign * aside < nearest[sign])
                     nearest[sign] = np.where(near, sign * aside, nearest[sign])
@@ -102,27 +112,6 @@ class _Sides:
         for sign in (1, -1):
             which[sign][(nearest[sign] < MIN_WIDTH_M) | (nearest[sign] > MAX_WIDTH_M)] = -1
         return cls(s, which[1], which[-1], nearest[1])
-
-
-def _mutual(
-    own: _Sides, line: Polyline, theirs: _Sides, other: Polyline, names: tuple[int, int]
-) -> list[NDArray[np.intp]]:
-    """Return the stretches of rows at which two lines, `names`, are each the nearest of the other."""
-    i, j = names
-    rows = np.flatnonzero(own.left == j)
-    gap = line.at(own.s_m[rows])[:, None, :2] - other.at(theirs.s_m)[None, :, :2]
-    across = np.hypot(gap[..., 0], gap[..., 1]).argmin(axis=1)
-    rows = rows[(theirs.left[across] == i) | (theirs.right[across] == i)]
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 2) + 1)
-    return [run for run in runs if len(run) > 1 and own.s_m[run[-1]] - own.s_m[run[0]] >= STEP_M]
-
-
-def _strip(sides: _Sides, rows: NDArray[np.intp], line: Polyline, items: tuple[RoadLine, RoadLine]) -> LaneStrip:
-    s, width = sides.s_m[rows], sides.left_m[rows]
-    middle = Polyline.through(line.offset(s, width / 2))
-    at = (s - s[0]) / (s[-1] - s[0]) * middle.length_m
-    left, right = items
-    return LaneStrip(middle, width, at, left.id, right.id, left.confidence * right.confidence)
 
 
 def _once(strips: Sequence[LaneStrip]) -> list[LaneStrip]:
@@ -143,25 +132,21 @@ def _once(strips: Sequence[LaneStrip]) -> list[LaneStrip]:
 
 def _chained(strips: list[LaneStrip]) -> list[LaneStrip]:
     """Join strips that follow each other."""
-    strips = list(strips)
     while True:
+        both = [(strip, strip.reversed()) for strip in strips]
         gaps = [
             (gap, i, j, flip)
-            for i, one in enumerate(strips)
-            for j, two in enumerate(strips)
+            for i, one in enumerate(both)
+            for j, two in enumerate(both)
             if i != j
             for flip in ((False, False), (True, False), (False, True))
-            if (gap := _gap(_turned(one, flip[0]), _turned(two, flip[1]))) is not None
+            if (gap := _gap(one[flip[0]], two[flip[1]])) is not None
         ]
         if not gaps:
             return strips
         _, i, j, flip = min(gaps)
-        joined = _join(_turned(strips[i], flip[0]), _turned(strips[j], flip[1]))
+        joined = _join(both[i][flip[0]], both[j][flip[1]])
         strips = [strip for k, strip in enumerate(strips) if k not in (i, j)] + [joined]
-
-
-def _turned(strip: LaneStrip, flip: bool) -> LaneStrip:
-    return strip.reversed() if flip else strip
 
 
 def _gap(one: LaneStrip, two: LaneStrip) -> float | None:
@@ -169,12 +154,10 @@ def _gap(one: LaneStrip, two: LaneStrip) -> float | None:
     (x, y, _), (u, v, _) = one.line.points_m[-1], two.line.points_m[0]
     if abs(u - x) > MAX_GAP_M or abs(v - y) > MAX_GAP_M:
         return None
-    heading, other = float(one.line.heading_rad[-1]), float(two.line.heading_rad[0])
-    along, aside = (
-        (u - x) * np.cos(heading) + (v - y) * np.sin(heading),
-        (v - y) * np.cos(heading) - (u - x) * np.sin(heading),
-    )
-    bend = float(wrap_angle(np.array([other - heading]))[0])
+    heading = one.line.heading_rad[-1]
+    c, s = np.cos(heading), np.sin(heading)
+    along, aside = (u - x) * c + (v - y) * s, (v - y) * c - (u - x) * s
+    bend = float(wrap_angle(two.line.heading_rad[0] - heading))
     fits = -STEP_M <= along <= MAX_GAP_M and abs(aside - along * bend / 2) <= MAX_ASIDE_M and abs(bend) <= PARALLEL_RAD
     return float(along) if fits and abs(one.width_m[-1] - two.width_m[0]) <= MAX_WIDENING_M else None
 

@@ -59,8 +59,18 @@ def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:
     the cost grows as the length.
     """
     s = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6))])
-    order, s = _ordered(points, s)
-    points = points[order]
+    # The ends of pieces may overlap: points are ordered along the polyline of the middles of neighbors, which goes forward where
+    # its corners go back.
+    middle = np.concatenate([points[:1], (points[1:] + points[:-1]) / 2, points[-1:]])
+    step = np.gradient(middle, axis=0)
+    step = (step[1:] + step[:-1]) / 2
+    norm = np.linalg.norm(step, axis=1, keepdims=True)
+    chord = np.broadcast_to(points[-1] - points[0], step.shape)
+    step = np.divide(step, norm, out=chord.copy(), where=norm > 1e-9)
+    ahead = np.concatenate([[0.0], np.cumsum(np.einsum("ij,ij->i", np.diff(points, axis=0), step[1:]))])
+    order = np.argsort(ahead, kind="stable")
+    points, along = points[order], ahead[order] - ahead[order[0]]
+    s = along if along[-1] > 0 else s
     knots = max(int(np.ceil(s[-1] / KNOT_M)) + 1, 4)
     place = s / s[-1] * (knots - 1)
     spacing = s[-1] / (knots - 1)
@@ -76,21 +86,6 @@ def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:
         distance = np.linalg.norm(points - (xy[low] * (1 - part) + xy[low + 1] * part), axis=1)
         weight = 1 / sigma_m**2 / np.maximum(distance / (ROBUST_SIGMAS * sigma_m), 1)
     return Curve(xy)
-
-
-def _ordered(points: Array, s: Array) -> tuple[NDArray[np.int64], Array]:
-    """Order points along their line, as the ends of pieces may overlap: indices, and lengths along the line."""
-    chord = points[-1] - points[0]
-    # Along the polyline of the middles of neighbors, which goes forward where its corners go back.
-    middle = np.concatenate([points[:1], (points[1:] + points[:-1]) / 2, points[-1:]])
-    step = np.gradient(middle, axis=0)
-    step = (step[1:] + step[:-1]) / 2
-    norm = np.linalg.norm(step, axis=1, keepdims=True)
-    step = np.divide(step, norm, out=np.broadcast_to(chord, step.shape).copy(), where=norm > 1e-9)
-    ahead = np.concatenate([[0.0], np.cumsum(np.einsum("ij,ij->i", np.diff(points, axis=0), step[1:]))])
-    order = np.argsort(ahead, kind="stable")
-    along = ahead[order] - ahead[order[0]]
-    return order, along if along[-1] > 0 else s
 
 
 def _solve(points: Array, place: Array, weight: Array, knots: int, spacing: float) -> Array:
@@ -152,10 +147,12 @@ class Trace:
 
     def strokes(self) -> Array:
         """Begin and end (K, 2) of the parts with paint, m, without flakes and small gaps."""
-        runs = _runs(self.on)
+        change = np.flatnonzero(np.diff(np.concatenate([[False], self.on, [False]]).astype(np.int8)))
+        runs = np.stack([change[::2], change[1::2] - 1], 1)
         merged: list[list[float]] = []
-        for begin, end in self.s[runs] + np.array([-STEP_M / 2, STEP_M / 2]) if len(runs) else ():
-            hidden = merged and not self._seen_between(merged[-1][1], begin)
+        for begin, end in self.s[runs] + np.array([-STEP_M / 2, STEP_M / 2]):
+            between = self.seen[(self.s > merged[-1][1]) & (self.s < begin)] if merged else self.seen[:0]
+            hidden = len(between) > 0 and float(np.mean(between)) <= 0.5
             if merged and (begin - merged[-1][1] < MIN_GAP_M or hidden):
                 merged[-1][1] = end
             else:
@@ -165,10 +162,6 @@ class Trace:
     def painted_m(self, begin_m: float, end_m: float) -> float:
         """Measure the length with paint between two places."""
         return STEP_M * int(np.count_nonzero(self.on & (self.s >= begin_m) & (self.s <= end_m)))
-
-    def _seen_between(self, begin: float, end: float) -> bool:
-        between = self.seen[(self.s > begin) & (self.s < end)]
-        return not len(between) or float(np.mean(between)) > 0.5
 
 
 @dataclass(frozen=True)
@@ -219,9 +212,8 @@ def _normalized(contrast: Array) -> Array:
     if np.count_nonzero(known) < 3:
         return np.full(len(contrast), np.nan)
     size = (1, 2 * round(SMOOTH_M / STEP_M / 2) + 1)
-    total, count = (
-        cv2.blur(a.reshape(-1, 1), size).ravel() for a in (np.nan_to_num(contrast), known.astype(np.float64))
-    )
+    values = np.nan_to_num(contrast), known.astype(np.float64)
+    total, count = (cv2.blur(a.reshape(-1, 1), size).ravel() for a in values)
     soft = np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
     # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
     level = float(np.quantile(soft[known], 0.875))
@@ -230,40 +222,27 @@ def _normalized(contrast: Array) -> Array:
     return np.asarray(soft, np.float64)
 
 
-def _runs(on: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """First and last index (K, 2) of each run."""
-    change = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
-    return np.stack([change[::2], change[1::2] - 1], 1)
-
-
 def stretches_of(strokes: Array) -> list[Stretch]:
     """Part strokes (K, 2) along a curve into solid and dashed stretches."""
     out: list[Stretch] = []
     solid: list[Array] = []
-    for part in _alike_parts(strokes):
-        if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
-            out += _solid_parts(solid)
-            solid = []
-            out += [Stretch(float(p[0, 0]), float(p[-1, 1]), "dashed", len(p)) for p in _split_long_gaps(part)]
-        else:
-            solid += list(part)
-    return out + _solid_parts(solid)
-
-
-def _split_long_gaps(strokes: Array) -> list[Array]:
-    """Part dashes (K, 2) where several are missing in a row, as lines end before a junction and begin again behind it."""
-    gaps = strokes[1:, 0] - strokes[:-1, 1]
-    usual = float(np.median(gaps) if len(gaps) > FEW_GAPS else gaps.min(initial=np.inf))
-    return np.split(strokes, np.flatnonzero(gaps > max(JUNCTION_M, LONG_GAPS * usual)) + 1)
-
-
-def _alike_parts(strokes: Array) -> list[Array]:
-    """Part strokes (K, 2) where much longer ones begin or end, as dashed lines become solid before a junction."""
+    # Dashed lines become solid before a junction: much longer strokes begin or end there.
     length = strokes[:, 1] - strokes[:, 0]
     short = length[length <= MAX_DASH_M]
     dash = float(np.median(short)) if len(short) else 0.0
     long = (length > SOLID_DASHES * dash) & (length > LONG_M) if len(short) > 1 else length > MAX_DASH_M
-    return np.split(strokes, np.flatnonzero(np.diff(long)) + 1) if len(strokes) else []
+    for part in np.split(strokes, np.flatnonzero(np.diff(long)) + 1) if len(strokes) else ():
+        if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
+            out += _solid_parts(solid)
+            solid = []
+            # Where several dashes are missing in a row, the line ends before a junction and begins again behind it.
+            gaps = part[1:, 0] - part[:-1, 1]
+            usual = float(np.median(gaps) if len(gaps) > FEW_GAPS else gaps.min(initial=np.inf))
+            pieces = np.split(part, np.flatnonzero(gaps > max(JUNCTION_M, LONG_GAPS * usual)) + 1)
+            out += [Stretch(float(p[0, 0]), float(p[-1, 1]), "dashed", len(p)) for p in pieces]
+        else:
+            solid += list(part)
+    return out + _solid_parts(solid)
 
 
 def is_dashed(strokes: Array) -> bool:
@@ -281,23 +260,19 @@ def is_dashed(strokes: Array) -> bool:
         return False
     s = np.arange(strokes[0, 0], strokes[-1, 1], STEP_M)
     on = (np.searchsorted(strokes[:, 0], s, side="right") - np.searchsorted(strokes[:, 1], s, side="right")) > 0
-    best, gain = None, MIN_GAIN
-    for period in _periods(strokes):
-        found = _fold(s, on, float(period))
-        if found is not None and found[0] > gain:
-            gain, best = found[0], found
-    return best is not None and best[1] >= MIN_ON and best[2] <= MAX_OFF
-
-
-def _periods(strokes: Array) -> Array:
-    """List periods that strokes (K, 2) may have: distances of neighbors, adjusted to their distance from first to last."""
+    # Periods are distances of neighbors, adjusted to their distance from first to last.
     middle = strokes.mean(axis=1)
     steps = np.concatenate([np.diff(edge[::every]) / every for edge in (middle, *strokes.T) for every in (1, 2)])
     steps = np.unique(np.round(steps[(steps >= PERIODS_M[0]) & (steps <= PERIODS_M[1])] / PHASE_M) * PHASE_M)
     length = np.concatenate([middle[-1:] - middle[:1], strokes[-1] - strokes[0]])
     adjusted = (length[:, None] / np.maximum(np.rint(length[:, None] / steps), 1)).ravel()
     periods = np.unique(np.round(np.concatenate([steps, adjusted]), 2))
-    return np.asarray(periods[1.5 * periods <= strokes[-1, 1] - strokes[0, 0]])
+    best, gain = None, MIN_GAIN
+    for period in periods[1.5 * periods <= strokes[-1, 1] - strokes[0, 0]]:
+        found = _fold(s, on, float(period))
+        if found is not None and found[0] > gain:
+            gain, best = found[0], found
+    return best is not None and best[1] >= MIN_ON and best[2] <= MAX_OFF
 
 
 def _fold(s: Array, on: NDArray[np.bool_], period: float) -> tuple[float, float, float] | None:
@@ -307,11 +282,7 @@ def _fold(s: Array, on: NDArray[np.bool_], period: float) -> tuple[float, float,
     count, painted = np.bincount(phase, minlength=bins), np.bincount(phase, on, minlength=bins)
     rate = painted / np.maximum(count, 1)
     inside = rate > 0.5 * rate.max()
-    if (
-        inside.all()
-        or np.count_nonzero(inside[1:] != inside[:-1]) + int(inside[0] != inside[-1]) != 2
-        or period * (~inside).mean() < MIN_BARE_M
-    ):
+    if np.count_nonzero(inside != np.roll(inside, 1)) != 2 or period * (~inside).mean() < MIN_BARE_M:
         return None
     n1, k1 = count[inside].sum(), painted[inside].sum()
     n0, k0 = count[~inside].sum(), painted[~inside].sum()

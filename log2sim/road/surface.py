@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -83,9 +84,20 @@ def take_sweep(
         standing = (height > MIN_HIDING_HEIGHT_M) & (height < MAX_OBSTACLE_HEIGHT_M)
         above = within[standing]
         above = above[:: max(len(above) // MAX_HIDING_POINTS, 1)]
-        # Nothing was measured below what the lowest beam meets: the side of a vehicle next to the sensor hides the ground as well.
-        standing &= _lowest(xyz[within] - sensor)
-        hiding = np.concatenate([xyz[above], _down_to_ground(xyz[within[standing]], height[standing])])
+        # Nothing was measured below the lowest return of a direction: the side of a vehicle next to the sensor hides the ground as
+        # well, which points every `FILL_STEP_M` down to it stand for.
+        away = xyz[within] - sensor
+        level = np.hypot(away[:, 0], away[:, 1])
+        slope = np.divide(away[:, 2], level, out=np.full(len(away), np.inf), where=level > 0)
+        turn = np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5
+        direction = np.minimum((turn * DIRECTIONS).astype(np.int64), DIRECTIONS - 1)
+        least = np.full(DIRECTIONS, np.inf)
+        np.minimum.at(least, direction, slope)
+        standing &= (slope <= least[direction]) & np.isfinite(slope)
+        count = np.ceil(height[standing] / FILL_STEP_M).astype(np.int64)
+        below = np.repeat(xyz[within[standing]], count, axis=0)
+        below[:, 2] -= FILL_STEP_M * (np.arange(len(below)) - np.repeat(np.cumsum(count) - count, count) + 1)
+        hiding = np.concatenate([xyz[above], below])
     near = within[np.abs(height) < NEAR_GROUND_M]
     near = near[:: -(-len(near) // most)] if len(near) > most else near
     cell, inside = raster.index_of(xyz[near, :2])
@@ -105,26 +117,6 @@ def take_sweep(
         np.full(len(near), list(log.lidars).index(lidar), np.int8),
     )
     return points, hiding
-
-
-def _lowest(away: Array) -> NDArray[np.bool_]:
-    """Mark the lowest return of each direction around a LiDAR, of points (N, 3), m, from it: none shows what is below it."""
-    level = np.hypot(away[:, 0], away[:, 1])
-    slope = np.divide(away[:, 2], level, out=np.full(len(away), np.inf), where=level > 0)
-    turn = np.arctan2(away[:, 1], away[:, 0]) / (2 * np.pi) + 0.5
-    direction = np.minimum((turn * DIRECTIONS).astype(np.int64), DIRECTIONS - 1)
-    least = np.full(DIRECTIONS, np.inf)
-    np.minimum.at(least, direction, slope)
-    return np.asarray((slope <= least[direction]) & np.isfinite(slope))
-
-
-def _down_to_ground(xyz: Array, height_m: NDArray[np.float32]) -> Array:
-    """Return points (F, 3) every `FILL_STEP_M` between points (N, 3), m, and the ground that far below them."""
-    count = np.ceil(height_m / FILL_STEP_M).astype(np.int64)
-    below = np.repeat(xyz, count, axis=0)
-    first = np.repeat(np.cumsum(count) - count, count)
-    below[:, 2] -= FILL_STEP_M * (np.arange(len(below)) - first + 1)
-    return np.asarray(below, dtype=np.float64)
 
 
 ROUNDS = 5
@@ -186,7 +178,10 @@ def estimate_surface(points: GroundPoints, raster: Raster, path: Array, z0_m: fl
     near = 1 / (1 + (points.range_m / HALF_WEIGHT_RANGE_M) ** 2)
     sums = _trimmed_means(cell, rest, near.astype(np.float32), raster.shape[0] * raster.shape[1])
     raw_weight, raw_middle = (a.reshape(raster.shape).astype(np.float32) for a in sums)
-    weight, middle = _smooth(np.minimum(raw_weight, FULL_WEIGHT), raw_middle)
+    # Smoothed by a Gaussian of one cell with their weights.
+    raw_weight = np.minimum(raw_weight, FULL_WEIGHT)
+    weight, heavy = (cv2.GaussianBlur(a, (5, 5), 1.0) for a in (raw_weight, raw_weight * raw_middle))
+    middle = np.divide(heavy, weight, out=np.zeros_like(heavy), where=weight > 0)
     measured = weight > 0.05
     filled = fill(np.where(measured, middle, 0), measured.astype(np.float32))
     distance = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, 3)
@@ -215,26 +210,15 @@ def _trimmed_means(
     and tires until it rests on points that are all within the noise.
     """
     heavy, weights = (near * z).astype(np.float64), near.astype(np.float64)
-    weight, mean = _means(cell, heavy, weights, count)
-    for k in range(ROUNDS):
+    kept: NDArray[Any] = np.ones(len(z), dtype=bool)
+    for k in range(ROUNDS + 1):
+        # A weight of 0 takes less time than a copy of the rows that are left.
+        weight, total = (np.bincount(cell, a * kept, count).astype(np.float64, copy=False) for a in (weights, heavy))
+        mean = np.divide(total, weight, out=np.zeros(count), where=weight > 0)
         wide = 2.0 ** max(ROUNDS - 2 - k, 0)
         off = z - mean.astype(np.float32).take(cell)
         kept = (off < wide * ABOVE_M) & (off > -wide * BELOW_M)
-        # A weight of 0 takes less time than a copy of the rows that are left.
-        weight, mean = _means(cell, heavy * kept, weights * kept, count)
     return weight, mean
-
-
-def _means(cell: NDArray[np.int64], heavy: Array, weights: Array, count: int) -> tuple[Array, Array]:
-    """Means (count,) of heights, of which `heavy` (N,) are the products with their weights (N,)."""
-    weight, total = (np.bincount(cell, values, count).astype(np.float64, copy=False) for values in (weights, heavy))
-    return weight, np.divide(total, weight, out=np.zeros(count), where=weight > 0)
-
-
-def _smooth(weight: NDArray[np.float32], z: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Smooth heights (R, C) by a Gaussian of one cell with their weights."""
-    total, sums = (np.asarray(cv2.GaussianBlur(a, (5, 5), 1.0), np.float32) for a in (weight, weight * z))
-    return total, np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
 
 
 def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -264,22 +248,18 @@ def _base_of(path: Array, raster: Raster, z0_m: float) -> NDArray[np.float32]:
         return np.zeros(raster.shape, dtype=np.float32)
     coarse = raster.coarser(max(round(PATH_CELL_M / raster.resolution_m), 1))
     rows, columns = np.mgrid[: coarse.shape[0], : coarse.shape[1]]
-    path = _extended(path)
-    _, nearest = cKDTree(path[:, :2]).query(coarse.xy_of(rows, columns).reshape(-1, 2))
-    z = (path[nearest, 2] - z0_m).reshape(coarse.shape).astype(np.float32)
-    z = cv2.GaussianBlur(z, (0, 0), PATH_SMOOTHING_CELLS, borderType=cv2.BORDER_REPLICATE)
-    return upsample(z, round(coarse.resolution_m / raster.resolution_m), raster.shape)
-
-
-def _extended(path: Array) -> Array:
-    """Extend a path (K, 3) straight on at both ends, by `EXTENSION_M` with the grade of its last meters."""
+    # Straight on at both ends, with the grade of the last meters.
     parts = [path]
     for end, inner in ((path[0], path), (path[-1], path[::-1])):
         far = np.hypot(*(inner[:, :2] - end[:2]).T) >= GRADE_BASE_M
         if far.any():
             step = (end - inner[int(np.argmax(far))]) / GRADE_BASE_M
             parts.append(end + np.arange(1, EXTENSION_M + 1)[:, None] * step)
-    return np.concatenate(parts)
+    path = np.concatenate(parts)
+    _, nearest = cKDTree(path[:, :2]).query(coarse.xy_of(rows, columns).reshape(-1, 2))
+    z = (path[nearest, 2] - z0_m).reshape(coarse.shape).astype(np.float32)
+    z = cv2.GaussianBlur(z, (0, 0), PATH_SMOOTHING_CELLS, borderType=cv2.BORDER_REPLICATE)
+    return upsample(z, round(coarse.resolution_m / raster.resolution_m), raster.shape)
 
 
 def upsample(values: NDArray[np.float32], factor: int, shape: tuple[int, int]) -> NDArray[np.float32]:

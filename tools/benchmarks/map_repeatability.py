@@ -98,7 +98,7 @@ def measure_offsets(a: GroundMap, b: GroundMap, layer: str = "color") -> Offsets
             if np.isnan(offset).any():
                 unlike += 1
                 continue
-            middle = a.xy_of(parts[0][0].start + r + n / 2 - 0.5, parts[0][1].start + c + n / 2 - 0.5)
+            middle = a.raster.xy_of(parts[0][0].start + r + n / 2 - 0.5, parts[0][1].start + c + n / 2 - 0.5)
             found.append((*middle, *offset))
     table = np.array(found).reshape(-1, 4)
     return Offsets(table[:, :2], np.hypot(*table[:, 2:].T), table[:, 2:], unlike)
