@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Timeline, spans_of
 from log2sim.agents.evidence import MIN_TICK_RAYS
 from log2sim.agents.rays import count_at
-from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Finding, Obstacles, Waypoints
+from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Finding, Obstacles
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
 # Of a long log, so that the memory does not grow with agents times ticks.
@@ -79,14 +79,11 @@ def _overlaps(boxes: AgentTable, touching: float) -> tuple[NDArray[Any], ...]:
     share = overlap_of_smaller(boxes.rectangles(first, tick), boxes.rectangles(second, tick))
     over = share > touching
     first, second, tick = first[over], second[over], tick[over]
-    return first, second, tick, share[over], _depths(boxes.rectangles(first, tick), boxes.rectangles(second, tick))
-
-
-def _depths(a: Array, b: Array) -> Array:
-    """Return by how much (n,) one of two rectangles, (n, 5) each: x, y, length, width, yaw, has to move to be apart."""
+    a, b = boxes.rectangles(first, tick), boxes.rectangles(second, tick)
     dx, dy = (b[:, :2] - a[:, :2]).T
     axes = separating_axes(a[:, 4], b[:, 4], a[:, 2:4], b[:, 2:4])
-    return np.asarray(np.min([reach - np.abs(dx * nx + dy * ny) for nx, ny, reach, _ in axes], axis=0))
+    depth = np.min([reach - np.abs(dx * nx + dy * ny) for nx, ny, reach, _ in axes], axis=0)
+    return first, second, tick, share[over], depth
 
 
 def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[AgentCandidate]:
@@ -114,35 +111,26 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
         over = over[alive[stronger, over]]
         left = alive[weaker].copy()
         left[over] = False
-        left = _longest_run(left)
+        longest = max(spans_of(left), key=len, default=np.zeros(0, dtype=np.intp))  # the first of several
+        left = np.zeros_like(left)
+        left[longest] = True
         if of_ego or left.sum() >= MIN_KEPT_SHARE * alive[weaker].sum():
             alive[weaker] = left
-    kept = [k for k in range(len(candidates)) if alive[k].sum() >= min(MIN_KEPT_TICKS, present[k].sum())]
-    return [_cut(candidates[k], t_s, present[k], alive[k]) for k in kept]
-
-
-def _longest_run(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Keep only the longest run of a mask (T,), the first of several; gaps of absence end it."""
-    out = np.zeros_like(mask)
-    out[max(spans_of(mask), key=len, default=np.zeros(0, dtype=np.intp))] = True
-    return out
-
-
-def _cut(candidate: AgentCandidate, t_s: Array, present: NDArray[np.bool_], alive: NDArray[np.bool_]) -> AgentCandidate:
-    """Return a candidate at the ticks (T,) at which it is alive, out of those at which it is present."""
-    if (alive == present).all():
-        return candidate
-    first_s, last_s = t_s[alive][[0, -1]]
-    agent, w = candidate.agent, candidate.agent.waypoints
-    return replace(candidate, agent=replace(agent, waypoints=_during(agent, w, float(first_s), float(last_s))))
-
-
-def _during(agent: Agent, w: Waypoints, first_s: float, last_s: float) -> Waypoints:
-    """Take the waypoints from a first to a last time; those of a static agent stand at its ends."""
-    if agent.static:
-        ends = w.take(np.array([0, len(w) - 1])[: 1 + (last_s > first_s)])
-        return replace(ends, t_s=np.array([first_s, last_s])[: len(ends)])
-    return w.take((w.t_s >= first_s - MARGIN_S) & (w.t_s <= last_s + MARGIN_S))
+    kept = []
+    for k, candidate in enumerate(candidates):
+        if alive[k].sum() < min(MIN_KEPT_TICKS, present[k].sum()):
+            continue
+        if (alive[k] != present[k]).any():
+            first_s, last_s = t_s[alive[k]][[0, -1]].tolist()
+            w = candidate.agent.waypoints
+            if candidate.agent.static:  # its waypoints stand at its ends
+                w = w.take(np.array([0, len(w) - 1])[: 1 + (last_s > first_s)])
+                w = replace(w, t_s=np.array([first_s, last_s])[: len(w)])
+            else:
+                w = w.take((w.t_s >= first_s - MARGIN_S) & (w.t_s <= last_s + MARGIN_S))
+            candidate = replace(candidate, agent=replace(candidate.agent, waypoints=w))
+        kept.append(candidate)
+    return kept
 
 
 def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s: Array) -> list[list[Finding]]:
@@ -166,9 +154,7 @@ def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s
 
 def _doubt(found: Finding, conflict: Conflict, t_s: Array, agent: Agent) -> Finding:
     """Return a finding that holds during a conflict, for the whole life of an agent where it always holds."""
-    worst_s, first_s, last_s = (
-        float(t_s[k]) for k in (conflict.tick[conflict.share.argmax()], conflict.tick[0], conflict.tick[-1])
-    )
+    worst_s, first_s, last_s = t_s[conflict.tick[[conflict.share.argmax(), 0, -1]]].tolist()
     if first_s <= agent.waypoints.t_s[0] + MARGIN_S and last_s >= agent.waypoints.t_s[-1] - MARGIN_S:
         return found
     return replace(found, start_s=first_s, end_s=last_s, values={"at_s": worst_s})
@@ -201,17 +187,11 @@ def extend_static(
         before = before[before > max(before[taken[before]], default=-1)]
         after = after[after < min(after[taken[after]], default=len(t_s))]
         if len(before) or len(after):
-            out[rows[n]] = replace(agent, waypoints=_held(w, t_s[before], t_s[after]))
+            index = np.concatenate([0 * before, np.arange(len(w)), 0 * after + len(w) - 1])
+            seen = np.concatenate([np.zeros(len(before), bool), w.observed, np.zeros(len(after), bool)])
+            life_s = np.concatenate([t_s[before], w.t_s, t_s[after]])
+            out[rows[n]] = replace(agent, waypoints=replace(w.take(index), t_s=life_s, observed=seen))
     return out
-
-
-def _held(w: Waypoints, before_s: Array, after_s: Array) -> Waypoints:
-    """Return waypoints that stay at their ends at earlier and later times, at which nothing was observed."""
-    index = np.concatenate([np.zeros(len(before_s)), np.arange(len(w)), np.full(len(after_s), len(w) - 1)]).astype(
-        np.intp
-    )
-    observed = np.concatenate([np.zeros(len(before_s), bool), w.observed, np.zeros(len(after_s), bool)])
-    return replace(w.take(index), t_s=np.concatenate([before_s, w.t_s, after_s]), observed=observed)
 
 
 def _free_places(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], t_s: Array) -> NDArray[np.bool_]:

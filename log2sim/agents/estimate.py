@@ -128,7 +128,8 @@ def with_pose_errors(agent: Agent, log: Log, timeline: Timeline) -> Agent:
     variances = bridging_variances(log.ego, ticks)
     if not variances.any():
         return agent
-    away_m2 = np.sum((log.ego.at(ticks)[0][:, :2, 3] - _positions(agent, timeline.seconds(ticks))) ** 2, axis=1)
+    xy = np.stack([np.interp(timeline.seconds(ticks), w.t_s, column) for column in (w.x_m, w.y_m)], axis=1)
+    away_m2 = np.sum((log.ego.at(ticks)[0][:, :2, 3] - xy) ** 2, axis=1)
     position, yaw = variances[:, 0] + away_m2 * variances[:, 1], variances[:, 1]
     if agent.static:
         position, yaw = (np.full(len(w), v.min()) for v in (position, yaw))
@@ -137,12 +138,6 @@ def with_pose_errors(agent: Agent, log: Log, timeline: Timeline) -> Agent:
         sigma_xy_m=None if w.sigma_xy_m is None else np.sqrt(w.sigma_xy_m**2 + position),
         sigma_yaw_rad=None if w.sigma_yaw_rad is None else np.sqrt(w.sigma_yaw_rad**2 + yaw),
     ))  # fmt: skip
-
-
-def _positions(agent: Agent, t_s: Array) -> Array:
-    """Interpolate the positions (N, 2), m, of an agent at times (N,)."""
-    w = agent.waypoints
-    return np.stack([np.interp(t_s, w.t_s, w.x_m), np.interp(t_s, w.t_s, w.y_m)], axis=1)
 
 
 def ego_path(log: Log, schedule: Schedule) -> Array:
@@ -203,37 +198,25 @@ def simplify_waypoints(w: Waypoints) -> Waypoints:
     -----
     Greedy: from each kept waypoint the farthest next one is searched with steps that double, then halve.
     """
-    columns, tolerances = _toleranced(w)
+    exact = np.full(len(w), 0.0)
+    toleranced = [(w.x_m, exact + TOLERANCE_M), (w.y_m, exact + TOLERANCE_M), (w.z_m, exact + TOLERANCE_M)]
+    toleranced += [(np.unwrap(w.yaw_rad), exact + TOLERANCE_RAD), (w.speed_mps, exact + TOLERANCE_MPS)]
+    sigmas = (w.sigma_xy_m, TOLERANCE_M), (w.sigma_yaw_rad, TOLERANCE_RAD), (w.sigma_speed_mps, TOLERANCE_MPS)
+    toleranced += [(s, tolerance + SIGMA_SHARE * s) for s, tolerance in sigmas if s is not None]
+    columns, tolerances = (np.column_stack(c) for c in zip(*toleranced, (w.observed.astype(np.float64), exact)))
     kept, last = [0], len(w) - 1
     while kept[-1] < last:
         start = kept[-1]
         step, reach = 1, 1
         while step and start + reach < last:
             end = min(start + reach + step, last)
-            if _is_linear(w.t_s, columns, tolerances, start, end):
+            between = slice(start + 1, end)
+            share = (w.t_s[between] - w.t_s[start]) / (w.t_s[end] - w.t_s[start])
+            line = columns[start] + share[:, None] * (columns[end] - columns[start])
+            near = bool((np.abs(columns[between] - line) <= tolerances[between]).all())
+            if near and w.observed[start] == w.observed[end] and w.t_s[end] - w.t_s[start] <= MAX_INTERVAL_S:
                 reach, step = end - start, 2 * step
             else:
                 step //= 2
         kept.append(start + reach)
     return w.take(np.array(kept, dtype=np.intp)) if len(kept) < len(w) else w
-
-
-def _toleranced(w: Waypoints) -> tuple[Array, Array]:
-    """Return the columns (T, K) of waypoints and the tolerances (T, K) of each value."""
-    exact = np.full(len(w), 0.0)
-    columns = [(w.x_m, exact + TOLERANCE_M), (w.y_m, exact + TOLERANCE_M), (w.z_m, exact + TOLERANCE_M)]
-    columns += [(np.unwrap(w.yaw_rad), exact + TOLERANCE_RAD), (w.speed_mps, exact + TOLERANCE_MPS)]
-    sigmas = (w.sigma_xy_m, TOLERANCE_M), (w.sigma_yaw_rad, TOLERANCE_RAD), (w.sigma_speed_mps, TOLERANCE_MPS)
-    columns += [(s, tolerance + SIGMA_SHARE * s) for s, tolerance in sigmas if s is not None]
-    columns.append((w.observed.astype(np.float64), exact))
-    values, tolerances = zip(*columns)
-    return np.column_stack(values), np.column_stack(tolerances)
-
-
-def _is_linear(t: Array, columns: Array, tolerances: Array, start: int, end: int) -> bool:
-    """Decide whether the rows between two lie on the line between these, `observed` included."""
-    if t[end] - t[start] > MAX_INTERVAL_S or columns[start, -1] != columns[end, -1]:
-        return False
-    share = (t[start + 1 : end] - t[start]) / (t[end] - t[start])
-    line = columns[start] + share[:, None] * (columns[end] - columns[start])
-    return bool((np.abs(columns[start + 1 : end] - line) <= tolerances[start + 1 : end]).all())

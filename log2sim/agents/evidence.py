@@ -21,7 +21,6 @@ from log2sim.datatypes import (
     MAX_SIZE_M,
     MIN_SIZE_M,
     TYPICAL_SIZE_M,
-    Agent,
     AgentTable,
     Log,
     Obstacles,
@@ -29,7 +28,7 @@ from log2sim.datatypes import (
 )
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.files.processes import map_in_processes
-from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, project
+from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
 from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
 from log2sim.perception.lidar.measure import logit
 from log2sim.perception.sync import Schedule
@@ -37,18 +36,11 @@ from log2sim.perception.sync import Schedule
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What the sensors of a log recorded at the ticks of a run.
-
-    Attributes
-    ----------
-    schedule : Schedule
-        Its cameras are those that were searched.
-    clouds : T Obstacles, None at ticks without LiDAR
-    """
+    """What the sensors of a log recorded at the ticks of a run."""
 
     log: Log
-    schedule: Schedule
-    clouds: Sequence[Obstacles | None]
+    schedule: Schedule  # its cameras are those that were searched
+    clouds: Sequence[Obstacles | None]  # (T,): None at ticks without LiDAR
     timeline: Timeline
 
     @property
@@ -140,28 +132,45 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     if group == "vehicle" and in_sweep.any():
         sweep = min(sweep + MATCH_NATS * candidate.followed, MAX_LOG_ODDS)
     moved = sweep + float(np.log1p(way_m / DRIFT_M)) if in_sweep.any() else 0.0
+    # The place of a standing agent is fitted to its measurements, so their residuals are no test of it; and the measured centers of
+    # a long moving vehicle lag behind its points.
+    geometry, at = candidate.geometry, timeline.seconds(m.t_ns)
+    xy, covariance = (geometry.xy_m, geometry.covariance) if moving else (m.center_m[:, :2], m.covariance)
+    off = xy - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
+    scatter = float(np.median(np.einsum("na,nab,nb->n", off, np.linalg.pinv(covariance), off)))
+    smallest, typical, largest = (np.array(t[agent.category]) for t in (MIN_SIZE_M, TYPICAL_SIZE_M, MAX_SIZE_M))
+    odd = (np.log(np.array(agent.size_m) / typical) * LIMIT_SIGMAS / np.log(largest / smallest))[:2]
+    placed = (m.source == "topdown") & np.isfinite(m.height_px_m)
+    placed = placed & ~m.truncated if (placed & ~m.truncated).any() else placed
+    high = np.log(m.height_px_m[placed] / typical[2] + 1e-3).clip(-LIMITS["odd_height"][1], LIMITS["odd_height"][1])
+    widest = (m.high_m - m.low_m).max(axis=1)[m.points >= MIN_WIDE_POINTS]
+    widest = widest[np.isfinite(widest)]
+    thin = float(np.log(typical[1] / (np.median(widest) + EXTENT_ERROR_M))) if len(widest) else 0.0
+    # By images alone, people and what has an unlikely size need more than others.
+    ordinary = geometry.is_likely and group != "pedestrian"
+    shown = image_confidence(track)
+    sure = shown >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
+    knows_speed = moving and w.sigma_speed_mps is not None
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
-        "image": float(logit(np.array(image_confidence(track)))) if in_image.any() else 0.0,
+        "image": float(logit(np.array(shown))) if in_image.any() else 0.0,
         "no_image": float(not in_image.any()),
         "travel": float(np.log1p(way_m / agent.size_m[0])),
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
-        "scatter": np.log1p(_scatter(candidate, timeline)),
+        "scatter": np.log1p(scatter),
         "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
-        "unlikely_size": float(not candidate.geometry.is_likely),
-        "odd_size": _odd_size(agent),
-        "odd_height": _odd_height(candidate),
-        "thin": _thin(candidate) if group == "pedestrian" else 0.0,
+        "unlikely_size": float(not geometry.is_likely),
+        "odd_size": float(np.hypot(*odd)),
+        "odd_height": float(np.sqrt(np.mean(high**2))) if placed.any() else 0.0,
+        "thin": max(thin, 0.0) if group == "pedestrian" else 0.0,
         "heading": float(log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), 0.01, 0.99))),
         "other_category": float((m.category != agent.category).mean()),
         "impossible": float(any(d.kind != "heading_ambiguous" for d in agent.doubts)),
-        "sigma_speed": np.log(np.median(w.sigma_speed_mps) / 0.3 + 1e-3)
-        if moving and w.sigma_speed_mps is not None
-        else 0.0,
+        "sigma_speed": np.log(np.median(w.sigma_speed_mps) / 0.3 + 1e-3) if knows_speed else 0.0,
         "moving": float(moving),
-        "confirmed": float(moved >= MIN_SWEEP_LOG_ODDS or _shown_well(candidate)),
+        "confirmed": float(moved >= MIN_SWEEP_LOG_ODDS or sure),
         "two_wheeler": float(group == "two_wheeler"),
         "pedestrian": float(group == "pedestrian"),
     }
@@ -170,22 +179,6 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
 
 # Fewer points may lie on one side of a person; by so much extents of points err, m.
 MIN_WIDE_POINTS, EXTENT_ERROR_M = 5, 0.05
-
-
-def _thin(candidate: AgentCandidate) -> float:
-    """Return the logarithm of the typical width over the median of the widest extents of the points, 0 where these are wide or few."""
-    m = candidate.track.measurements
-    widest = (m.high_m - m.low_m).max(axis=1)[m.points >= MIN_WIDE_POINTS]
-    widest = widest[np.isfinite(widest)]
-    if not len(widest):
-        return 0.0
-    return max(float(np.log(TYPICAL_SIZE_M[candidate.agent.category][1] / (np.median(widest) + EXTENT_ERROR_M))), 0.0)
-
-
-def _odd_size(agent: Agent) -> float:
-    """Return by how many standard deviations of the category length and width differ from the typical ones."""
-    smallest, typical, largest = (np.array(t[agent.category][:2]) for t in (MIN_SIZE_M, TYPICAL_SIZE_M, MAX_SIZE_M))
-    return float(np.hypot(*(np.log(np.array(agent.size_m[:2]) / typical) * LIMIT_SIGMAS / np.log(largest / smallest))))
 
 
 # Confidence by images that suffices. A track whose size is unlikely for its category needs more, as do people, whom poles, bushes
@@ -206,12 +199,6 @@ def may_suffice(track: Track, *, static: bool) -> bool:
     way_m = 0.0 if static else MOST_FOLLOWED * float(np.hypot(*np.ptp(m.center_m[:, :2], axis=0)))
     in_sweep = np.isfinite(m.box_yaw_rad).any()
     return bool(in_sweep and sweep_log_odds(track) + np.log1p(way_m / DRIFT_M) >= MIN_SWEEP_LOG_ODDS)
-
-
-def _shown_well(candidate: AgentCandidate) -> bool:
-    """Return whether the detections of a candidate in images suffice."""
-    ordinary = candidate.geometry.is_likely and GROUP_OF[candidate.agent.category] != "pedestrian"
-    return image_confidence(candidate.track) >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
 
 
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video
@@ -261,28 +248,6 @@ def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded:
     recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
     hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
     return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))
-
-
-def _scatter(candidate: AgentCandidate, timeline: Timeline) -> float:
-    """Return the median of the squared distances of measurements from the trajectory in standard deviations."""
-    m, at = candidate.track.measurements, timeline.seconds(candidate.track.measurements.t_ns)
-    w, geometry = candidate.agent.waypoints, candidate.geometry
-    # The place of a standing agent is fitted to its measurements, so their residuals are no test of it; and the measured
-    # centers of a long moving vehicle lag behind its points.
-    centers = (m.center_m[:, :2], m.covariance) if candidate.agent.static else (geometry.xy_m, geometry.covariance)
-    off = centers[0] - np.stack([np.interp(at, w.t_s, w.x_m), np.interp(at, w.t_s, w.y_m)], axis=1)
-    return float(np.median(np.einsum("na,nab,nb->n", off, np.linalg.pinv(centers[1]), off)))
-
-
-def _odd_height(candidate: AgentCandidate) -> float:
-    """Return the root mean square logarithm of the heights of image boxes over the typical one, of whole boxes if there are any."""
-    m = candidate.track.measurements
-    placed = (m.source == "topdown") & np.isfinite(m.height_px_m)
-    rows = placed & ~m.truncated if (placed & ~m.truncated).any() else placed
-    if not rows.any():
-        return 0.0
-    share = np.log(m.height_px_m[rows] / TYPICAL_SIZE_M[candidate.agent.category][2] + 1e-3)
-    return float(np.sqrt(np.mean(np.clip(share, -LIMITS["odd_height"][1], LIMITS["odd_height"][1]) ** 2)))
 
 
 # Agents times ticks that are looked at together; each takes about a hundred bytes.
@@ -437,17 +402,12 @@ def shown_in_images(boxes: AgentTable, recording: Recording) -> NDArray[np.bool_
             cloud, rows = recording.clouds[tick], np.flatnonzero(boxes.present[:, tick])
             if cloud is None or np.linalg.norm(map_T_cam[:3, 3] - cloud.origin - cloud.sensor) > MAX_BASELINE_M:
                 continue
-            shown[rows, tick] |= _shown(camera, map_T_cam, boxes.center_m[rows, tick], boxes.size_m[rows, 2])
+            in_cam = apply(inverse(map_T_cam), boxes.center_m[rows, tick])
+            uv, inside = project(camera, in_cam)
+            border = BORDER_SHARE * camera.width_px
+            inside &= np.abs(np.nan_to_num(uv[:, 0]) - camera.width_px / 2) < camera.width_px / 2 - border
+            shown[rows, tick] |= inside & (camera.K[1, 1] * boxes.size_m[rows, 2] >= MIN_HEIGHT_PX * in_cam[:, 2])
     return shown
-
-
-def _shown(camera: Camera, map_T_cam: Array, center_m: Array, height_m: Array) -> NDArray[np.bool_]:
-    """Mark the boxes (M,) with these centers (M, 3) and heights (M,) that an image shows."""
-    in_cam = apply(inverse(map_T_cam), center_m)
-    uv, inside = project(camera, in_cam)
-    border = BORDER_SHARE * camera.width_px
-    inside &= np.abs(np.nan_to_num(uv[:, 0]) - camera.width_px / 2) < camera.width_px / 2 - border
-    return np.asarray(inside & (camera.K[1, 1] * height_m >= MIN_HEIGHT_PX * in_cam[:, 2]))
 
 
 # Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken

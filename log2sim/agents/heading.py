@@ -222,11 +222,13 @@ def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -
     """
     odds, weights = [], []
     for passing in _passing_by(pose[:2], paths, float(pose[2])):
-        along = _direction_at(passing.left_m if keeps_right else -passing.left_m)
+        left_m = passing.left_m if keeps_right else -passing.left_m
+        across = NEAR_CURB if left_m < 0 else 1.0 - (NEXT_LANE if left_m < BEYOND_M else BEYOND)
+        along = IN_LANE if abs(left_m) < IN_LANE_M else across
         chance = 0.5 + passing.belongs * (along - 0.5)
         sign = 1.0 if np.cos(passing.heading_rad - pose[2]) > 0 else -1.0
         odds.append(sign * float(log_odds_of(chance)))
-        weights.append(passing.weight)
+        weights.append(passing.belongs / (1.0 + abs(passing.left_m) / 2) ** 2)
     total = float(np.sum(weights))
     return float(np.dot(weights, odds) / total) if total > 0 else 0.0
 
@@ -245,11 +247,6 @@ class _Passing:
     heading_rad: float  # of the path
     belongs: float  # probability that the place belongs to its street
 
-    @property
-    def weight(self) -> float:
-        """Of what the path says, beside other paths."""
-        return self.belongs / (1.0 + abs(self.left_m) / 2) ** 2
-
 
 def _passing_by(xy: Array, paths: Sequence[Array], yaw_rad: float | None) -> list[_Passing]:
     """Find how each path passes a place (2,), or something there with a yaw, which should be parallel."""
@@ -266,15 +263,6 @@ def _passing_by(xy: Array, paths: Sequence[Array], yaw_rad: float | None) -> lis
         k = int(np.argmax(belongs))
         found.append(_Passing(float(left[k]), float(path[k, 2]), float(belongs[k])))
     return found
-
-
-def _direction_at(left_m: float) -> float:
-    """Return the probability that the street goes the way of a path at a place left of it, where traffic keeps right."""
-    if abs(left_m) < IN_LANE_M:
-        return IN_LANE
-    if left_m < 0:
-        return NEAR_CURB
-    return 1.0 - (NEXT_LANE if left_m < BEYOND_M else BEYOND)
 
 
 # Neighbors of one row: axes are parallel within three standard deviations of a parked car's yaw; bumper to bumper with room for one
@@ -407,8 +395,16 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     """
     of = [k for k, c in enumerate(candidates) if GROUP_OF[c.agent.category] in ("vehicle", "two_wheeler")]
     road_users = [candidates[k] for k in of]
-    alone = np.array([_own_log_odds(c, timeline) for c in road_users])
-    own = continued_log_odds([c.agent.waypoints for c in road_users], alone)
+    alone = []
+    for c in road_users:
+        w, m = c.agent.waypoints, c.track.measurements
+        t_s = timeline.seconds(m.t_ns)
+        odds = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad)))
+        if GROUP_OF[c.agent.category] == "vehicle":
+            outline = outline_log_odds(c.track, w, t_s, c.agent.size_m)
+            odds = POINTS_SHARE * (odds + outline) if odds and outline else odds + outline
+        alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0]))
+    own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
     paths = [_path_of(c, odds) for c, odds in zip(road_users, own.tolist())]
     road_users = [_along_street(c, [ego_path, *paths]) for c in road_users]
     middle = [(c.agent.waypoints, len(c.agent.waypoints) // 2) for c in road_users]
@@ -422,19 +418,13 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     chance = headings_of(rows, own, street, side_log_odds([ego_path, *paths]))
     decided = list(candidates)
     for k, candidate, along in zip(of, road_users, chance.tolist()):
-        decided[k] = _decided(candidate, along)
+        agent, w, confidence = candidate.agent, candidate.agent.waypoints, max(along, 1 - along)
+        if along < 0.5:
+            w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=0.0 - w.speed_mps)  # never -0.0
+        agent = replace(agent, waypoints=w, quality={**agent.quality, "heading_confidence": round(confidence, 3)})
+        doubts = [Finding("heading_ambiguous")] if confidence < MIN_HEADING_CONFIDENCE else []
+        decided[k] = replace(candidate, agent=agent).doubted(doubts)
     return [c.doubted(motion_doubts(c.agent.category, c.agent.waypoints)) for c in decided]
-
-
-def _own_log_odds(candidate: AgentCandidate, timeline: Timeline) -> float:
-    """Return the log-odds that a candidate points along its yaw, by what is known of it alone."""
-    agent, m = candidate.agent, candidate.track.measurements
-    w, t_s = agent.waypoints, timeline.seconds(m.t_ns)
-    odds = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad)))
-    if GROUP_OF[agent.category] == "vehicle":
-        outline = outline_log_odds(candidate.track, w, t_s, agent.size_m)
-        odds = POINTS_SHARE * (odds + outline) if odds and outline else odds + outline
-    return odds if agent.static else odds + course_log_odds(w, agent.size_m[0])
 
 
 def _path_of(candidate: AgentCandidate, log_odds: float) -> Array:
@@ -457,15 +447,3 @@ def _along_street(candidate: AgentCandidate, paths: Sequence[Array]) -> AgentCan
     n = len(w.t_s)
     w = replace(w, yaw_rad=np.full(n, wrap_angle(yaw)), sigma_yaw_rad=np.full(n, sigma))
     return replace(candidate, agent=replace(candidate.agent, waypoints=w))
-
-
-def _decided(candidate: AgentCandidate, along: float) -> AgentCandidate:
-    """Turn a candidate to its likelier heading, given the probability of its yaw, and doubt it if that is unlikely too."""
-    agent, confidence = candidate.agent, max(along, 1 - along)
-    if along < 0.5:
-        w = agent.waypoints
-        w = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=0.0 - w.speed_mps)  # never -0.0
-        agent = replace(agent, waypoints=w)
-    agent = replace(agent, quality={**agent.quality, "heading_confidence": round(confidence, 3)})
-    doubts = [Finding("heading_ambiguous")] if confidence < MIN_HEADING_CONFIDENCE else []
-    return replace(candidate, agent=agent).doubted(doubts)

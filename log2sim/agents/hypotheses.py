@@ -16,7 +16,6 @@ from log2sim.agents.smooth.fixed_interval import (
     PLACE_SIGMA_M,
     REPEATED_SHARE,
     STANDING,
-    MarginalLikelihood,
     MotionPriorSigmas,
     Positions,
     marginal_likelihood,
@@ -55,8 +54,13 @@ def motion_of_ends(track: Track) -> tuple[float, float]:
     if GROUP_OF[track.category] != "vehicle" or len(rows) < MIN_START_ROWS:
         return 0.0, -np.inf
     rows = rows[_spread(len(rows))]
-    yaw, yaw_sigma = _axis(m.yaw_rad[rows])
-    turned_m = TYPICAL_SIZE_M[track.category][1] * yaw_sigma
+    # The length axis of most of the yaws, which are known up to quarter turns.
+    yaw_rad = m.yaw_rad[rows]
+    yaw = float(np.angle(np.exp(4j * yaw_rad).sum())) / 4
+    off = wrap_angle(4 * (yaw_rad - yaw)) / 4
+    is_across = np.abs(np.sin(yaw_rad - yaw)) > np.abs(np.cos(yaw_rad - yaw))
+    yaw += np.pi / 2 if is_across.mean() > 0.5 else 0.0
+    turned_m = TYPICAL_SIZE_M[track.category][1] * float(np.sqrt(np.mean(off**2)))
     ends = ends_of(track, rows, np.full(len(rows), yaw), np.zeros((len(rows), 2)))
     origin = rotate(m.sensor_m[rows, :2] - m.center_m[rows[0], :2], -yaw)
     # Frames that share a sweep measure the same points at the same time.
@@ -67,14 +71,6 @@ def motion_of_ends(track: Track) -> tuple[float, float]:
     drives, starts = _log_odds(along)
     # Ends that move across, too, are those of something else.
     return drives, starts if not across or _log_odds(across)[1] <= 0 else -np.inf
-
-
-def _axis(yaw_rad: Array) -> tuple[float, float]:
-    """Return the length axis of most of the yaws (n,) of one vehicle, and their standard deviation up to quarter turns, in rad."""
-    mean = float(np.angle(np.exp(4j * yaw_rad).sum())) / 4
-    off = wrap_angle(4 * (yaw_rad - mean)) / 4
-    is_across = np.abs(np.sin(yaw_rad - mean)) > np.abs(np.cos(yaw_rad - mean))
-    return mean + (np.pi / 2 if is_across.mean() > 0.5 else 0.0), float(np.sqrt(np.mean(off**2)))
 
 
 def _observed_ends(t: Array, ends: Ends, origin: Array, axis: int, sigma_m: float) -> list[Positions]:
@@ -89,22 +85,17 @@ def _observed_ends(t: Array, ends: Ends, origin: Array, axis: int, sigma_m: floa
         positions = Positions(t[seen], place, variance[seen, axis, side, None].repeat(2, axis=1))
         # What no motion of a vehicle explains is an outlier of each hypothesis.
         motion = MotionPriorSigmas(FIRST_SPEED_MPS["vehicle"], ACCELERATION_MPS2["vehicle"])
-        kept = positions.take(marginal_likelihood(positions, motion).inlier)
-        if len(kept) >= MIN_START_ROWS:
-            found.append(_scattering(kept))
+        p = positions.take(marginal_likelihood(positions, motion).inlier)
+        if len(p) < MIN_START_ROWS:
+            continue
+        # Variances of positions that scatter more about those next to them than they say are enlarged (Birge, 1932).
+        share = np.diff(p.t_s)[:-1] / (p.t_s[2:] - p.t_s[:-2])
+        off = p.xy_m[1:-1, 0] - p.xy_m[:-2, 0] * (1 - share) - p.xy_m[2:, 0] * share
+        weights, rows = np.zeros((len(off), len(p))), np.arange(len(off))
+        weights[rows, rows], weights[rows, rows + 1], weights[rows, rows + 2] = share - 1, 1.0, -share
+        expected = np.einsum("ij,jk,ik->i", weights, noise_of(p), weights)
+        found.append(Positions(p.t_s, p.xy_m, p.variance * max(1.0, float(np.mean(off**2 / expected)))))
     return found
-
-
-def _scattering(p: Positions) -> Positions:
-    """Enlarge the variances of positions that scatter more about those next to them than they say (Birge, 1932)."""
-    share = np.diff(p.t_s)[:-1] / (p.t_s[2:] - p.t_s[:-2])
-    off = p.xy_m[1:-1, 0] - p.xy_m[:-2, 0] * (1 - share) - p.xy_m[2:, 0] * share
-    noise = noise_of(p)
-    weights = np.zeros((len(off), len(p)))
-    rows = np.arange(len(off))
-    weights[rows, rows], weights[rows, rows + 1], weights[rows, rows + 2] = share - 1, 1.0, -share
-    expected = np.einsum("ij,jk,ik->i", weights, noise, weights)
-    return Positions(p.t_s, p.xy_m, p.variance * max(1.0, float(np.mean(off**2 / expected))))
 
 
 def _log_odds(ends: list[Positions]) -> tuple[float, float]:
@@ -167,7 +158,9 @@ def explain_track(track: Track) -> list[Part]:
         return [Part(track, static=GROUP_OF[track.category] == "vehicle")]
     rows = _spread(len(track))
     positions = _positions_of(track, rows)
-    moving, at_rest = (marginal_likelihood(positions, motion) for motion in (_expected_motion(track), STANDING))
+    group = GROUP_OF[track.category]
+    expected = MotionPriorSigmas(FIRST_SPEED_MPS[group], ACCELERATION_MPS2[group])
+    moving, at_rest = (marginal_likelihood(positions, motion) for motion in (expected, STANDING))
     log, parts = _standing_parts(track, positions)
     drives, starts = motion_of_ends(track)
     # The center of a long vehicle wanders while more of it comes into view; its ends do not.
@@ -178,10 +171,15 @@ def explain_track(track: Track) -> list[Part]:
         return [Part(track, static=False)]
     if parts and log > moving.log:
         return [replace(p, static=motion_of_ends(p.track)[1] + STARTS_LOG <= MIN_LOG_ODDS) for p in parts]
-    if not moving.inlier.all():
-        cut = _best_cut(positions, moving, _expected_motion(track))
-        if cut is not None:
-            first = rows[cut]
+    if not moving.inlier.all() and len(positions) >= 2 * MIN_ROWS:
+        # Two objects, of which the second is seen after the first.
+        count = min(len(positions) - 2 * MIN_ROWS + 1, MAX_SPLITS)
+        cuts = np.unique(np.linspace(MIN_ROWS, len(positions) - MIN_ROWS, count).astype(np.intp))
+        halves = [(positions.take(slice(k)), positions.take(slice(k, None))) for k in cuts]
+        logs = [sum(marginal_likelihood(half, expected).log for half in both) for both in halves]
+        best = int(np.argmax(logs))
+        if logs[best] + NEXT_OBJECT_LOG > moving.log + MIN_LOG_ODDS:
+            first = rows[cuts[best]]
             parts = [p for part in (slice(first), slice(first, None)) for p in explain_track(_taken(track, part))]
             return [p for p in parts if p.static or len(p.track) >= MIN_MOVING_ROWS]
     return [Part(track, static=False)]
@@ -197,11 +195,6 @@ def main_place(track: Track) -> Track | None:
 
 def _taken(track: Track, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Track:
     return replace(track, tick=track.tick[rows], measurements=track.measurements.take(rows))
-
-
-def _expected_motion(track: Track) -> MotionPriorSigmas:
-    group = GROUP_OF[track.category]
-    return MotionPriorSigmas(FIRST_SPEED_MPS[group], ACCELERATION_MPS2[group])
 
 
 def _spread(count: int) -> NDArray[np.intp]:
@@ -237,7 +230,13 @@ def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
     # From the axes of the errors to shares of half the length and half the width of the smallest object of its kind.
     body = _axes(track).T @ np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     body = body / (np.array(MIN_SIZE_M[track.category][:2]) / 2)
-    objects = _objects_at(places @ body)
+    # Places nearer than a length and a width, 2 each, are those of one object.
+    at, objects = places @ body, np.arange(len(places))
+    for k in range(1, len(places)):
+        shared = np.flatnonzero(np.all(np.abs(at[:k] - at[k]) < 2, axis=1))
+        if len(shared):
+            objects[k] = objects[shared[0]]
+    objects = np.unique(objects, return_inverse=True)[1]
     label, count = _labels(few, places, objects, body), int(objects.max()) + 1
     seen = label[label >= 0]
     log = OUTLIER_LOG * int((label < 0).sum()) + NEXT_OBJECT_LOG * (count - 1)
@@ -281,16 +280,6 @@ def _places(p: Positions) -> Array:
     return np.array(places).reshape(-1, 2)
 
 
-def _objects_at(places: Array) -> NDArray[np.intp]:
-    """Return the index (K,) of the object at each place: places nearer than a length and a width, 2 each, are those of one."""
-    index = np.arange(len(places))
-    for k in range(1, len(places)):
-        shared = np.flatnonzero(np.all(np.abs(places[:k] - places[k]) < 2, axis=1))
-        if len(shared):
-            index[k] = index[shared[0]]
-    return np.unique(index, return_inverse=True)[1]
-
-
 def _labels(p: Positions, places: Array, objects: NDArray[np.intp], body: Array | None = None) -> NDArray[np.intp]:
     """Return the index (n,) of the object at whose place each position is, -1 for none.
 
@@ -303,18 +292,3 @@ def _labels(p: Positions, places: Array, objects: NDArray[np.intp], body: Array 
         at_place |= np.all(np.abs(offset @ body) < 1, axis=2)
     nearest = np.argmin(np.where(at_place, squared, np.inf), axis=1)
     return np.where(at_place.any(axis=1), objects[nearest], -1)
-
-
-def _best_cut(p: Positions, whole: MarginalLikelihood, motion: MotionPriorSigmas) -> int | None:
-    """Return the first row of the second of two objects, if two are likelier than one."""
-    if len(p) < 2 * MIN_ROWS:
-        return None
-    cuts = np.unique(
-        np.linspace(MIN_ROWS, len(p) - MIN_ROWS, min(len(p) - 2 * MIN_ROWS + 1, MAX_SPLITS)).astype(np.intp)
-    )
-    logs = [
-        marginal_likelihood(p.take(slice(k)), motion).log + marginal_likelihood(p.take(slice(k, None)), motion).log
-        for k in cuts
-    ]
-    best = int(np.argmax(logs))
-    return int(cuts[best]) if logs[best] + NEXT_OBJECT_LOG > whole.log + MIN_LOG_ODDS else None

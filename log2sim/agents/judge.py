@@ -156,6 +156,10 @@ def _are_duplicates(a: Agent, b: Agent) -> bool:
     return bool(np.median(overlap_of_smaller(*(boxes.rectangles(k, slice(None)) for k in range(2)))) > least)
 
 
+# Of the extents seen at all ticks, this quantile counts as seen at some time: stray points lengthen a few.
+SEEN_QUANTILE = 0.85
+
+
 def _rated(candidate: AgentCandidate, confidence: float, timeline: Timeline) -> AgentCandidate:
     """Return a candidate with its confidence and larger standard deviations.
 
@@ -188,7 +192,15 @@ def variance_terms(candidate: AgentCandidate, confidence: float, timeline: Timel
     w, length_m = agent.waypoints, agent.size_m[0]
     ones, wrong, moving = np.ones(len(w)), (1 - confidence) ** 2, float(not agent.static)
     range_m = float(np.median(np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)))
-    hidden_m = (1 - seen_share(candidate, timeline)[0]) * length_m
+    # Of the length that points spanned at one time at most, but for a few that stray points lengthen.
+    extent = m.high_m - m.low_m
+    rows = np.isfinite(extent).all(axis=1) & np.isfinite(m.yaw_rad)
+    seen_m = 0.0
+    if rows.any():
+        yaw = np.interp(timeline.seconds(m.t_ns), w.t_s, np.unwrap(w.yaw_rad))
+        across = np.abs(np.cos(m.yaw_rad - yaw)) < np.sqrt(0.5)
+        seen_m = float(np.quantile(np.where(across, extent[:, 1], extent[:, 0])[rows], SEEN_QUANTILE))
+    hidden_m = (1 - float(np.clip(seen_m / length_m, 0.0, 1.0))) * length_m
     terms: dict[str, dict[str, Array]] = {
         "sigma_xy_m": {
             "given": w.sigma_xy_m**2,
@@ -204,20 +216,3 @@ def variance_terms(candidate: AgentCandidate, confidence: float, timeline: Timel
         speed = {"standing": (1 - moving) * wrong * ones, "moving": moving * wrong * (1.0 + np.abs(w.speed_mps)) ** 2}
         terms["sigma_speed_mps"] = {"given": w.sigma_speed_mps**2, **speed}
     return terms
-
-
-# Of the extents seen at all ticks, this quantile counts as seen at some time: stray points lengthen a few.
-SEEN_QUANTILE = 0.85
-
-
-def seen_share(candidate: AgentCandidate, timeline: Timeline) -> Array:
-    """Return the shares (2,) of length and width that points spanned at one time; 0 without points."""
-    m, w = candidate.track.measurements, candidate.agent.waypoints
-    extent = m.high_m - m.low_m
-    rows = np.isfinite(extent).all(axis=1) & np.isfinite(m.yaw_rad)
-    if not rows.any():
-        return np.zeros(2)
-    across = np.abs(np.cos(m.yaw_rad - np.interp(timeline.seconds(m.t_ns), w.t_s, np.unwrap(w.yaw_rad)))) < np.sqrt(0.5)
-    extent = np.where(across[:, None], extent[:, ::-1], extent)[rows]
-    seen = np.quantile(extent, SEEN_QUANTILE, axis=0) / np.array(candidate.agent.size_m[:2])
-    return np.asarray(np.clip(seen, 0.0, 1.0))

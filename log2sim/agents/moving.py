@@ -9,18 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import (
-    REAR_AXLE_SHARE,
-    AgentCandidate,
-    Timeline,
-    candidate_of,
-    spans_of,
-)
-from log2sim.agents.size import TrackGeometry, independent, independent_along, moving_geometry
-from log2sim.agents.smooth import motion_model
+from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of, spans_of
+from log2sim.agents.size import independent, independent_along, moving_geometry
+from log2sim.agents.smooth.motion_model import MAX_CURVATURE_1PM as ROAD_CURVATURE_1PM
 from log2sim.agents.smooth.motion_model import SIGNIFICANT_SIGMAS, UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
-from log2sim.agents.static import BoxState, LidarMatch, left_free, track_with_lidar
+from log2sim.agents.static import BoxState, left_free, track_with_lidar
 from log2sim.config import TrackConfig
 from log2sim.datatypes import (
     GROUP_OF,
@@ -84,17 +78,14 @@ def course_log_odds(w: Waypoints, length_m: float) -> float:
     """
     step_s = np.gradient(w.t_s) if len(w.t_s) > 1 else np.zeros(1)
     certain_m = max(length_m, CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m)))
-    return _one_way(np.maximum(w.speed_mps, 0.0), step_s, certain_m) - _one_way(
-        np.maximum(-w.speed_mps, 0.0), step_s, certain_m
-    )
-
-
-def _one_way(speed_mps: Array, step_s: Array, certain_m: float) -> float:
-    """Return the log-odds for the direction in which something drives at speeds (T,), 0 at other times."""
-    distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
-    if time_s <= 0:
-        return 0.0
-    return min(forward_log_odds(distance_m / time_s), MAX_FORWARD_LOG_ODDS) * min(distance_m / certain_m, 1.0)
+    odds = 0.0
+    for sign in (1, -1):
+        speed_mps = np.maximum(sign * w.speed_mps, 0.0)
+        distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
+        if time_s > 0:
+            one_way = min(forward_log_odds(distance_m / time_s), MAX_FORWARD_LOG_ODDS)
+            odds += sign * one_way * min(distance_m / certain_m, 1.0)
+    return odds
 
 
 def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: TrackConfig) -> list[Boxes3D]:
@@ -107,11 +98,15 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
     Boxes are tracked. What a track moves around a sweep counts beside what the detector says of its box there; what stands, is
     in one sweep alone, or is laid across its course stays as it is.
     """
-    rows = [_placed(boxes) for boxes in found]
+    rows = []
+    for boxes in found:  # each placed at its center as exactly as centers of boxes are
+        sigma = np.array([CENTER_SIGMA_M[GROUP_OF[str(c)]] for c in boxes.category])
+        covariance, source = sigma[:, None, None] ** 2 * np.eye(2), np.full(len(boxes), "lidar", dtype="<U16")
+        placed = Measurements.from_boxes(boxes, np.zeros(3))
+        rows.append(replace(placed, center_m=boxes.center_m, covariance=covariance, source=source))
     yaw, score = [b.yaw_rad.copy() for b in found], [b.heading_score.copy() for b in found]
-    for one in track(
-        rows, t_ns, birth_score=config.birth_score, max_gap_s=config.max_gap_s, min_life_s=config.min_life_s
-    ):
+    limits = {"max_gap_s": config.max_gap_s, "min_life_s": config.min_life_s}
+    for one in track(rows, t_ns, birth_score=config.birth_score, **limits):
         m, group, velocity = one.measurements, GROUP_OF[one.category], velocities(one)
         speed, course = np.hypot(*velocity.T), np.arctan2(velocity[:, 1], velocity[:, 0])
         t_s = (m.t_ns - m.t_ns[0]) / NS_PER_S
@@ -129,17 +124,6 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
             if odds < 0:
                 yaw[tick][row] = wrap_angle(yaw[tick][row] + np.pi)
     return [replace(b, yaw_rad=y, heading_score=s) for b, y, s in zip(found, yaw, score)]
-
-
-def _placed(boxes: Boxes3D) -> Measurements:
-    """Return a row for each box, placed at its center as exactly as centers of boxes are."""
-    sigma = np.array([CENTER_SIGMA_M[GROUP_OF[str(c)]] for c in boxes.category])
-    return replace(
-        Measurements.from_boxes(boxes, np.zeros(3)),
-        center_m=boxes.center_m,
-        covariance=sigma[:, None, None] ** 2 * np.eye(2),
-        source=np.full(len(boxes), "lidar", dtype="<U16"),
-    )
 
 
 # Of slow vehicles one in five reverses, at 3 m/s one in a thousand (`forward_log_odds`); out of a driveway or
@@ -162,11 +146,19 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Finding, ...]:
     `w`: one at every tick.
     """
     margin = 0.0 if w.sigma_speed_mps is None else SIGNIFICANT_SIGMAS * w.sigma_speed_mps
-    fast = np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category]
-    doubts = _doubts(w, fast, "speed")
+    spans = [("speed", rows) for rows in spans_of(np.abs(w.speed_mps) - margin > MAX_SPEED_MPS[category])]
     if GROUP_OF[category] in ("vehicle", "two_wheeler"):
-        doubts += _doubts(w, _reverses(w, -w.speed_mps - margin), "reversing")
-    return doubts
+        fast, wrong = -w.speed_mps - margin > MAX_REVERSING_MPS, np.zeros(len(w), dtype=bool)
+        for rows in spans_of(w.speed_mps < 0):
+            covered = float(np.hypot(np.diff(w.x_m[rows]), np.diff(w.y_m[rows])).sum())
+            wrong[rows] = fast[rows].any() or covered > MAX_REVERSING_M
+        spans += [("reversing", rows) for rows in spans_of(wrong)]
+    return tuple(
+        Finding(
+            kind, start_s=float(w.t_s[k[0]]), end_s=float(w.t_s[k[-1]]), values={"most_mps": float(np.abs(w.speed_mps[k]).max())},
+        )
+        for kind, k in spans
+    )  # fmt: skip
 
 
 def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Finding, ...]:
@@ -199,36 +191,11 @@ def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: A
     return (Finding("sideways", start_s=float(t_s[rows[0]]), end_s=float(t_s[rows[-1]])),)
 
 
-def _reverses(w: Waypoints, backward_mps: Array) -> NDArray[np.bool_]:
-    """Return where (T,) an agent reverses too fast, or farther than anybody does."""
-    backward = w.speed_mps < 0
-    wrong = np.zeros(len(w), dtype=bool)
-    for rows in spans_of(backward):
-        covered = float(np.hypot(np.diff(w.x_m[rows]), np.diff(w.y_m[rows])).sum())
-        wrong[rows] = bool((backward_mps[rows] > MAX_REVERSING_MPS).any()) or covered > MAX_REVERSING_M
-    return wrong
-
-
-def _doubts(w: Waypoints, holds: NDArray[np.bool_], kind: str) -> tuple[Finding, ...]:
-    """Make a finding about the speed of each span in which something holds (T,)."""
-    return tuple(
-        Finding(
-            kind, start_s=float(w.t_s[k[0]]), end_s=float(w.t_s[k[-1]]), values={"most_mps": float(np.abs(w.speed_mps[k]).max())},
-        )
-        for k in spans_of(holds)
-    )  # fmt: skip
-
-
 # Spectral density of the jerk, m2/s5, of groups for which it is not estimated.
 JERK_DENSITY = {"pedestrian": 2.0}
 # Tightest ways of groups: that of road vehicles; of a bicycle with a wheelbase of 1.05 m whose front wheel is turned by 30 degrees,
 # tan(30 degrees) / 1.05 m; of others nothing is known.
-MAX_CURVATURE_1PM = {
-    "vehicle": motion_model.MAX_CURVATURE_1PM,
-    "two_wheeler": 0.55,
-    "pedestrian": np.inf,
-    "other": np.inf,
-}
+MAX_CURVATURE_1PM = {"vehicle": ROAD_CURVATURE_1PM, "two_wheeler": 0.55, "pedestrian": np.inf, "other": np.inf}
 # Without smoothing: so large that the trajectory follows the positions.
 UNSMOOTHED_JERK_DENSITY = 1e4
 # Standard deviation of box centers beyond their covariance: points are no exact outlines.
@@ -262,7 +229,10 @@ def moving_candidate(
     changes and mislead the headings. LiDAR matches before, after and between the detections join the positions, and the
     final smoothing gives the trajectory.
     """
-    track = _one_at_a_moment(track)
+    # Frames that share a sweep measure the same points: one measurement a moment.
+    first = np.r_[True, np.diff(track.measurements.t_ns) > SAME_MOMENT_S * NS_PER_S]
+    unrecorded = np.union1d(track.unrecorded, track.tick[~first])
+    track = replace(track, tick=track.tick[first], measurements=track.measurements.take(first), unrecorded=unrecorded)
     m, group = track.measurements, GROUP_OF[track.category]
     t = timeline.seconds(m.t_ns)
     noise = FITTED_CENTER_SIGMA_M[group] ** 2 * np.eye(2)
@@ -275,8 +245,28 @@ def moving_candidate(
         headings = _headings(rough, group)
         geometry = moving_geometry(track, headings, rough.velocity_mps)
         xy, covariance = geometry.xy_m, geometry.covariance
-    matches = _lidar_matches(track, rough, headings, geometry, obstacles, timeline)
-    positions_s, xy, covariance, ticks = _all_positions(track, geometry, matches, timeline)
+    # The box is looked for before, after and in the gaps of its track.
+    tick = track.tick.tolist()
+    spans = [(0, range(tick[0] - 1, -1, -1)), (len(tick) - 1, range(tick[-1] + 1, len(timeline.t_ns)))]
+    spans += [(k, range(a + 1, b)) for k, (a, b) in enumerate(pairwise(tick))]
+    bottom_m, axis = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2, headings.copy()
+    if group == "vehicle":
+        # At the end of a track the sides of a box tell its direction better than its course does.
+        off = np.nan_to_num(wrap_angle(2 * (m.yaw_rad - headings)) / 2)
+        axis += np.where(np.abs(off) < MAX_YAW_OFF_RAD, off, 0.0)
+    matches = []
+    for k, wanted in spans:
+        place = rough.xy_m[k], rough.velocity_mps[k], float(axis[k])
+        start = BoxState(int(m.t_ns[k]), *place, geometry.size_m, bottom_m)
+        matches += track_with_lidar(obstacles, wanted, timeline.t_ns, start)
+    # Measurements and matches together, one at a moment.
+    positions_s = timeline.seconds(np.concatenate([m.t_ns, np.array([f.t_ns for f in matches], dtype=np.int64)]))
+    xy = np.concatenate([xy, np.array([match.xy_m for match in matches]).reshape(-1, 2)])
+    covariance = np.concatenate([covariance, np.array([f.covariance for f in matches]).reshape(-1, 2, 2)])
+    ticks = np.concatenate([track.tick, np.array([match.tick for match in matches], dtype=np.int64)])
+    rows = np.argsort(positions_s, kind="stable")
+    rows = rows[np.r_[True, np.diff(positions_s[rows]) > SAME_MOMENT_S]]
+    positions_s, xy, covariance = positions_s[rows], xy[rows], covariance[rows]
     life = np.arange(ticks.min(), ticks.max() + 1)
     at = timeline.seconds(timeline.t_ns[life])
     if not smooth:
@@ -289,25 +279,32 @@ def moving_candidate(
         "observed_share": round(float(observed.mean()), 3),
         "smoothing_residual_rms_m": round(float(np.sqrt(np.nanmean(residual**2))), 4) if len(residual) else None,
     }
-    z = np.interp(at, t, _running_median(geometry.z_m))
-    waypoints = _waypoints(path, _headings(path, group), z, observed)
+    padded = np.pad(geometry.z_m, HEIGHT_MEDIAN_HALF, mode="edge")
+    level = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * HEIGHT_MEDIAN_HALF + 1), axis=1)
+    yaw = _headings(path, group)
+    speed = signed_speed(path.velocity_mps, yaw)
+    waypoints = Waypoints(
+        t_s=path.t_s,
+        x_m=path.xy_m[:, 0],
+        y_m=path.xy_m[:, 1],
+        z_m=np.interp(at, t, level),
+        yaw_rad=yaw,
+        speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
+        observed=observed,
+        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
+        sigma_yaw_rad=path.sigma_yaw_rad,
+        sigma_speed_mps=path.sigma_speed_mps,
+    )
     sigma_m = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
     doubts = path.broken + jump_doubts(positions_s, path.residual_m, sigma_m)
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])
     ordered = sorted(matches, key=lambda match: match.tick)
-    free = left_free(obstacles, ordered, geometry.size_m, float(np.median(geometry.z_m)) - geometry.size_m[2] / 2)
+    free = left_free(obstacles, ordered, geometry.size_m, bottom_m)
     places = np.array([match.xy_m for match in ordered]).reshape(-1, 2)[free][:MAX_PLACES]
     candidate = candidate_of(track, geometry, waypoints, quality, static=False).doubted(doubts)
     return replace(candidate, followed=independent_along(places, TYPICAL_SIZE_M[track.category][0]))
-
-
-def _one_at_a_moment(track: Track) -> Track:
-    """Drop measurements at the time of the previous one: frames that share a sweep measure the same points."""
-    first = np.r_[True, np.diff(track.measurements.t_ns) > SAME_MOMENT_S * NS_PER_S]
-    unrecorded = np.union1d(track.unrecorded, track.tick[~first])
-    return replace(track, tick=track.tick[first], measurements=track.measurements.take(first), unrecorded=unrecorded)
 
 
 def _headings(path: SmoothedTrack, group: str) -> Array:
@@ -341,66 +338,3 @@ def _first_heading(track: Track) -> tuple[float | None, float]:
         return None, UNKNOWN_YAW_RAD
     yaw = align_to(float(yaws[0]), 0.0, np.pi)
     return (yaw if heading_log_odds(m, yaw) >= 0 else float(wrap_angle(yaw + np.pi))), BOX_YAW_SIGMA_RAD
-
-
-def _lidar_matches(
-    track: Track,
-    path: SmoothedTrack,
-    headings: Array,
-    geometry: TrackGeometry,
-    obstacles: Sequence[Obstacles | None],
-    timeline: Timeline,
-) -> list[LidarMatch]:
-    """Match the box before, after and in the gaps of its track."""
-    tick, total = track.tick.tolist(), len(timeline.t_ns)
-    spans = [(0, range(tick[0] - 1, -1, -1)), (len(tick) - 1, range(tick[-1] + 1, total))]
-    spans += [(k, range(a + 1, b)) for k, (a, b) in enumerate(pairwise(tick))]
-    bottom_m = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2
-    matches = []
-    yaw_rad = headings.copy()
-    if GROUP_OF[track.category] == "vehicle":
-        # At the end of a track the sides of a box tell its direction better than its course does.
-        off = np.nan_to_num(wrap_angle(2 * (track.measurements.yaw_rad - headings)) / 2)
-        yaw_rad += np.where(np.abs(off) < MAX_YAW_OFF_RAD, off, 0.0)
-    for k, wanted in spans:
-        start = BoxState(
-            int(track.measurements.t_ns[k]), path.xy_m[k], path.velocity_mps[k], float(yaw_rad[k]),
-            geometry.size_m, bottom_m,
-        )  # fmt: skip
-        matches += track_with_lidar(obstacles, wanted, timeline.t_ns, start)
-    return matches
-
-
-def _all_positions(
-    track: Track, geometry: TrackGeometry, matches: Sequence[LidarMatch], timeline: Timeline
-) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Merge measurements and LiDAR matches, one at a moment: times (n,), positions, covariances, and the ticks of all."""
-    t_ns = np.concatenate([track.measurements.t_ns, np.array([m.t_ns for m in matches], dtype=np.int64)])
-    t_s = timeline.seconds(t_ns)
-    xy = np.concatenate([geometry.xy_m, np.array([m.xy_m for m in matches]).reshape(-1, 2)])
-    covariance = np.concatenate([geometry.covariance, np.array([m.covariance for m in matches]).reshape(-1, 2, 2)])
-    tick = np.concatenate([track.tick, np.array([m.tick for m in matches], dtype=np.int64)])
-    rows = np.argsort(t_s, kind="stable")
-    rows = rows[np.r_[True, np.diff(t_s[rows]) > SAME_MOMENT_S]]
-    return t_s[rows], xy[rows], covariance[rows], tick
-
-
-def _waypoints(path: SmoothedTrack, yaw: Array, z_m: Array, observed: NDArray[np.bool_]) -> Waypoints:
-    speed = signed_speed(path.velocity_mps, yaw)
-    return Waypoints(
-        t_s=path.t_s,
-        x_m=path.xy_m[:, 0],
-        y_m=path.xy_m[:, 1],
-        z_m=z_m,
-        yaw_rad=yaw,
-        speed_mps=np.where(np.abs(speed) < STANDSTILL_MPS, 0.0, speed),
-        observed=observed,
-        sigma_xy_m=np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2),
-        sigma_yaw_rad=path.sigma_yaw_rad,
-        sigma_speed_mps=path.sigma_speed_mps,
-    )
-
-
-def _running_median(values: Array) -> Array:
-    padded = np.pad(values, HEIGHT_MEDIAN_HALF, mode="edge")
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * HEIGHT_MEDIAN_HALF + 1), axis=1)

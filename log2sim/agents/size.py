@@ -51,16 +51,6 @@ def typical_box_size(m: BoxEvidence) -> Array | None:
     return np.array([weighted_quantile(m.box_size_m[rows, axis], weight, 0.5) for axis in range(3)])
 
 
-def mean_box_center(m: BoxEvidence) -> tuple[Array, float]:
-    """Return the robust mean (2,) of the box centers of a track that stands, and its standard deviation; NaN without boxes."""
-    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
-    if len(rows) == 0:
-        return np.full(2, np.nan), np.nan
-    sigma = box_sigma(m.points[rows])
-    center = np.array([weighted_quantile(m.box_center_m[rows, axis], sigma**-2, 0.5) for axis in range(2)])
-    return center, float(np.median(sigma)) / np.sqrt(independent(len(rows)))
-
-
 def mean_box_axis(m: BoxEvidence) -> float | None:
     """Return the mean yaw of the boxes of a track, in rad up to half turns; None without boxes."""
     rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
@@ -126,8 +116,13 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     yaw = boxes.fit_yaw(xy)[0] if axis is None else boxes.corrected_yaw(xy, axis)
     low, high = boxes.extents(xy, yaw)
     rows = np.flatnonzero(m.kept_points >= MIN_CLUSTER_POINTS)
-    if track.category in BOXES:
-        low, high = _reached(low, high, [m.points_of(k)[:, :2] - origin for k in rows.tolist()], yaw)
+    if track.category in BOXES and len(rows):
+        # Points that persist in their cells are widened to where those of enough views reach: at the far end of a long side, rays
+        # are so far apart that they never meet a cell twice. Errors of poses widen it too, which short vehicles cannot afford.
+        each = [boxes.extents(m.points_of(k)[:, :2] - origin, yaw) for k in rows.tolist()]
+        lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
+        enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(rows)), 2), len(rows))
+        low, high = np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
     seen = [view for _, view in m.views_of(rows)]
     sensor = boxes.rotate(np.array([v.sensor_m[:2] for v in seen]).reshape(-1, 2) - origin, -yaw)
     visible = np.array([v.ends_visible for v in seen], dtype=bool).reshape(-1, 2)
@@ -141,20 +136,6 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     if axis is None and _is_length_across(ends, boxes.rotate(m.sensor_m[:, :2] - origin, -yaw), track.category):
         return yaw + np.pi / 2, ends.swapped()
     return yaw, ends
-
-
-def _reached(low: Array, high: Array, views: list[Array], yaw_rad: float) -> tuple[Array, Array]:
-    """Widen ends (2,), (2,) of points that persist in their cells to where the points of enough views (n, 2) reach.
-
-    At the far end of a long side, rays are so far apart that they never meet a cell twice. Errors of poses widen it too,
-    which short vehicles cannot afford.
-    """
-    if not views:
-        return low, high
-    each = [boxes.extents(xy, yaw_rad) for xy in views]
-    lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
-    enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(views)), 2), len(views))
-    return np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
 
 
 def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
@@ -268,7 +249,13 @@ def static_geometry(track: Track) -> TrackGeometry:
     size, is_likely = _estimate_size(ends, track.category, height, known)
     low, high, real, gap = (column[0] for column in (ends.low, ends.high, ends.real, ends.gap_m))
     center, sigma = boxes.complete_box(low, high, size, real, known is not None, gap_m=gap)
-    box_xy, box_sigma_m = mean_box_center(m)
+    # The robust mean of the box centers of a 3D detector and its standard deviation; NaN without boxes.
+    rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
+    box_xy, box_sigma_m = np.full(2, np.nan), np.nan
+    if len(rows):
+        sigmas = box_sigma(m.points[rows])
+        box_xy = np.array([weighted_quantile(m.box_center_m[rows, axis], sigmas**-2, 0.5) for axis in range(2)])
+        box_sigma_m = float(np.median(sigmas)) / np.sqrt(independent(len(rows)))
     center, sigma = boxes.weighted_center(
         center, sigma, boxes.rotate(box_xy - origin[:2], -yaw), _with_size_error(box_sigma_m, known, size)
     )
@@ -335,7 +322,11 @@ def _estimate_size(ends: Ends, category: str, height_m: float, known: Array | No
     What was seen from end to end and what is expected, `known` (3,) from a 3D detector or typical of the category, are
     averaged by their variances. A side that was never seen so is as long as expected, or as the longest part that was seen.
     """
-    typical = _typical_sides(category, height_m)
+    length, width, height = TYPICAL_SIZE_M[category]
+    if category == "truck" and height_m > height:  # high trucks are longer
+        exponent = np.log(HIGHEST_TRUCK_LENGTH_M / length) / np.log(HIGHEST_TRUCK_M / height)
+        length = min(length * (height_m / height) ** exponent, HIGHEST_TRUCK_LENGTH_M)
+    typical = np.array([length, width])
     smallest, limit = (np.array(t[category][:2]) for t in (MIN_SIZE_M, MAX_SIZE_M))
     is_vehicle = GROUP_OF[category] == "vehicle"
     largest = np.minimum(limit, [np.inf, MAX_ROAD_WIDTH_M]) if is_vehicle else limit
@@ -357,37 +348,18 @@ def _estimate_size(ends: Ends, category: str, height_m: float, known: Array | No
         size[axis] = observed + error_of_all / (error_of_all + prior) * (expected[axis] - observed)
     # What lies between two rays is no evidence.
     between = np.where(ends.real == boxes.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
-    is_likely = _is_likely_size(seen - between, whole, np.maximum(expected, least), category)
-    is_likely = is_likely and not _is_too_thin(seen, whole, category)
+    sides = np.maximum(expected, least)
+    for a in np.flatnonzero(whole.any(axis=0)):
+        sides[a] = np.quantile((seen - between)[whole[:, a], a], SIZE_QUANTILE)
+    is_likely, body_m = bool((sides <= limit).all()), CATEGORY[category].min_seen_m
+    if body_m is None:
+        is_likely = is_likely and bool((sides >= smallest).all())
+    elif (
+        whole.any()
+    ):  # the longer of the sides that were seen, with half the gaps beside them, is no less than a body's
+        most = [np.quantile(seen[whole[:, a], a], SIZE_QUANTILE) for a in range(2) if whole[:, a].any()]
+        is_likely = is_likely and bool(max(most) >= body_m)
     return np.clip(np.maximum(size, least), smallest, largest), is_likely
-
-
-def _typical_sides(category: str, height_m: float) -> Array:
-    """Return the typical length and width (2,) of a category; high trucks are longer."""
-    length, width, height = TYPICAL_SIZE_M[category]
-    if category == "truck" and height_m > height:
-        exponent = np.log(HIGHEST_TRUCK_LENGTH_M / length) / np.log(HIGHEST_TRUCK_M / height)
-        length = min(length * (height_m / height) ** exponent, HIGHEST_TRUCK_LENGTH_M)
-    return np.array([length, width])
-
-
-def _is_likely_size(seen: Array, whole: NDArray[np.bool_], else_m: Array, category: str) -> bool:
-    """Return whether an object can be of its category by the sides (n, 2) that were seen, else by what they are thought to be."""
-    smallest, largest = (np.array(t[category][:2]) for t in (MIN_SIZE_M, MAX_SIZE_M))
-    raw = np.array(
-        [np.quantile(seen[whole[:, a], a], SIZE_QUANTILE) if whole[:, a].any() else else_m[a] for a in range(2)]
-    )
-    if CATEGORY[category].min_seen_m is not None:
-        return bool((raw <= largest).all())
-    return bool(((raw >= smallest) & (raw <= largest)).all())
-
-
-def _is_too_thin(seen: Array, whole: NDArray[np.bool_], category: str) -> bool:
-    """Return whether the longer of the sides (n, 2) that were seen, with half the gaps beside them, is less than a body's."""
-    least = CATEGORY[category].min_seen_m
-    if least is None or not whole.any():
-        return False
-    return max(float(np.quantile(seen[whole[:, a], a], SIZE_QUANTILE)) for a in range(2) if whole[:, a].any()) < least
 
 
 def _height(track: Track) -> tuple[float, Array]:

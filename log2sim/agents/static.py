@@ -106,8 +106,19 @@ def track_with_lidar(
             continue
         misses = 0
         matches.append(match)
-        if not is_static:
-            state = _corrected(state, match)
+        if is_static:
+            continue
+        # The state at the time of the match, corrected toward it.
+        dt_s = (match.t_ns - state.t_ns) / NS_PER_S
+        expected = state.xy_m + state.velocity_mps * dt_s
+        innovation, velocity = match.xy_m - expected, state.velocity_mps
+        if abs(dt_s) > 1e-3:
+            velocity = velocity + VELOCITY_GAIN * innovation / dt_s
+            if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
+                axis = np.array([np.cos(match.yaw_rad), np.sin(match.yaw_rad)])
+                velocity = (velocity @ axis) * axis
+        position = expected + POSITION_GAIN * innovation
+        state = replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=match.yaw_rad)
     return matches
 
 
@@ -142,21 +153,6 @@ def reach_of(size_m: Array) -> float:
 def _reach_around(size_m: Array) -> float:
     """Return how far from the center of a box, m, points are looked at."""
     return float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
-
-
-def _corrected(state: BoxState, match: LidarMatch) -> BoxState:
-    """Return the state at the time of a match, corrected toward it."""
-    dt_s = (match.t_ns - state.t_ns) / NS_PER_S
-    expected = state.xy_m + state.velocity_mps * dt_s
-    innovation = match.xy_m - expected
-    velocity, yaw_rad = state.velocity_mps, match.yaw_rad
-    if abs(dt_s) > 1e-3:
-        velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-        if yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
-            axis = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
-            velocity = (velocity @ axis) * axis
-    position = expected + POSITION_GAIN * innovation
-    return replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=yaw_rad)
 
 
 def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
@@ -295,9 +291,20 @@ def static_candidates(
 
     Their yaws are known up to half a turn.
     """
-    geometries = [_geometry_of(part) for part in parts]
-    boxes = []
-    for part, geometry in zip(parts, geometries):
+    geometries, boxes = [], []
+    for part in parts:
+        geometry = static_geometry(part.at_place or part.track)
+        # If all measurements make it too large for one object, some show a part of a neighbor.
+        largest = MAX_SIZE_M[part.track.category][:2]
+        if part.at_place is None and np.any(geometry.size_m[:2] >= largest):
+            main = main_place(part.track)
+            smaller = geometry if main is None else static_geometry(main)
+            geometry = geometry if np.any(smaller.size_m[:2] >= largest) else smaller
+        n = len(part.track)
+        xy_m, covariance = np.tile(geometry.xy_m[0], (n, 1)), np.median(geometry.covariance, axis=0)
+        z_m = np.full(n, np.median(geometry.z_m))
+        geometry = replace(geometry, xy_m=xy_m, covariance=np.tile(covariance, (n, 1, 1)), z_m=z_m)
+        geometries.append(geometry)
         yaw_rad = 0.0 if geometry.yaw_rad is None else float(np.nan_to_num(geometry.yaw_rad))
         bottom_m = float(geometry.z_m[0]) - geometry.size_m[2] / 2
         start_ns = int(timeline.t_ns[part.track.tick[0]])
@@ -325,30 +332,6 @@ def static_candidates(
         quality = {"lidar_only": len(found), "observed_share": round(float(share), 3)}
         candidates.append(candidate_of(track, geometry, waypoints, quality, static=True))
     return candidates
-
-
-def _geometry_of(part: Part) -> TrackGeometry:
-    """Estimate the geometry of a track that stands by the measurements that agree on its place.
-
-    If all make it too large for one object, some show a part of a neighbor.
-    """
-    geometry = static_geometry(part.at_place or part.track)
-    if part.at_place is None and _is_too_large(geometry, part.track.category):
-        main = main_place(part.track)
-        smaller = None if main is None else static_geometry(main)
-        if smaller is not None and not _is_too_large(smaller, part.track.category):
-            geometry = smaller
-    n = len(part.track)
-    return replace(
-        geometry,
-        xy_m=np.tile(geometry.xy_m[0], (n, 1)),
-        covariance=np.tile(np.median(geometry.covariance, axis=0), (n, 1, 1)),
-        z_m=np.full(n, np.median(geometry.z_m)),
-    )
-
-
-def _is_too_large(geometry: TrackGeometry, category: str) -> bool:
-    return bool(np.any(geometry.size_m[:2] >= MAX_SIZE_M[category][:2]))
 
 
 def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:

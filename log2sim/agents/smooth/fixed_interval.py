@@ -38,9 +38,6 @@ from log2sim.agents.smooth.quadratic import (
 )
 from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index
 
-__all__ = ["smooth_interval"]
-
-
 # A place is known before to some car lengths: the gates of the tracker reach as far.
 PLACE_SIGMA_M = 5.0
 # Errors of a center repeat while the view stays the same, for some half a second of passing traffic; the rest of the variance
@@ -290,16 +287,6 @@ USUAL_ACCELERATION_MPS2, ACCELERATION_S = 2.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class _RobustFit:
-    """State (K, 3, 2), weights (n,), jerk density in m2/s5 and factor on the noise's variance, both axes alike."""
-
-    state: Array
-    weight: Array
-    density: float
-    variance_factor: float
-
-
-@dataclass(frozen=True, eq=False)
 class _Problem:
     """All terms as quadratic forms about `state` (K, 3, 2)."""
 
@@ -315,7 +302,10 @@ class _Problem:
         """Return the minimum and the state (K, 3, 2) there."""
         terms = [(1.0, self.likelihood), *((1.0 / d, j) for d, j in zip(self.density, self.jerk))]
         if self.measurement.observed.correlated and len(self.prior) > 1:
-            terms.append((1.0, self.usual_acceleration))
+            # One acceleration in `ACCELERATION_S`: errors that repeat do not pass for braking at the ends of a track.
+            share = np.gradient(self.prior.knots_s) / ACCELERATION_S
+            information = (share / USUAL_ACCELERATION_MPS2**2)[:, None, None] * np.eye(2)
+            terms.append((1.0, zero_motion(self.state, np.zeros_like(information), information)))
         least = minimize(weighted_sum(terms if constraints is None else [*terms, (1.0, constraints)]))
         return least, self.state + least.step.reshape(self.state.shape)
 
@@ -323,13 +313,6 @@ class _Problem:
         """Weighted squared residuals of a state (K, 3, 2), in sigmas."""
         residual = self.measurement.residual(state)
         return float(self.weight @ np.einsum("na,nab,nb->n", residual, self.information, residual))
-
-    @cached_property
-    def usual_acceleration(self) -> Quadratic:
-        """Squared accelerations, one in `ACCELERATION_S`: errors that repeat do not pass for braking at the ends of a track."""
-        share = np.gradient(self.prior.knots_s) / ACCELERATION_S
-        information = (share / USUAL_ACCELERATION_MPS2**2)[:, None, None] * np.eye(2)
-        return zero_motion(self.state, np.zeros_like(information), information)
 
     @cached_property
     def likelihood(self) -> Quadratic:
@@ -350,21 +333,32 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
     constraint of slow vehicles are pseudo-measurements. Cost O(n).
     """
     prior = MotionPrior.over(np.concatenate([observed.t_s, asked_s]))
-    problem, least, state = _reweight(_problem(prior, MeasurementModel.of(observed, prior), motion))
-    covariance = least.covariance
-    constraints = _constraints(problem, state, covariance, motion)
+    problem = _problem(prior, MeasurementModel.of(observed, prior), motion)
+    least, state = problem.solve()
+    for _ in range(MAX_REWEIGHTING_ROUNDS):
+        residual = problem.measurement.residual(state)
+        weight = _weights(observed, np.einsum("na,nab,nb->n", residual, problem.information, residual))
+        if np.abs(weight - problem.weight).max() < MAX_WEIGHT_CHANGE:
+            break
+        problem = replace(problem, weight=weight)
+        least, state = problem.solve()
+    constraints = _constraints(problem, state, least.covariance, motion)
     if constraints is not None:
         least, state = problem.solve(constraints)
-        covariance = least.covariance
     if not motion.holonomic:
         least, state = _without_rolling_back(problem, least, state, constraints, motion)
-        covariance = least.covariance
-    residual = np.hypot(*problem.measurement.residual(state).T)
-    state, covariance = _at_times(prior, asked_s, state, covariance)
+    residual_m = np.hypot(*problem.measurement.residual(state).T)
+    # At the asked times, each propagated from the nearest knot.
+    knot, covariance = nearest_index(prior.knots_s, asked_s), least.covariance
+    if np.array_equal(prior.knots_s[knot], asked_s):
+        state, covariance = state[knot], covariance[knot]
+    else:
+        both = np.einsum("tij,ab->tiajb", transition(asked_s - prior.knots_s[knot]), np.eye(2)).reshape(-1, 6, 6)
+        state, covariance = propagate(prior, state, asked_s), both @ covariance[knot] @ np.swapaxes(both, 1, 2)
     known = _known_courses(state, covariance, motion, correlated=observed.correlated)
     yaw = yaw_of_motion(state[:, 0], state[:, 1], hint_rad=motion.heading_rad, holonomic=motion.holonomic, known=known)
     sigma = yaw_sigma(state[:, 0], state[:, 1], covariance[:, 2:4, 2:4], known, hint_sigma_rad=motion.heading_sigma_rad)
-    return Smoothed(state, covariance, yaw, sigma, residual, problem.weight, problem.density)
+    return Smoothed(state, covariance, yaw, sigma, residual_m, problem.weight, problem.density)
 
 
 def _without_rolling_back(
@@ -407,20 +401,20 @@ def _problem(prior: MotionPrior, measurement: MeasurementModel, motion: MotionMo
     observed = measurement.observed
     few = MotionPrior.over(observed.t_s, SEARCH_STEP_S)
     coarse = MeasurementModel.of(observed, few)
-    fit = _robust_fit(few, coarse, motion)
-    information = np.asarray(np.linalg.inv(observed.r * fit.variance_factor), dtype=np.float64)
-    yaw = unwrap(yaw_of_motion(fit.state[:, 0], fit.state[:, 1], hint_rad=motion.heading_rad))
-    density = (fit.density, fit.density)
+    fit, weight, isotropic, variance_factor = _robust_fit(few, coarse, motion)
+    information = np.asarray(np.linalg.inv(observed.r * variance_factor), dtype=np.float64)
+    yaw = unwrap(yaw_of_motion(fit[:, 0], fit[:, 1], hint_rad=motion.heading_rad))
+    density = (isotropic, isotropic)
     if motion.density_by_direction and len(few) >= MIN_KNOTS:
-        forms = few.jerk_by_direction(fit.state, _directions(yaw))
-        search = _Problem(few, coarse, fit.state, fit.weight, information, forms, density)
-        density = _estimator(observed, motion).by_direction(few, search.jerk, search.likelihood, fit.density)
+        forms = few.jerk_by_direction(fit, _directions(yaw))
+        search = _Problem(few, coarse, fit, weight, information, forms, density)
+        density = _estimator(observed, motion).by_direction(few, search.jerk, search.likelihood, isotropic)
     course: Array = np.interp(prior.knots_s, few.knots_s, yaw)
-    state = propagate(few, fit.state, prior.knots_s)
+    state = propagate(few, fit, prior.knots_s)
     lowest = min_density(prior)
     densities = max(density[0], lowest), max(density[1], lowest)
     forms = prior.jerk_by_direction(state, _directions(course))
-    return _Problem(prior, measurement, state, fit.weight, information, forms, densities)
+    return _Problem(prior, measurement, state, weight, information, forms, densities)
 
 
 def _directions(yaw: Array) -> Array:
@@ -434,52 +428,35 @@ def _estimator(observed: NoisyPositions, motion: MotionModel) -> DensityEstimato
     return DensityEstimator(prior, observed.unknown_scale, rounds=1 if motion.density_by_direction else 2)
 
 
-def _robust_fit(prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel) -> _RobustFit:
-    """Find outliers, noise and one density with both axes treated alike, which makes the search cheap."""
+def _robust_fit(
+    prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel
+) -> tuple[Array, Array, float, float]:
+    """Find outliers, noise and one density with both axes treated alike, which makes the search cheap.
+
+    Returns the state (K, 3, 2), weights (n,), jerk density in m2/s5 and factor on the noise's variance.
+    """
     observed = measurement.observed
     variance = np.trace(observed.r, axis1=1, axis2=2) / 2
     density = PERMISSIVE_JERK_DENSITY if motion.jerk_density is None else motion.jerk_density
     density = max(density, min_density(prior))
-    state, weight = _without_outliers(prior, measurement, variance, density)
-    if motion.jerk_density is not None and not observed.unknown_scale:
-        return _RobustFit(state, weight, density, 1.0)
-    likelihood = measurement.independent_axes(state, weight / variance)
-    density, factor = _estimator(observed, motion).isotropic(prior, state, likelihood, float(weight.sum()))
-    density = density if motion.jerk_density is None else motion.jerk_density
-    state = state + minimize(weighted_sum([(1.0, likelihood), (factor / density, prior.jerk(state))])).step
-    squared = (measurement.residual(state) ** 2).sum(axis=1) / (variance * factor)
-    return _RobustFit(state, _weights(observed, squared), density, factor)
-
-
-def _without_outliers(
-    prior: MotionPrior, measurement: MeasurementModel, variance: Array, density: float
-) -> tuple[Array, Array]:
-    """State (K, 3, 2) and weights (n,) by iteratively reweighted least squares, both axes alike, with a given density."""
     start = np.zeros((len(prior), 3, 2))
-    jerk = prior.jerk(start)
-    weight = np.ones(len(variance))
-    for k in range(MAX_ROBUST_ROUNDS + 1):
+    jerk, weight = prior.jerk(start), np.ones(len(variance))
+    for _ in range(MAX_ROBUST_ROUNDS + 1):
         likelihood = measurement.independent_axes(start, weight / variance)
         state = minimize(weighted_sum([(1.0, likelihood), (1.0 / density, jerk)])).step
         squared = (measurement.residual(state) ** 2).sum(axis=1) / variance
         if squared.max() < MAX_CLEAN_SIGMAS**2:
             break
-        last = k == MAX_ROBUST_ROUNDS
-        weight = _weights(measurement.observed, squared) if last else geman_mcclure_weights(squared)
-    return state, _weights(measurement.observed, squared)
-
-
-def _reweight(problem: _Problem) -> tuple[_Problem, Minimum, Array]:
-    """Reweight the observations until the weights settle: the problem, its minimum and the state (K, 3, 2) there."""
-    for _ in range(MAX_REWEIGHTING_ROUNDS):
-        least, state = problem.solve()
-        residual = problem.measurement.residual(state)
-        squared = np.einsum("na,nab,nb->n", residual, problem.information, residual)
-        weight = _weights(problem.measurement.observed, squared)
-        if np.abs(weight - problem.weight).max() < MAX_WEIGHT_CHANGE:
-            return problem, least, state
-        problem = replace(problem, weight=weight)
-    return problem, *problem.solve()
+        weight = geman_mcclure_weights(squared)
+    weight = _weights(observed, squared)
+    if motion.jerk_density is not None and not observed.unknown_scale:
+        return state, weight, density, 1.0
+    likelihood = measurement.independent_axes(state, weight / variance)
+    density, factor = _estimator(observed, motion).isotropic(prior, state, likelihood, float(weight.sum()))
+    density = density if motion.jerk_density is None else motion.jerk_density
+    state = state + minimize(weighted_sum([(1.0, likelihood), (factor / density, prior.jerk(state))])).step
+    squared = (measurement.residual(state) ** 2).sum(axis=1) / (variance * factor)
+    return state, _weights(observed, squared), density, factor
 
 
 def _constraints(problem: _Problem, state: Array, covariance: Array, motion: MotionModel) -> Quadratic | None:
@@ -515,12 +492,3 @@ def _known_courses(state: Array, covariance: Array, motion: MotionModel, *, corr
         correlated=correlated,
         max_curvature_1pm=motion.max_curvature_1pm,
     )
-
-
-def _at_times(prior: MotionPrior, asked_s: Array, state: Array, covariance: Array) -> tuple[Array, Array]:
-    """States (T, 3, 2) and covariances (T, 6, 6) at asked times, each propagated from the nearest knot."""
-    knot = nearest_index(prior.knots_s, asked_s)
-    if np.array_equal(prior.knots_s[knot], asked_s):
-        return state[knot], covariance[knot]
-    both = np.einsum("tij,ab->tiajb", transition(asked_s - prior.knots_s[knot]), np.eye(2)).reshape(-1, 6, 6)
-    return propagate(prior, state, asked_s), both @ covariance[knot] @ np.swapaxes(both, 1, 2)

@@ -127,9 +127,8 @@ def _turns_feasible(
     for k in np.argsort(sigma_rad, kind="stable").tolist():
         near = slice(first[k], last[k])
         turned = np.abs(wrap_angle(2 * (course_rad[near] - course_rad[k]))) / 2
-        feasible = max_curvature_1pm * np.abs(distance_m[near] - distance_m[k]) + np.hypot(
-            sigma_rad[near], sigma_rad[k]
-        )
+        feasible = max_curvature_1pm * np.abs(distance_m[near] - distance_m[k])
+        feasible += np.hypot(sigma_rad[near], sigma_rad[k])
         counts[k] = np.all((turned <= feasible) | ~counts[near])
     return counts
 
@@ -166,8 +165,16 @@ def yaw_of_motion(
         return np.full(len(xy_m), overall if hint_rad is None else hint_rad)
     course = np.arctan2(velocity_mps[:, 1], velocity_mps[:, 0])
     distance = _distance_covered(xy_m, speed)
-    angles = unwrap(course[moving] if holonomic else _heading_of_course(course[moving], hint_rad))
-    return wrap_angle(np.interp(distance, distance[moving], angles))
+    course = course[moving]
+    if not holonomic:
+        # A jump by more than a right angle is a change of gear, not a turn on the spot.
+        first = course[0]
+        if hint_rad is not None and abs(float(wrap_angle(first - hint_rad))) > np.pi / 2:
+            first = first + np.pi
+        jumps = np.abs(wrap_angle(np.diff(course))) > np.pi / 2
+        backward = np.concatenate([[0], np.cumsum(jumps)]) % 2
+        course = wrap_angle(course + (first - course[0]) + np.pi * backward)
+    return wrap_angle(np.interp(distance, distance[moving], unwrap(course)))
 
 
 def yaw_sigma(
@@ -192,10 +199,8 @@ def yaw_sigma(
     variance = _course_variance(velocity_mps[rows], covariance[rows])
     distance = _distance_covered(xy_m, speed)
     after = np.clip(np.searchsorted(rows, np.arange(len(xy_m))), 0, len(rows) - 1)
-    nearest = [
-        variance[k] + (WAY_CURVATURE_1PM * (distance - distance[rows[k]])) ** 2
-        for k in (after, np.maximum(after - 1, 0))
-    ]
+    both = after, np.maximum(after - 1, 0)
+    nearest = [variance[k] + (WAY_CURVATURE_1PM * (distance - distance[rows[k]])) ** 2 for k in both]
     return np.asarray(np.minimum(np.sqrt(np.minimum(*nearest)), UNKNOWN_YAW_RAD))
 
 
@@ -215,16 +220,6 @@ def _distance_covered(xy_m: Array, speed_mps: Array) -> Array:
 def unwrap(angles: Array) -> Array:
     """Angles (n,) without jumps by full turns between neighbors."""
     return np.concatenate([angles[:1], angles[0] + np.cumsum(wrap_angle(np.diff(angles)))])
-
-
-def _heading_of_course(course: Array, hint_rad: float | None) -> Array:
-    """Turn courses (n,) into headings: a jump by more than a right angle is a change of gear, not a turn on the spot."""
-    first = course[0]
-    if hint_rad is not None and abs(float(wrap_angle(first - hint_rad))) > np.pi / 2:
-        first = first + np.pi
-    jumps = np.abs(wrap_angle(np.diff(course))) > np.pi / 2
-    backward = np.concatenate([[0], np.cumsum(jumps)]) % 2
-    return wrap_angle(course + (first - course[0]) + np.pi * backward)
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,6 @@ class Quadratic:
     gradient: Array  # (K, p, m): negative half gradient at the reference, of m columns of unknowns that share A
     value: float  # at the reference
 
-    @classmethod
-    def of(cls, diagonal: Array, off: Array | None, gradient: Array, value: float) -> Quadratic:
-        """Build a form from the blocks on (K, p, p) and above (K-1, p, p) A's diagonal, the latter None if zero."""
-        return cls(to_band(diagonal, off), gradient, value)
-
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
@@ -75,7 +70,7 @@ def minimize(form: Quadratic) -> Minimum:
 
 
 def to_band(diagonal: Array, off: Array | None) -> Array:
-    """Store blocks as columns (K p, 2p) from the diagonal down: LAPACK's lower band storage, transposed.
+    """Store the blocks on (K, p, p) and above (K-1, p, p) the diagonal, None if zero, as LAPACK's lower band storage, transposed.
 
     Every block column holds the diagonal block and the one below it; reading it with a stride that goes one further with
     every column skews it into the band.
@@ -116,8 +111,14 @@ def selected_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
     Cyclic reduction (Buzbee, Golub and Nielson, SIAM J. Numer. Anal. 7, 1970): every other state is eliminated at once, which leaves a chain of half the length. Its O(log K) rounds
     are each a few stacked products, where elimination along the chain would take K.
     """
-    if len(diagonal) <= MAX_DENSE_STATES:
-        return _dense_inverse(diagonal, off)
+    count, size, _ = diagonal.shape
+    if count <= MAX_DENSE_STATES:
+        dense, k = np.zeros((count, size, count, size)), np.arange(count)
+        dense[k, :, k] = diagonal
+        dense[k[:-1], :, k[1:]] = off
+        dense[k[1:], :, k[:-1]] = np.swapaxes(off, 1, 2)
+        whole = np.linalg.inv(dense.reshape(count * size, -1)).reshape(dense.shape).astype(np.float64, copy=False)
+        return whole[k, :, k], whole[k[:-1], :, k[1:]]
     even, odd = diagonal[::2], np.linalg.inv(diagonal[1::2])
     left, right = off[::2], off[1::2]  # even to odd, odd to even
     n, m = len(left), len(right)
@@ -135,17 +136,6 @@ def selected_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
     on[::2], on[1::2] = inverse, odd
     above[::2], above[1::2] = np.swapaxes(to_left, 1, 2), to_right
     return on, above
-
-
-def _dense_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
-    count, size, _ = diagonal.shape
-    dense = np.zeros((count, size, count, size))
-    k = np.arange(count)
-    dense[k, :, k] = diagonal
-    dense[k[:-1], :, k[1:]] = off
-    dense[k[1:], :, k[:-1]] = np.swapaxes(off, 1, 2)
-    inverse = np.linalg.inv(dense.reshape(count * size, -1)).reshape(dense.shape).astype(np.float64, copy=False)
-    return inverse[k, :, k], inverse[k[:-1], :, k[1:]]
 
 
 # Minimum distance of two knots; in between the acceleration is taken as constant, which at 100 m/s3 of jerk costs 0.02 mm.
@@ -187,7 +177,13 @@ class MotionPrior:
     @classmethod
     def over(cls, t_s: Array, step_s: float = KNOT_STEP_S) -> MotionPrior:
         """Build the prior with knots out of the times (n,), none nearer to another than `step_s`."""
-        knots = place_knots(t_s, step_s)
+        knots = np.unique(t_s)
+        if np.any(np.diff(knots) < step_s):
+            kept = [float(knots[0])]
+            for t in knots[1:].tolist():
+                if t - kept[-1] >= step_s:
+                    kept.append(t)
+            knots = np.array(kept)
         dt = np.diff(knots)
         # Inverted in units of the step: steps from milliseconds to seconds are equally well conditioned.
         scale = np.stack([dt**-2.5, dt**-1.5, dt**-0.5], axis=-1)
@@ -208,7 +204,8 @@ class MotionPrior:
 
     def jerk(self, state: Array) -> Quadratic:
         """Squared jerk over the three unknowns that both axes share, about a state (K, 3, 2)."""
-        return Quadratic.of(self.diagonal, self.cross, *self._gradient(state[1:] - self.step @ state[:-1]))
+        band = to_band(self.diagonal, self.cross)
+        return Quadratic(band, *self._gradient(state[1:] - self.step @ state[:-1]))
 
     def jerk_by_direction(self, state: Array, direction: Array) -> tuple[Quadratic, Quadratic]:
         """Squared jerk along and across unit directions (K-1, 2) of the steps, over all six unknowns of a knot."""
@@ -230,7 +227,7 @@ class MotionPrior:
 
     def _form(self, noise: Array, diagonal: Array, cross: Array) -> Quadratic:
         gradient, value = self._gradient(noise)
-        return Quadratic.of(diagonal, cross, gradient.reshape(-1, 6, 1), value)
+        return Quadratic(to_band(diagonal, cross), gradient.reshape(-1, 6, 1), value)
 
     def _gradient(self, noise: Array) -> tuple[Array, float]:
         """Negative half gradient (K, 3, 2) of the squared jerk for process noise (K-1, 3, 2), and its value."""
@@ -248,18 +245,6 @@ def kronecker(blocks: Array, weights: Array) -> Array:
         for second in range(2):
             np.multiply(blocks, weights[:, first, second, None, None], out=product[:, first::2, second::2])
     return product
-
-
-def place_knots(t_s: Array, step_s: float = KNOT_STEP_S) -> Array:
-    """Select knots (K,) from times (n,), from the first on, none nearer to the one before than `step_s`."""
-    times = np.unique(t_s)
-    if np.all(np.diff(times) >= step_s):
-        return times
-    knots: list[float] = []
-    for t in times.tolist():
-        if not knots or t - knots[-1] >= step_s:
-            knots.append(t)
-    return np.array(knots)
 
 
 # Information about position, velocity and acceleration of the first knot.
@@ -302,7 +287,7 @@ class MeasurementModel:
         diagonal[0] += np.diag(INITIAL_INFORMATION)
         gradient[0] -= INITIAL_INFORMATION[:, None] * state[0]
         value = float(information @ (residual**2).sum(axis=1) + INITIAL_INFORMATION @ (state[0] ** 2).sum(axis=1))
-        return Quadratic.of(diagonal, None, gradient, value)
+        return Quadratic(to_band(diagonal, None), gradient, value)
 
     def coupled_axes(self, state: Array, information: Array) -> Quadratic:
         """Squared residuals with information (n, 2, 2), over all six unknowns of a knot."""
@@ -315,7 +300,7 @@ class MeasurementModel:
         diagonal[0] += np.diag(initial)
         gradient[0, :, 0] -= initial * state[0].ravel()
         value = float(np.vdot(weighted, residual) + initial @ state[0].ravel() ** 2)
-        return Quadratic.of(diagonal, None, gradient, value)
+        return Quadratic(to_band(diagonal, None), gradient, value)
 
     def _sum_by_knot(self, values: Array, count: int) -> Array:
         """Sum values (n, ...) of the observations of each knot to (K, ...)."""
@@ -353,7 +338,8 @@ def zero_motion(state: Array, velocity_information: Array, acceleration_informat
     v = np.einsum("kab,kb->ka", velocity_information, state[:, 1])
     a = np.einsum("kab,kb->ka", acceleration_information, state[:, 2])
     gradient[:, 2:4, 0], gradient[:, 4:, 0] = -v, -a
-    return Quadratic.of(diagonal, None, gradient, float(np.vdot(v, state[:, 1]) + np.vdot(a, state[:, 2])))
+    value = float(np.vdot(v, state[:, 1]) + np.vdot(a, state[:, 2]))
+    return Quadratic(to_band(diagonal, None), gradient, value)
 
 
 def geman_mcclure_weights(squared: Array) -> Array:

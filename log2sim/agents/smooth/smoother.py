@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.agents.smooth.fixed_interval import smooth_interval
-from log2sim.agents.smooth.motion_model import MotionModel, Smoothed, broken_limits, speed_sigma
+from log2sim.agents.smooth.motion_model import MotionModel, broken_limits, speed_sigma
 from log2sim.agents.smooth.quadratic import NoisyPositions
 from log2sim.datatypes import Finding
 from log2sim.geometry import Array, wrap_angle
-
-__all__ = ["MotionModel", "SmoothedTrack", "smooth_track"]
 
 # Below this speed the curvature of a smoothed path is noise.
 MIN_CURVATURE_SPEED_MPS = 1.5
@@ -65,19 +62,39 @@ def smooth_track(
     """
     motion = MotionModel() if motion is None else motion
     t, xy = np.asarray(t_s, dtype=np.float64), np.asarray(xy_m, dtype=np.float64)
-    use = _rows_to_use(t, xy, valid)
-    r = _covariances(t[use], xy[use], sigma_m, covariance, use)
+    if t.ndim != 1 or xy.shape != (len(t), 2):
+        raise ValueError(f"t_s must be (n,) and xy_m (n, 2), got {t.shape} and {xy.shape}")
+    if np.any(np.diff(t) <= 0):
+        raise ValueError(f"t_s must increase strictly; it does not at index {int(np.argmax(np.diff(t) <= 0)) + 1}")
+    use = np.isfinite(xy).all(axis=1) & (np.ones(len(t), bool) if valid is None else np.asarray(valid, dtype=bool))
+    if not use.any():
+        raise ValueError("no valid position to smooth")
+    if covariance is not None:
+        r = np.asarray(covariance, dtype=np.float64)[use]
+    else:
+        sigma = np.asarray(estimate_sigma(t[use], xy[use]) if sigma_m is None else sigma_m, dtype=np.float64)
+        sigma = sigma[use] if sigma.ndim else np.full(int(use.sum()), float(sigma))
+        if np.any(~np.isfinite(sigma) | (sigma <= 0)):
+            raise ValueError("sigma_m must be positive and finite")
+        r = sigma[:, None, None] ** 2 * np.eye(2)
     asked = t if at_s is None else np.asarray(at_s, dtype=np.float64)
     # Far from the origin the normal equations would lose digits, so everything is relative to the first position.
     origin = xy[use][0]
     unknown_scale, correlated = sigma_m is None and covariance is None, covariance is not None
     path = smooth_interval(NoisyPositions(t[use], xy[use] - origin, r, unknown_scale, correlated), asked, motion)
     velocity, acceleration = path.state[:, 1], path.state[:, 2]
-    curvature = _curvature(velocity, acceleration)
-    residual = np.full(len(t), np.nan)
-    residual[use] = path.residual_m
-    inlier = np.zeros(len(t), dtype=bool)
-    inlier[use] = path.weight > MIN_INLIER_WEIGHT
+    speed = np.hypot(*velocity.T)
+    fast = speed > MIN_CURVATURE_SPEED_MPS
+    cross = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
+    curvature = np.divide(cross, speed**3, out=np.zeros_like(speed), where=fast)
+    residual, inlier = np.full(len(t), np.nan), np.zeros(len(t), dtype=bool)
+    residual[use], inlier[use] = path.residual_m, path.weight > MIN_INLIER_WEIGHT
+    broken: tuple[Finding, ...] = ()
+    if not motion.holonomic:
+        sigma = np.sqrt(np.trace(path.covariance[:, 4:, 4:], axis1=1, axis2=2) / 2)
+        of_curvature = np.divide(sigma, speed**2, out=np.zeros_like(speed), where=fast)
+        sigmas = {"acceleration": sigma, "lateral_acceleration": sigma, "curvature": of_curvature}
+        broken = broken_limits(asked, acceleration, path.yaw_rad, curvature, sigmas)
     return SmoothedTrack(
         t_s=asked,
         xy_m=path.state[:, 0] + origin,
@@ -90,48 +107,8 @@ def smooth_track(
         inlier=inlier,
         sigma_yaw_rad=path.sigma_yaw_rad,
         sigma_speed_mps=speed_sigma(path.yaw_rad, path.covariance[:, 2:4, 2:4]),
-        broken=_broken_limits(asked, path, curvature) if not motion.holonomic else (),
+        broken=broken,
     )
-
-
-def _rows_to_use(t: Array, xy: Array, valid: ArrayLike | None) -> NDArray[np.bool_]:
-    if t.ndim != 1 or xy.shape != (len(t), 2):
-        raise ValueError(f"t_s must be (n,) and xy_m (n, 2), got {t.shape} and {xy.shape}")
-    if np.any(np.diff(t) <= 0):
-        raise ValueError(f"t_s must increase strictly; it does not at index {int(np.argmax(np.diff(t) <= 0)) + 1}")
-    use = np.isfinite(xy).all(axis=1) & (np.ones(len(t), bool) if valid is None else np.asarray(valid, dtype=bool))
-    if not use.any():
-        raise ValueError("no valid position to smooth")
-    return np.asarray(use)
-
-
-def _curvature(velocity: Array, acceleration: Array) -> Array:
-    speed = np.hypot(*velocity.T)
-    cross = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
-    curvature: Array = np.divide(cross, speed**3, out=np.zeros_like(speed), where=speed > MIN_CURVATURE_SPEED_MPS)
-    return curvature
-
-
-def _broken_limits(t_s: Array, path: Smoothed, curvature: Array) -> tuple[Finding, ...]:
-    speed = np.hypot(*path.state[:, 1].T)
-    sigma = np.sqrt(np.trace(path.covariance[:, 4:, 4:], axis1=1, axis2=2) / 2)
-    of_curvature = np.divide(sigma, speed**2, out=np.zeros_like(speed), where=speed > MIN_CURVATURE_SPEED_MPS)
-    sigmas = {"acceleration": sigma, "lateral_acceleration": sigma, "curvature": of_curvature}
-    return broken_limits(t_s, path.state[:, 2], path.yaw_rad, curvature, sigmas)
-
-
-def _covariances(t: Array, xy: Array, sigma_m: ArrayLike | None, covariance: Array | None, use: NDArray[Any]) -> Array:
-    if covariance is not None:
-        given: Array = np.asarray(covariance, dtype=np.float64)[use]
-        return given
-    if sigma_m is None:
-        sigma_m = estimate_sigma(t, xy)
-    sigma = np.asarray(sigma_m, dtype=np.float64)
-    sigma = sigma[use] if sigma.ndim else np.full(len(t), float(sigma))
-    if np.any(~np.isfinite(sigma) | (sigma <= 0)):
-        raise ValueError("sigma_m must be positive and finite")
-    covariances: Array = sigma[:, None, None] ** 2 * np.eye(2)
-    return covariances
 
 
 def _inflated_in_gaps(covariance: Array, at_s: Array, inlier_s: Array, density: tuple[float, float]) -> Array:
