@@ -23,9 +23,8 @@ def box_corners_bev(xy_m: ArrayLike, length_m: ArrayLike, width_m: ArrayLike, ya
     m = len(xy)
     half_l, half_w = np.broadcast_to(length, m) / 2, np.broadcast_to(width, m) / 2
     yaw = np.broadcast_to(yaw, m)
-    local = (
-        np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * np.stack([half_l, half_w], axis=-1)[:, None]
-    )
+    local = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    local = local * np.stack([half_l, half_w], axis=-1)[:, None]
     c, s = np.cos(yaw), np.sin(yaw)
     rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
     return np.asarray(np.einsum("mij,mkj->mki", rotation, local) + xy[:, None])
@@ -39,9 +38,9 @@ def box_corners(center_m: ArrayLike, size_m: ArrayLike, yaw_rad: ArrayLike) -> A
     center, size = np.atleast_2d(np.asarray(center_m, float)), np.atleast_2d(np.asarray(size_m, float))
     bev = box_corners_bev(center[:, :2], size[:, 0], size[:, 1], yaw_rad)
     half_height = size[:, 2, None, None] / 2
-    bottom = np.concatenate([bev, np.broadcast_to(center[:, None, 2:] - half_height, (len(center), 4, 1))], -1)
-    top = np.concatenate([bev, np.broadcast_to(center[:, None, 2:] + half_height, (len(center), 4, 1))], -1)
-    return np.concatenate([bottom, top], axis=1)
+    levels = center[:, None, 2:] - half_height, center[:, None, 2:] + half_height
+    faces = [np.concatenate([bev, np.broadcast_to(z, (len(center), 4, 1))], axis=-1) for z in levels]
+    return np.concatenate(faces, axis=1)
 
 
 def points_in_box(
@@ -70,10 +69,7 @@ def box_iou(a_px: ArrayLike, b_px: ArrayLike) -> Array:
     """Compute the IoU (A, B) of axis-aligned image boxes (A, 4), (B, 4), u0, v0, u1, v1 in px; 0 where both are empty."""
     a, b = np.asarray(a_px, dtype=np.float64).reshape(-1, 1, 4), np.asarray(b_px, dtype=np.float64).reshape(1, -1, 4)
     overlap = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None).prod(-1)
-    area_a, area_b = (
-        np.clip(a[..., 2:] - a[..., :2], 0, None).prod(-1),
-        np.clip(b[..., 2:] - b[..., :2], 0, None).prod(-1),
-    )
+    area_a, area_b = (np.clip(one[..., 2:] - one[..., :2], 0, None).prod(-1) for one in (a, b))
     union = area_a + area_b - overlap
     return np.asarray(np.divide(overlap, union, out=np.zeros_like(union), where=union > 0))
 
@@ -119,7 +115,13 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     valid, range_m = np.zeros(count, dtype=bool), np.full(count, np.nan)
     if not count:
         return ProjectedBoxes(valid, box, range_m)
-    planes = view_planes(camera)
+    # Planes n, d of the view in the camera's frame: near, left, right, top, bottom; n . x + d >= 0 inside.
+    K, margin = camera.K, VIEW_MARGIN if any(camera.distortion) else 1.0
+    left, right = -margin * K[0, 2] / K[0, 0], margin * (camera.width_px - K[0, 2]) / K[0, 0]
+    top, bottom = -margin * K[1, 2] / K[1, 1], margin * (camera.height_px - K[1, 2]) / K[1, 1]
+    planes = np.array([
+        [0, 0, 1, -NEAR_M], [1, 0, -left, 0], [-1, 0, right, 0], [0, 1, -top, 0], [0, -1, bottom, 0],
+    ])  # fmt: skip
     limit = np.array([camera.width_px, camera.height_px], dtype=np.float64)
     corners_cam = box_corners(center_m, size_m, yaw_rad) @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
     inside = corners_cam @ planes[:, :3].T + planes[:, 3] >= 0  # (L, 8, 5)
@@ -146,17 +148,6 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     return ProjectedBoxes(valid, box, range_m)
 
 
-def view_planes(camera: Camera) -> Array:
-    """Compute planes (5, 4) n, d of the view, cam frame: near, left, right, top, bottom; n . x + d >= 0 inside."""
-    K = camera.K
-    margin = VIEW_MARGIN if any(camera.distortion) else 1.0
-    left, right = -margin * K[0, 2] / K[0, 0], margin * (camera.width_px - K[0, 2]) / K[0, 0]
-    top, bottom = -margin * K[1, 2] / K[1, 1], margin * (camera.height_px - K[1, 2]) / K[1, 1]
-    return np.array([
-        [0, 0, 1, -NEAR_M], [1, 0, -left, 0], [-1, 0, right, 0], [0, 1, -top, 0], [0, -1, bottom, 0],
-    ])  # fmt: skip
-
-
 def clip_box(corners_cam: Array, planes: Array) -> Array:
     """Clip a box, corners (8, 3), to the inside of planes (K, 4): vertices (V, 3), which may repeat.
 
@@ -167,27 +158,23 @@ def clip_box(corners_cam: Array, planes: Array) -> Array:
         return corners_cam
     if not inside.any(axis=0).all():
         return np.zeros((0, 3))
-    cutting = planes[~inside.all(axis=0)]
-    return np.concatenate([clip_polygon(corners_cam[list(face)], cutting) for face in FACES])
-
-
-def clip_polygon(polygon: Array, planes: Array) -> Array:
-    """Clip a flat convex polygon (P, 3) to the inside of planes (K, 4): vertices (V, 3)."""
-    for plane in planes:
-        if not len(polygon):
-            break
-        side = (polygon @ plane[:3] + plane[3]).tolist()
-        if min(side) >= 0:
-            continue
-        kept = []
-        for i, s in enumerate(side):
-            k = (i + 1) % len(side)
-            if s >= 0:
-                kept.append(polygon[i])
-            if (s >= 0) != (side[k] >= 0):
-                kept.append(polygon[i] + (polygon[k] - polygon[i]) * (s / (s - side[k])))
-        polygon = np.array(kept).reshape(-1, 3)
-    return polygon
+    clipped = []
+    for face in FACES:
+        polygon = corners_cam[list(face)]
+        for plane in planes[~inside.all(axis=0)]:
+            side = (polygon @ plane[:3] + plane[3]).tolist()
+            if min(side, default=0.0) >= 0:
+                continue
+            kept = []
+            for i, s in enumerate(side):
+                k = (i + 1) % len(side)
+                if s >= 0:
+                    kept.append(polygon[i])
+                if (s >= 0) != (side[k] >= 0):
+                    kept.append(polygon[i] + (polygon[k] - polygon[i]) * (s / (s - side[k])))
+            polygon = np.array(kept).reshape(-1, 3)
+        clipped.append(polygon)
+    return np.concatenate(clipped)
 
 
 def box_lines(camera: Camera, corners_cam: Array) -> Array:

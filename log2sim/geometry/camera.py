@@ -182,41 +182,31 @@ def undistort(camera: Camera, uv_px: Array) -> Array:
     if not _is_distorted(camera):
         return target
     tolerance = _TOLERANCE_PX / max(camera.K[0, 0], camera.K[1, 1])
-    xy = _radial_start(camera, target)
+    # The radial part, which is odd in x where the tangential terms are even; beyond the fold the last ray before it.
+    radius = np.tan(np.linspace(0.0, np.arctan(fold_radius(camera)), _TABLE_SIZE))[:-1]
+    ahead = np.column_stack([radius, np.zeros(_TABLE_SIZE - 1)])
+    bent = (distort(camera, ahead) - distort(camera, -ahead))[:, 0] / 2
+    wanted = np.hypot(target[:, 0], target[:, 1])
+    start = np.interp(wanted, np.maximum.accumulate(bent), radius)
+    xy = target * np.divide(start, wanted, out=np.ones_like(wanted), where=wanted > 0)[:, None]
     for _ in range(_ITERATIONS):
         error = distort(camera, xy) - target
         if not np.any(np.abs(error) > 1e-3 * tolerance):
             break
-        xy = xy - _newton_step(camera, xy, error)
+        # J step = error, with the Jacobian J of the lens by central differences; no step where it is singular.
+        width, columns = 1e-6 * np.maximum(1.0, np.abs(xy).max(axis=1, initial=0.0)), []
+        for axis in range(2):
+            aside = np.zeros_like(xy)
+            aside[:, axis] = width
+            columns.append((distort(camera, xy + aside) - distort(camera, xy - aside)) / (2 * width[:, None]))
+        (a, c), (b, d) = columns[0].T, columns[1].T
+        determinant = a * d - b * c
+        adjugate = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1)
+        regular = (determinant != 0)[:, None]
+        xy = xy - np.divide(adjugate, determinant[:, None], out=np.zeros_like(xy), where=regular)
     error = np.abs(distort(camera, xy) - target).max(axis=1, initial=0.0)
     found = (error <= tolerance) & _before_fold(camera, xy[:, 0], xy[:, 1])
     return np.where(found[:, None], xy, np.nan)
-
-
-def _radial_start(camera: Camera, target: Array) -> Array:
-    """Invert the radial part of the lens at `target` (N, 2): rays (N, 2), beyond the fold the last one before it."""
-    radius = np.tan(np.linspace(0.0, np.arctan(fold_radius(camera)), _TABLE_SIZE))[:-1]
-    ahead = np.column_stack([radius, np.zeros(_TABLE_SIZE - 1)])
-    # The radial part is odd in x, the tangential terms are even.
-    bent = (distort(camera, ahead) - distort(camera, -ahead))[:, 0] / 2
-    wanted = np.hypot(target[:, 0], target[:, 1])
-    start = np.interp(wanted, np.maximum.accumulate(bent), radius)
-    return np.asarray(target * np.divide(start, wanted, out=np.ones_like(wanted), where=wanted > 0)[:, None])
-
-
-def _newton_step(camera: Camera, xy: Array, error: Array) -> Array:
-    """Solve J step = error (N, 2) with the Jacobian J of the lens by central differences; 0 where it is singular."""
-    width = 1e-6 * np.maximum(1.0, np.abs(xy).max(axis=1, initial=0.0))
-    columns = []
-    for axis in range(2):
-        aside = np.zeros_like(xy)
-        aside[:, axis] = width
-        columns.append((distort(camera, xy + aside) - distort(camera, xy - aside)) / (2 * width[:, None]))
-    (a, c), (b, d) = columns[0].T, columns[1].T
-    determinant = a * d - b * c
-    adjugate = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1)
-    step = np.divide(adjugate, determinant[:, None], out=np.zeros_like(xy), where=(determinant != 0)[:, None])
-    return np.asarray(step)
 
 
 def _padded(coefficients: tuple[float, ...], count: int) -> tuple[float, ...]:
@@ -274,27 +264,19 @@ def project_moving(
     uv = project(camera, apply(transforms[KNOTS // 2], points))[0]
     depth = np.zeros(len(points))
     for _ in range(ITERATIONS):
+        # Projections and depths by the two poses around the time of each line, interpolated.
         place = (line_time_s(camera, uv) / shutter.readout_s + 0.5) * (KNOTS - 1)
-        uv, depth = _project_between(camera, points, transforms, place)
+        before = np.minimum(place.astype(np.int64), KNOTS - 2)
+        weight, uv, depth = place - before, np.zeros((len(points), 2)), np.zeros(len(points))
+        for k in np.unique(before):
+            rows = before == k
+            for knot, share in ((k, 1 - weight[rows]), (k + 1, weight[rows])):
+                local = apply(transforms[knot], points[rows])
+                uv[rows] += share[:, None] * project(camera, local)[0]
+                depth[rows] += share * local[:, 2]
     with np.errstate(invalid="ignore"):
         valid = np.all((uv >= 0) & (uv < [camera.width_px, camera.height_px]), axis=1)
     return uv, depth, valid
-
-
-def _project_between(
-    camera: Camera, points: NDArray[np.floating[Any]], transforms: Array, place: Array
-) -> tuple[Array, Array]:
-    """Interpolate the projections (N, 2) and depths (N,) of the two transforms around each place (N,) among them."""
-    before = np.minimum(place.astype(np.int64), KNOTS - 2)
-    weight = place - before
-    uv, depth = np.zeros((len(points), 2)), np.zeros(len(points))
-    for k in np.unique(before):
-        rows = before == k
-        for knot, share in ((k, 1 - weight[rows]), (k + 1, weight[rows])):
-            local = apply(transforms[knot], points[rows])
-            uv[rows] += share[:, None] * project(camera, local)[0]
-            depth[rows] += share * local[:, 2]
-    return uv, depth
 
 
 MIN_CAMERA_HEIGHT_M = 1e-3
@@ -309,9 +291,8 @@ def ground_homography(camera: Camera, dst_T_cam: Array, ground_z_m: float = 0.0)
     the camera lies in the plane, which it then sees edge-on.
     """
     if abs(dst_T_cam[2, 3] - ground_z_m) < MIN_CAMERA_HEIGHT_M:
-        raise ValueError(
-            f"camera '{camera.name}' lies in the ground plane z = {ground_z_m:g} m and cannot look onto it"
-        )
+        plane = f"the ground plane z = {ground_z_m:g} m"
+        raise ValueError(f"camera '{camera.name}' lies in {plane} and cannot look onto it")
     cam_T_dst = inverse(np.asarray(dst_T_cam, dtype=np.float64))
     r, t = cam_T_dst[:3, :3], cam_T_dst[:3, 3]
     image_H_ground = camera.K @ np.column_stack([r[:, 0], r[:, 1], r[:, 2] * ground_z_m + t])

@@ -115,17 +115,10 @@ class Polyline:
     def project(self, xy_m: Array, heading_rad: Array) -> Projection:
         """Project points (N, 2) with headings (N,): of the parts nearby, on the one that leads their way."""
         near = self._tree.query(_features(xy_m, heading_rad))[1]
-        s, aside = self._feet(near, xy_m)
-        inside = (s >= -INSIDE_M) & (s <= self.length_m + INSIDE_M)
-        turn = wrap_angle(heading_rad - self.heading_at(s))
-        return Projection(s, aside, turn, inside)
-
-    def _feet(self, near: NDArray[np.intp], xy_m: Array) -> tuple[Array, Array]:
-        """Stations and offsets of points next to vertices (N,), on the two segments that meet there."""
         points, last = self.points_m[:, :2], len(self.points_m) - 1
         best_s, best_aside = np.zeros(len(xy_m)), np.full(len(xy_m), np.inf)
         best = np.full(len(xy_m), np.inf)
-        for shift in (-1, 0):
+        for shift in (-1, 0):  # the two segments that meet at the nearest vertex
             k = np.clip(near + shift, 0, last - 1)
             start, step = points[k], points[k + 1] - points[k]
             length = np.hypot(*step.T)
@@ -139,7 +132,8 @@ class Polyline:
             best = np.where(better, distance, best)
             best_s = np.where(better, self.s_m[k] + held, best_s)
             best_aside = np.where(better, np.where(aside == 0, 0.0, np.copysign(distance, aside)), best_aside)
-        return best_s, best_aside
+        inside = (best_s >= -INSIDE_M) & (best_s <= self.length_m + INSIDE_M)
+        return Projection(best_s, best_aside, wrap_angle(heading_rad - self.heading_at(best_s)), inside)
 
 
 def crossings(one: Polyline, two: Polyline) -> Array:
@@ -147,8 +141,19 @@ def crossings(one: Polyline, two: Polyline) -> Array:
     low, high = (np.maximum(one.bounds_m[0], two.bounds_m[0]), np.minimum(one.bounds_m[1], two.bounds_m[1]))
     if np.any(low > high):
         return np.zeros((0, 2))
-    (s, a), (t, b) = _chords(one), _chords(two)
-    i, j = _near_chords(a, b)
+    from scipy.spatial import cKDTree
+
+    # Stations and points about `CROSSING_STEP_M` apart, and the pairs of chords between them that may intersect, in rising order.
+    s, t = (
+        np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / CROSSING_STEP_M)), 1) + 1)
+        for line in (one, two)
+    )
+    a, b = one.at(s)[:, :2], two.at(t)[:, :2]
+    trees = [cKDTree((points[:-1] + points[1:]) / 2) for points in (a, b)]
+    reach = sum(float(np.hypot(*np.diff(points, axis=0).T).max()) for points in (a, b)) / 2
+    near = trees[0].sparse_distance_matrix(trees[1], reach * (1 + 1e-9), output_type="ndarray")
+    near = near[np.lexsort((near["j"], near["i"]))]
+    i, j = near["i"], near["j"]
     da, db, gap = np.diff(a, axis=0)[i], np.diff(b, axis=0)[j], b[j] - a[i]
     det = da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -158,23 +163,6 @@ def crossings(one: Polyline, two: Polyline) -> Array:
     hit = (sine > MIN_SINE) & (f >= 0) & (f < 1) & (g >= 0) & (g < 1)
     found = np.column_stack([s[i] + f * np.diff(s)[i], t[j] + g * np.diff(t)[j]])[hit]
     return np.asarray(found[found[:, 0] < found[:, 1] - CROSSING_STEP_M] if one is two else found)
-
-
-def _near_chords(a: Array, b: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return pairs of chords of two lines of points that are near enough to each other to intersect, in rising order."""
-    from scipy.spatial import cKDTree
-
-    trees = [cKDTree((points[:-1] + points[1:]) / 2) for points in (a, b)]
-    reach = sum(float(np.hypot(*np.diff(points, axis=0).T).max()) for points in (a, b)) / 2
-    near = trees[0].sparse_distance_matrix(trees[1], reach * (1 + 1e-9), output_type="ndarray")
-    order = np.lexsort((near["j"], near["i"]))
-    return near["i"][order], near["j"][order]
-
-
-def _chords(line: Polyline) -> tuple[Array, Array]:
-    """Stations (M,) and points (M, 2) about `CROSSING_STEP_M` apart."""
-    s = np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / CROSSING_STEP_M)), 1) + 1)
-    return s, line.at(s)[:, :2]
 
 
 def _way(points_m: Array) -> Array:

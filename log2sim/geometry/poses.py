@@ -85,11 +85,11 @@ class PoseTrack:
         """
         t_s = (np.atleast_1d(np.asarray(t_ns, dtype=np.int64)) - self.t_ns[0]) / NS_PER_S
         known_s = (self.t_ns - self.t_ns[0]) / NS_PER_S
-        columns = zip(usual, (self.sigma_m, self.sigma_yaw_rad), strict=True)
-        return np.stack(
-            [np.full(len(t_s), value) if sigma is None else np.interp(t_s, known_s, sigma) for value, sigma in columns],
-            axis=1,
-        )
+        out = np.tile(usual, (len(t_s), 1)).astype(np.float64)
+        for k, sigma in enumerate((self.sigma_m, self.sigma_yaw_rad)):
+            if sigma is not None:
+                out[:, k] = np.interp(t_s, known_s, sigma)
+        return out
 
     def _neighbors(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows (N,) before and after stamps; outside the track its end and a row some time away, never two at nearly one time."""
@@ -99,7 +99,6 @@ class PoseTrack:
         if not (start.any() or end.any()):
             return after - 1, after
         second = min(int(np.searchsorted(self.t_ns, self.t_ns[0] + MIN_EXTRAPOLATION_BASE_NS)), last)
-        second_last = max(
-            int(np.searchsorted(self.t_ns, self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS, side="right")) - 1, 0
-        )
+        early_ns = self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS
+        second_last = max(int(np.searchsorted(self.t_ns, early_ns, side="right")) - 1, 0)
         return np.where(end, second_last, after - 1), np.where(start, second, after)

@@ -1,9 +1,4 @@
-"""Rigid transforms, rotations, angles and stamps in nanoseconds.
-
-Transforms are named `dst_T_src` (4x4, float64) so that inner frames cancel: `map_T_cam = map_T_ego @ ego_T_cam`.
-Frames: map (local ENU), ego (ISO 8855: x forward, y left, z up), cam (x right, y down, z forward). Quaternions are
-scalar-first, yaw is counter-clockwise from +x in [-pi, pi).
-"""
+"""Rigid transforms, rotations, angles and stamps in nanoseconds; names and frames as in `log2sim.geometry`."""
 
 from __future__ import annotations
 
