@@ -154,7 +154,7 @@ def conflict_doubts(candidates: Sequence[AgentCandidate], ego: Agent | None, t_s
 
 def _doubt(found: Finding, conflict: Conflict, t_s: Array, agent: Agent) -> Finding:
     """Return a finding that holds during a conflict, for the whole life of an agent where it always holds."""
-    worst_s, first_s, last_s = t_s[conflict.tick[[conflict.share.argmax(), 0, -1]]].tolist()
+    worst_s, first_s, last_s = t_s[conflict.tick[[int(conflict.share.argmax()), 0, -1]]].tolist()
     if first_s <= agent.waypoints.t_s[0] + MARGIN_S and last_s >= agent.waypoints.t_s[-1] - MARGIN_S:
         return found
     return replace(found, start_s=first_s, end_s=last_s, values={"at_s": worst_s})

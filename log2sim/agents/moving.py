@@ -105,8 +105,8 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
         placed = Measurements.from_boxes(boxes, np.zeros(3))
         rows.append(replace(placed, center_m=boxes.center_m, covariance=covariance, source=source))
     yaw, score = [b.yaw_rad.copy() for b in found], [b.heading_score.copy() for b in found]
-    limits = {"max_gap_s": config.max_gap_s, "min_life_s": config.min_life_s}
-    for one in track(rows, t_ns, birth_score=config.birth_score, **limits):
+    birth_score, max_gap_s, min_life_s = config.birth_score, config.max_gap_s, config.min_life_s
+    for one in track(rows, t_ns, birth_score=birth_score, max_gap_s=max_gap_s, min_life_s=min_life_s):
         m, group, velocity = one.measurements, GROUP_OF[one.category], velocities(one)
         speed, course = np.hypot(*velocity.T), np.arctan2(velocity[:, 1], velocity[:, 0])
         t_s = (m.t_ns - m.t_ns[0]) / NS_PER_S

@@ -186,7 +186,8 @@ def match(routes: Sequence[Polyline], line: Polyline, enter_m: float = ENTER_M, 
     for run in _runs(route_of, s):
         if run.route < 0:
             rows = slice(run.first, run.last + 1)
-            held = stay[:, rows].all(axis=1) & (np.abs(np.diff(s[:, rows], axis=1)) <= JUMP_M).all(axis=1)
+            held = np.all(np.abs(np.diff(s[:, rows], axis=1)) <= JUMP_M, axis=1)
+            held &= stay[:, rows].all(axis=1)
             if held.any():
                 beside = [route_of[k] for k in (run.first - 1, run.last + 1) if 0 <= k < n]
                 route_of[rows] = next((r for r in beside if r >= 0 and held[r]), np.flatnonzero(held)[0])

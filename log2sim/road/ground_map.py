@@ -152,6 +152,6 @@ class GroundMap:
         (rows, columns), d = spans, self.resolution_m
         x0, _, _, y1 = self.extent_m
         extent = (x0 + columns.start * d, x0 + columns.stop * d, y1 - rows.stop * d, y1 - rows.start * d)
-        layers = self.color_bgr, self.alpha, self.height_m, self.intensity
-        color, alpha, height, intensity = (layer[rows, columns].copy() for layer in layers)
+        color, alpha = (layer[rows, columns].copy() for layer in (self.color_bgr, self.alpha))
+        height, intensity = (layer[rows, columns].copy() for layer in (self.height_m, self.intensity))
         return GroundMap(color, alpha, height, intensity, d, extent, self.notes)

@@ -344,7 +344,8 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     lines, shares = [], []
     for m in markings:
         if m.is_lane_line:
-            slope, offset = np.polyfit(*(m.points_m[:, :2] - camera.mount_T_cam[:2, 3]).T, 1)
+            x, y = (m.points_m[:, :2] - camera.mount_T_cam[:2, 3]).T
+            slope, offset = np.polyfit(x, y, 1)
             share = _visible(found, m) * m.confidence / (LONG_LINE * camera.height_px)
             # Upright things that are laid out flat point to below the camera, but not along the road.
             upright = abs(slope) > UPRIGHT_SLOPE and abs(offset) < UPRIGHT_OFFSET_M
@@ -355,9 +356,8 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     others = tuple(m for m in markings if not m.is_lane_line)
     if shape is None:
         return replace(found, markings=others, notes=(*notes, "no lane lines seen: none run beside each other"))
-    kept = [lines[k] for k in shape[1]]
-    x = camera.mount_T_cam[0, 3]
-    joined = join_lines(kept, shape[0], x + NEAR_M, x + FAR_M)
+    kept, own_m = [lines[k] for k in shape[1]], camera.mount_T_cam[0, 3]
+    joined = join_lines(kept, shape[0], own_m + NEAR_M, own_m + FAR_M)
     return replace(found, markings=(*kept, *others), lane_lines=tuple(joined))
 
 

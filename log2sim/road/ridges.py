@@ -236,7 +236,8 @@ def _respond(layers: tuple[Layer, Layer, Layer], cell_m: float) -> tuple[Layer, 
         # By LiDAR alone all three are one layer, which is warped and blurred once.
         turned = {id(layer): layer for layer in layers}
         length = _cells(ALONG_M, cell_m), 1
-        turned = {key: cv2.blur(warp(layer, there, size), length) for key, layer in turned.items()}
+        means = ((key, cv2.blur(warp(layer, there, size), length)) for key, layer in turned.items())
+        turned = {key: np.asarray(mean, np.float32) for key, mean in means}
         along, brightest, darkest = (turned[id(layer)] for layer in layers)
         if k == 0:
             # Contrast of ridges of the least width to the mean of both sides, as texture has it, too.

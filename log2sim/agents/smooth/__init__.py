@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from log2sim.agents.smooth.motion_model import yaw_of_motion
-from log2sim.agents.smooth.smoother import MotionModel, SmoothedTrack, smooth_track
+from log2sim.agents.smooth.motion_model import MotionModel, yaw_of_motion
+from log2sim.agents.smooth.smoother import SmoothedTrack, smooth_track
 
 __all__ = ["MotionModel", "SmoothedTrack", "smooth_track", "yaw_of_motion"]
