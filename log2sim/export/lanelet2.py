@@ -1,4 +1,9 @@
-"""Export of the road to Lanelet2 (OSM XML): lanelets, their borders, stop lines, crosswalks and traffic lights."""
+"""Export of the road to Lanelet2 (OSM XML): lanelets, their borders, stop lines, crosswalks and traffic lights.
+
+`lanelet2_map.osm`, and `map_projector_info.yaml`, with which Autoware takes `local_x` and `local_y` of its nodes. Lanes beside each
+other share a way and those behind each other its ends, as routing needs it. Nodes have latitude and longitude; where the place of
+the map is not known, they are around 0, 0.
+"""
 
 from __future__ import annotations
 
@@ -26,60 +31,54 @@ TYPE_OF_MARK = {
 Way = tuple[str, str]  # of a lane, "left" or "right"
 
 
-class Lanelet2:
-    """`lanelet2_map.osm`, and `map_projector_info.yaml`, with which Autoware takes `local_x` and `local_y` of its nodes.
+options: tuple[str, ...] = ()
+loses = (
+    "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "
+    "gets a stop sign at its right end (`log2sim_assumed`), since Lanelet2 has no stop line by itself; `location` is always urban, and speed limits are not known"
+)
 
-    Lanes beside each other share a way and those behind each other its ends, as routing needs it. Nodes have latitude and
-    longitude; where the place of the map is not known, they are around 0, 0.
-    """
 
-    options: tuple[str, ...] = ()
-    loses = (
-        "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "
-        "gets a stop sign at its right end (`log2sim_assumed`), since Lanelet2 has no stop line by itself; `location` is always urban, and speed limits are not known"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the map."""
-        draft = _Draft(scenario.map)
-        roads, marks = lanes(scenario), MarkFinder(scenario)
-        way_of = _add_borders(draft, roads, marks)
-        features = scenario.map_features or MapFeatures()
-        stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
-        rules: dict[str, list[int]] = {lane.id: [] for lane in roads}
-        lit: set[int] = set()  # stop lines of lights
-        for signal in scenario.signals:
-            ahead = signal_lanes(signal, roads)
-            members = [("way", _add_light(draft, signal), "refers")]
-            if not ahead:
-                continue
-            lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
-            members += [("way", number, "ref_line") for number in lines]
-            lit |= set(lines)
-            rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the map."""
+    draft = _Draft(scenario.map)
+    roads, marks = lanes(scenario), MarkFinder(scenario)
+    way_of = _add_borders(draft, roads, marks)
+    features = scenario.map_features or MapFeatures()
+    stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
+    rules: dict[str, list[int]] = {lane.id: [] for lane in roads}
+    lit: set[int] = set()  # stop lines of lights
+    for signal in scenario.signals:
+        ahead = signal_lanes(signal, roads)
+        members = [("way", _add_light(draft, signal), "refers")]
+        if not ahead:
+            continue
+        lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
+        members += [("way", number, "ref_line") for number in lines]
+        lit |= set(lines)
+        rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
+        for lane in ahead:
+            rules[lane.id].append(rule)
+    for stop, number in stops:
+        ahead = [lane for lane in roads if number not in lit and _ends_at(lane, stop)]
+        if ahead:
+            members = [("way", _add_sign(draft, stop, ahead[0]), "refers"), ("way", number, "ref_line")]
+            rule = draft.relation(members, type="regulatory_element", subtype="traffic_sign", log2sim_assumed="yes")
             for lane in ahead:
                 rules[lane.id].append(rule)
-        for stop, number in stops:
-            ahead = [lane for lane in roads if number not in lit and _ends_at(lane, stop)]
-            if ahead:
-                members = [("way", _add_sign(draft, stop, ahead[0]), "refers"), ("way", number, "ref_line")]
-                rule = draft.relation(members, type="regulatory_element", subtype="traffic_sign", log2sim_assumed="yes")
-                for lane in ahead:
-                    rules[lane.id].append(rule)
-        for lane in roads:
-            members = [("way", way_of[lane.id, side], side) for side in ("left", "right")]
-            members += [("relation", rule, "regulatory_element") for rule in rules[lane.id]]
-            tags = {"subtype": "road", "location": "urban", "one_way": "yes", "participant:vehicle": "yes"}
-            draft.relation(members, type="lanelet", **tags, **_turn(lane), log2sim_id=xml_text.escaped(lane.id))
-        for marking in features.markings:
-            if marking.kind == "crosswalk":
-                edges = [draft.way(edge, type="pedestrian_marking") for edge in _walk_edges(marking)]
-                members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
-                draft.relation(
-                    members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
-                )
-        xml_text.write(draft.document(), folder / "lanelet2_map.osm")
-        (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
+    for lane in roads:
+        members = [("way", way_of[lane.id, side], side) for side in ("left", "right")]
+        members += [("relation", rule, "regulatory_element") for rule in rules[lane.id]]
+        tags = {"subtype": "road", "location": "urban", "one_way": "yes", "participant:vehicle": "yes"}
+        draft.relation(members, type="lanelet", **tags, **_turn(lane), log2sim_id=xml_text.escaped(lane.id))
+    for marking in features.markings:
+        if marking.kind == "crosswalk":
+            edges = [draft.way(edge, type="pedestrian_marking") for edge in _walk_edges(marking)]
+            members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
+            draft.relation(
+                members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
+            )
+    xml_text.write(draft.document(), folder / "lanelet2_map.osm")
+    (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
 
 
 class _Draft:
@@ -251,6 +250,3 @@ def _walk_edges(marking: Marking) -> tuple[Array, Array]:
         ring = np.roll(ring, -1, axis=0)
     z = np.full(2, marking.points_m[:, 2].mean())
     return np.column_stack([ring[[3, 2]], z]), np.column_stack([ring[[0, 1]], z])
-
-
-EXPORTER = Lanelet2()

@@ -1,4 +1,9 @@
-"""Export to ASAM OpenLABEL 1.0.0: 3D boxes, 2D boxes in the pictures of cameras, and coordinate systems, frame by frame."""
+"""Export to ASAM OpenLABEL 1.0.0: objects with a cuboid in the map at each frame; with `--log`, also their boxes in its pictures.
+
+Frames are the synchronized moments of the log; without one, they are 0.1 s apart. Positions are coordinates of the scenario's
+projection, as the frame's `transforms` from the ego to the map. A box in a picture is that of the whole cuboid, whether or not
+something hides it.
+"""
 
 from __future__ import annotations
 
@@ -21,59 +26,52 @@ DECIMALS = 6  # of meters, and finer of radians; pixels have two
 PINHOLE_COEFFICIENTS = 5  # that the schema asks for at least
 
 
-class OpenLabel:
-    """`openlabel.json`: objects with a cuboid in the map at each frame; with `--log`, also their boxes in its pictures.
+options: tuple[str, ...] = ("log",)
+loses = (
+    "uncertainty and observed flags, speeds, times between frames, markings, lanes, traffic lights, map origin, stages; the "
+    "rolling shutter of cameras"
+)
 
-    Frames are the synchronized moments of the log; without one, they are 0.1 s apart. Positions are coordinates of the
-    scenario's projection, as the frame's `transforms` from the ego to the map. A box in a picture is that of the whole cuboid, whether or
-    not something hides it.
-    """
 
-    options: tuple[str, ...] = ("log",)
-    loses = (
-        "uncertainty and observed flags, speeds, times between frames, markings, lanes, traffic lights, map origin, stages; the "
-        "rolling shutter of cameras"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the document."""
-        log = options.log
-        stamps, pictures = _frames_of(scenario, log)
-        if log is None:
-            moves = agent_steps(scenario).moves
-        else:
-            t_s = (stamps - scenario.t0_ns) / NS_PER_S
-            step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else STEP_S
-            moves = tuple((agent, sample_steps(agent, t_s, step_s)) for agent in scenario.agents)
-        data: list[dict[str, dict[str, Any]]] = [{} for _ in stamps]
-        for uid, (agent, move) in enumerate(moves, start=1):
-            for k in np.flatnonzero(move.valid).tolist():
-                data[k][str(uid)] = {"cuboid": [_cuboid(scenario, agent, move, k)]}
-        if log is not None:
-            for found, shown in zip(data, pictures, strict=True):
-                for camera, t_ns in shown.items():
-                    for row, box in _boxes_px(scenario, log, camera, t_ns):
-                        found.setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
-        content = {}
-        for k, (t_ns, shown) in enumerate(zip(stamps.tolist(), pictures)):
-            streams = {name: {"stream_properties": {"timestamp": str(stamp)}} for name, stamp in shown.items()}
-            transforms = _transforms(scenario, log, t_ns, moves, k)
-            content[str(k)] = {
-                "frame_properties": {"timestamp": str(t_ns), "transforms": transforms, "streams": streams},
-                "objects": {uid: {"object_data": found} for uid, found in data[k].items()},
-            }
-        document = {
-            "metadata": {"schema_version": "1.0.0", "name": scenario.name, "annotator": "log2sim"},
-            "coordinate_systems": _systems(scenario, log),
-            "streams": {} if log is None else _streams(log),
-            "objects": {
-                str(uid): _object(agent, [k for k, found in enumerate(data) if str(uid) in found])
-                for uid, agent in enumerate(scenario.agents, start=1)
-            },
-            "frames": content,
-            "frame_intervals": _intervals(range(len(data))),
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the document."""
+    log = options.log
+    stamps, pictures = _frames_of(scenario, log)
+    if log is None:
+        moves = agent_steps(scenario).moves
+    else:
+        t_s = (stamps - scenario.t0_ns) / NS_PER_S
+        step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else STEP_S
+        moves = tuple((agent, sample_steps(agent, t_s, step_s)) for agent in scenario.agents)
+    data: list[dict[str, dict[str, Any]]] = [{} for _ in stamps]
+    for uid, (agent, move) in enumerate(moves, start=1):
+        for k in np.flatnonzero(move.valid).tolist():
+            data[k][str(uid)] = {"cuboid": [_cuboid(scenario, agent, move, k)]}
+    if log is not None:
+        for found, shown in zip(data, pictures, strict=True):
+            for camera, t_ns in shown.items():
+                for row, box in _boxes_px(scenario, log, camera, t_ns):
+                    found.setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
+    content = {}
+    for k, (t_ns, shown) in enumerate(zip(stamps.tolist(), pictures)):
+        streams = {name: {"stream_properties": {"timestamp": str(stamp)}} for name, stamp in shown.items()}
+        transforms = _transforms(scenario, log, t_ns, moves, k)
+        content[str(k)] = {
+            "frame_properties": {"timestamp": str(t_ns), "transforms": transforms, "streams": streams},
+            "objects": {uid: {"object_data": found} for uid, found in data[k].items()},
         }
-        write_json(folder / "openlabel.json", {"openlabel": document})
+    document = {
+        "metadata": {"schema_version": "1.0.0", "name": scenario.name, "annotator": "log2sim"},
+        "coordinate_systems": _systems(scenario, log),
+        "streams": {} if log is None else _streams(log),
+        "objects": {
+            str(uid): _object(agent, [k for k, found in enumerate(data) if str(uid) in found])
+            for uid, agent in enumerate(scenario.agents, start=1)
+        },
+        "frames": content,
+        "frame_intervals": _intervals(range(len(data))),
+    }
+    write_json(folder / "openlabel.json", {"openlabel": document})
 
 
 def _frames_of(scenario: Scenario, log: Log | None) -> tuple[NDArray[np.int64], list[dict[str, int]]]:
@@ -192,6 +190,3 @@ def _intervals(frames: Sequence[int]) -> list[dict[str, int]]:
     """Return the runs of successive frames."""
     runs = np.split(np.array(frames, dtype=np.int64), np.flatnonzero(np.diff(frames) != 1) + 1)
     return [{"frame_start": int(run[0]), "frame_end": int(run[-1])} for run in runs if len(run)]
-
-
-EXPORTER = OpenLabel()

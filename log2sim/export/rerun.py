@@ -1,4 +1,9 @@
-"""Recordings for the Rerun viewer."""
+"""Recordings for the Rerun viewer.
+
+`<name>.rrd`: `/agents`, `/paths`, `/speed`, and with a log `/cameras` and `/lidar`, all over the log's own time. What was taken off
+positions and why agents are doubtful stands in `/about`. The same scenario gives the same data and not the same bytes: Rerun draws
+ids of its own for whatever it stores.
+"""
 
 from __future__ import annotations
 
@@ -24,35 +29,29 @@ PATH_PX, OUTLINE_PX = 1.5, 1.0
 Part = tuple[tuple[str, ...], NDArray[np.int64] | None, Any]
 
 
-class Rerun:
-    """`<name>.rrd`: `/agents`, `/paths`, `/speed`, and with a log `/cameras` and `/lidar`, all over the log's own time.
+options: tuple[str, ...] = ("log",)
+loses = (
+    "uncertainty and observed flags, times between steps of 0.1 s, colors (boxes are colored by category), stages; of a "
+    "log: full resolution of pictures wider than 960 px, and points beyond 10,000 a sweep; positions are float32"
+)
 
-    What was taken off positions and why agents are doubtful stands in `/about`. The same scenario gives the same data and not the same bytes: Rerun
-    draws ids of its own for whatever it stores.
-    """
 
-    options: tuple[str, ...] = ("log",)
-    loses = (
-        "uncertainty and observed flags, times between steps of 0.1 s, colors (boxes are colored by category), stages; of a "
-        "log: full resolution of pictures wider than 960 px, and points beyond 10,000 a sweep; positions are float32"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the recording."""
-        try:
-            import rerun
-        except ImportError:
-            raise MissingExtra("export to Rerun", "rerun") from None
-        name = file_name(scenario.name)
-        recording = rerun.RecordingStream("log2sim", recording_id=name)
-        recording.save(folder / f"{name}.rrd", default_blueprint=_layout(options.log))
-        try:
-            for entity, t_ns, columns in _parts(scenario, options.log):
-                stamps = None if t_ns is None else t_ns.astype("datetime64[ns]")
-                times = [] if stamps is None else [rerun.TimeColumn(TIMELINE, timestamp=stamps)]
-                recording.send_columns(rerun.new_entity_path(list(entity)), times, columns)
-        finally:
-            recording.disconnect()
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the recording."""
+    try:
+        import rerun
+    except ImportError:
+        raise MissingExtra("export to Rerun", "rerun") from None
+    name = file_name(scenario.name)
+    recording = rerun.RecordingStream("log2sim", recording_id=name)
+    recording.save(folder / f"{name}.rrd", default_blueprint=_layout(options.log))
+    try:
+        for entity, t_ns, columns in _parts(scenario, options.log):
+            stamps = None if t_ns is None else t_ns.astype("datetime64[ns]")
+            times = [] if stamps is None else [rerun.TimeColumn(TIMELINE, timestamp=stamps)]
+            recording.send_columns(rerun.new_entity_path(list(entity)), times, columns)
+    finally:
+        recording.disconnect()
 
 
 def _layout(log: Log | None) -> Any:
@@ -147,6 +146,3 @@ def _picture(record: viewers.CameraFrame, t_ns: NDArray[np.int64], origin: Array
         radii=[rerun.Radius.ui_points(OUTLINE_PX)] * len(lines),
     )
     yield (*place, "boxes"), t_ns, strips.partition([len(lines)])
-
-
-EXPORTER = Rerun()
