@@ -24,9 +24,9 @@ from log2sim.datatypes import (
 )
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
+from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.expected_motion import ends_of
 from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
-from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.plot.layers import lane_arrows, lane_outline, shown_spans
 from log2sim.visualization.plot.viewport import assign_view_roles, is_moving
 
@@ -135,7 +135,7 @@ MAX_BYTES = 3_000_000
 QUALITY = 75  # of 100; artifacts are invisible below the tracks
 
 
-def embed(picture: Background) -> dict[str, Any] | None:
+def embed(picture: GroundMap) -> dict[str, Any] | None:
     """Return the picture as a data URL with its extent, x0, x1, y0, y1, m; None where it shows nothing.
 
     Cut to what it shows; WebP, since that has opacity and every browser shows it.
@@ -186,7 +186,7 @@ def page_document(
     truth: Scenario | None = None,
     replay: Any = None,
     predict_s: float | None = None,
-    background: Background | None = None,
+    background: GroundMap | None = None,
     metrics: Sequence[tuple[str, str]] = (),
 ) -> dict[str, Any]:
     """Assemble the document of a page: name, span of time and a layer each for scenario, truth and replay.
