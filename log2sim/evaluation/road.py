@@ -397,10 +397,11 @@ def map_figures(scenario: Scenario, truth: Scenario) -> dict[str, Any] | None:
     moved = truth.aligned_to(scenario)
     ours, theirs = scenario.map_features, moved.map_features or MapFeatures()
     area = Area.of(scenario, moved, truth.shift_to(scenario))
+    our_lines, true_lines = ([m for m in side.markings if m.is_lane_line] for side in (ours, theirs))
     return {
         "within_m": WITHIN_M if area.near is not None else None,
         "where_seen": area.seen is not None,
-        "lane_lines": line_figures(*([m for m in side.markings if m.is_lane_line] for side in (ours, theirs)), area),
+        "lane_lines": line_figures(our_lines, true_lines, area),
         "borders": line_figures(ours.borders, theirs.borders, area),
         **shape_figures(ours.markings, theirs.markings, area),
         "lanes": {**lane_figures(ours.lanes, theirs.lanes, area), **path_figures(ours.lanes, moved, area)},

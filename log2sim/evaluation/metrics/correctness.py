@@ -134,7 +134,7 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         }
 
     rows, everything = [], np.ones_like(v.judged)
-    for k in np.flatnonzero(v.judged.any(axis=1)):
+    for k in np.flatnonzero(v.judged.any(axis=1)).tolist():
         ticks, reasons = v.judged[k], doubts(agents[k])
         there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
         rows.append({

@@ -181,7 +181,8 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
             xyz = np.einsum("nij,nj->ni", rotation_from_rpy(0 * turn, 0 * turn, turn), states[:, :3] - before[:, :3])
             return np.column_stack([xyz + after[:, :3], states[:, 3] + turn])
 
-        method, far = "projection", reproject
+        method = "projection"
+        far: Move = reproject
         near: Move = reproject if truth.ego is None else around_ego
     else:
         apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
