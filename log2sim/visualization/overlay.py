@@ -133,7 +133,7 @@ def read_moment(
             if sweep.t_ns is not None and len(sweep.t_ns):
                 middle = (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2
             loaded[name, index] = SweepInMap(name, mapped[0], middle, compensation_of(log, name, sweep))
-        return tuple(sweep for key in wanted if (sweep := loaded.get(key)) is not None)
+        return tuple(found for key in wanted if (found := loaded.get(key)) is not None)
 
     frames = [(name, int(index[tick])) for name, index in schedule.frames.items()]
     shots = tuple(_shot(log, name, index, partial(sweeps_of, row)) for row, (name, index) in enumerate(frames))

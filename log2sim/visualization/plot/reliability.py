@@ -31,7 +31,7 @@ def write_reliability(result: Mapping[str, Any], path: Path) -> None:
     figure = style.new_figure(SIDE_IN * max(len(tables), 1), SIDE_IN + 0.3, layout="constrained")
     for k, (name, noun, table) in enumerate(tables, start=1):
         axes = figure.add_subplot(1, len(tables), k)
-        count, confidence, right = zip(*((b[key] for key in keys) for b in table["bins"] if b[keys[0]]))
+        count, confidence, right = zip(*([b[key] for key in keys] for b in table["bins"] if b[keys[0]]))
         area = [max(MAX_MARK_PT2 * n / max(count), MIN_MARK_PT2) for n in count]
         axes.plot([0, 1], [0, 1], color=style.FRAME, lw=1, zorder=1)
         axes.plot(confidence, right, color=style.PALETTE[0], lw=1.2, zorder=2)
