@@ -242,7 +242,7 @@ def cache(
         opt.say(f"{store.folder}: {opt.counted(removed, 'part')} removed")
         return
     usage, last = store.usage(), store.last_run
-    detectors = [
+    detectors: list[dict[str, Any]] = [
         {"name": group.rpartition(".")[0], "parts": count, "bytes": size}
         for group, (count, size) in sorted(usage.items(), key=lambda item: (-item[1][0], item[0]))
     ]
