@@ -93,25 +93,19 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         root.append(_lanelet(lane, number_of, marks, own))
     root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
     first = len(roads) + len(scenario.signals) + 1
-    table = [
-        ("commonroad_id", "agent", "category", "role", "confidence", "doubts"),
-        (first, ego.id, ego.category, "planning problem", *_trust(ego)),
-    ]
+    table: list[tuple[object, ...]] = [("commonroad_id", "agent", "category", "role", "confidence", "doubts")]
     obstacles = []
-    for number, agent in enumerate(scenario.others, start=first + 1):
-        obstacle = _obstacle(agent, number, t_s)
+    for number, agent in enumerate((ego, *scenario.others), start=first):
+        obstacle = None if agent is ego else _obstacle(agent, number, t_s)
         obstacles += [obstacle] if obstacle is not None else []
-        role = obstacle.tag if obstacle is not None else "left out: not alive at any step"
-        table.append((number, agent.id, agent.category, role, *_trust(agent)))
+        role = "planning problem" if agent is ego else "left out: not alive at any step"
+        doubts = ", ".join(doubt.sentence for doubt in agent.doubts)
+        role = role if obstacle is None else obstacle.tag
+        table.append((number, agent.id, agent.category, role, agent.confidence, doubts))
     root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
     root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
     xml_text.write(root, folder / f"{name}.xml")
     write_csv_table(folder / "agents.csv", table)
-
-
-def _trust(agent: Agent) -> tuple[float, str]:
-    """Return the confidence of an agent and the reasons to doubt it."""
-    return agent.confidence, ", ".join(doubt.sentence for doubt in agent.doubts)
 
 
 def _decimal(value: float) -> str:

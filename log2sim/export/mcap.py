@@ -40,7 +40,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     except ImportError:
         raise MissingExtra("export to MCAP", "mcap") from None
     steps = agent_steps(scenario)
-    if steps.t_ns[0] < 0:
+    if steps[0][0] < 0:
         raise ScenarioError(f"scenario '{scenario.name}' starts before 1970, which MCAP has no stamps for")
     placement = near_origin(scenario)
     origin = np.array(placement.origin_m)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, AgentTable, Lidar, Log, Scenario
 from log2sim.errors import ConfigError
@@ -36,17 +35,29 @@ loses = (
 def write(scenario: Scenario, folder: Path, options: Options) -> None:
     """Write the document."""
     log = options.log
-    stamps, pictures = _frames_of(scenario, log)
+    # The stamps (T,) of frames, and those of the pictures of cameras in each.
     if log is None:
-        moves = agent_steps(scenario).moves
+        stamps, moves = agent_steps(scenario)
+        pictures: list[dict[str, int]] = [{} for _ in stamps]
     else:
+        start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        ticks = [tick for tick in log.ticks() if start <= tick.t_ns <= stop]
+        if not ticks:
+            raise ConfigError(
+                f"--log: log '{log.name}' has no moment between {start} and {stop} ns, the time of scenario '{scenario.name}'; give "
+                "the log that it was made from"
+            )
+        stamps, pictures = np.array([tick.t_ns for tick in ticks], dtype=np.int64), [dict(t.image_ns) for t in ticks]
         t_s = (stamps - scenario.t0_ns) / NS_PER_S
         step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else STEP_S
         moves = tuple((agent, sample_steps(agent, t_s, step_s)) for agent in scenario.agents)
     data: list[dict[str, dict[str, Any]]] = [{} for _ in stamps]
     for uid, (agent, move) in enumerate(moves, start=1):
         for k in np.flatnonzero(move.valid).tolist():
-            data[k][str(uid)] = {"cuboid": [_cuboid(scenario, agent, move, k)]}
+            center, half = move.position_m[k] + np.array(scenario.map.offset_m), float(move.yaw_rad[k]) / 2
+            turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+            values = [*_rounded(center), *_rounded(turn, 9), *_rounded(np.array(agent.size_m))]
+            data[k][str(uid)] = {"cuboid": [{"name": "cuboid", "coordinate_system": "map", "val": values}]}
     if log is not None:
         for found, shown in zip(data, pictures, strict=True):
             for camera, t_ns in shown.items():
@@ -74,30 +85,8 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     write_json(folder / "openlabel.json", {"openlabel": document})
 
 
-def _frames_of(scenario: Scenario, log: Log | None) -> tuple[NDArray[np.int64], list[dict[str, int]]]:
-    """Return the stamps (T,) of frames, and those of the pictures of cameras in each."""
-    if log is None:
-        t_ns = agent_steps(scenario).t_ns
-        return t_ns, [{} for _ in t_ns]
-    start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
-    ticks = [tick for tick in log.ticks() if start <= tick.t_ns <= stop]
-    if not ticks:
-        raise ConfigError(
-            f"--log: log '{log.name}' has no moment between {start} and {stop} ns, the time of scenario '{scenario.name}'; give "
-            "the log that it was made from"
-        )
-    return np.array([tick.t_ns for tick in ticks], dtype=np.int64), [dict(tick.image_ns) for tick in ticks]
-
-
 def _rounded(values: Array, digits: int = DECIMALS) -> list[float]:
     return [round(float(v), digits) for v in np.ravel(values)]
-
-
-def _cuboid(scenario: Scenario, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any]:
-    center, half = move.position_m[k] + np.array(scenario.map.offset_m), float(move.yaw_rad[k]) / 2
-    turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
-    values = [*_rounded(center), *_rounded(turn, 9), *_rounded(np.array(agent.size_m))]
-    return {"name": "cuboid", "coordinate_system": "map", "val": values}
 
 
 def _boxes_px(scenario: Scenario, log: Log, camera: str, t_ns: int) -> list[tuple[int, dict[str, Any]]]:

@@ -130,7 +130,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         import betterosi
     except ImportError:
         raise MissingExtra("export to OSI", "osi") from None
-    steps = agent_steps(scenario)
+    stamps, moves = agent_steps(scenario)
     # The fields that all frames share.
     major, minor, patch = map(int, betterosi.__version_osi__.split("."))
     head: dict[str, Any] = {
@@ -162,10 +162,10 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     versions = betterosi.prepare_channel_metadata()
     keys = (betterosi.OSI_CHANNEL_OSI_VERSION_KEY, betterosi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
     standard, protobuf = (versions[key].replace(".", "") for key in keys)
-    name = f"{start}_gt_{standard}_{protobuf}_{len(steps.t_ns)}_{file_name(scenario.name)}.osi"
+    name = f"{start}_gt_{standard}_{protobuf}_{len(stamps)}_{file_name(scenario.name)}.osi"
     with betterosi.Writer(folder / name) as writer:
-        for k, stamp_ns in enumerate(steps.t_ns.tolist()):
-            alive = [(n, a, m) for n, (a, m) in enumerate(steps.moves, start=1) if m.valid[k]]
+        for k, stamp_ns in enumerate(stamps.tolist()):
+            alive = [(n, a, m) for n, (a, m) in enumerate(moves, start=1) if m.valid[k]]
             t_s = (stamp_ns - scenario.t0_ns) / NS_PER_S
             writer.add(betterosi.GroundTruth(
                 **head, **ground,

@@ -103,9 +103,16 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     """Write the description and the two tables."""
     description = scenario_description(scenario)
     name = f"sd_{DATASET}_{VERSION}_{file_name(scenario.name)}.pkl"
-    _dump(description, folder / name)
-    _dump({name: _without_arrays(description["metadata"])}, folder / "dataset_summary.pkl")
-    _dump({name: ""}, folder / "dataset_mapping.pkl")
+
+    def plain(value: Any) -> Any:  # lists in place of arrays, as summaries hold them
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        return value.tolist() if isinstance(value, np.ndarray) else value
+
+    files = {name: description, "dataset_summary.pkl": {name: plain(description["metadata"])}}
+    for file, value in (files | {"dataset_mapping.pkl": {name: ""}}).items():
+        with (folder / file).open("wb") as opened:
+            _Pickler(opened, protocol=PROTOCOL).dump(value)
 
 
 def scenario_description(scenario: Scenario) -> Value:
@@ -180,13 +187,6 @@ def _object_summary(name: str, track: Value) -> Value:
     }  # fmt: skip
 
 
-def _without_arrays(value: Any) -> Any:
-    """Replace arrays by lists, as summaries hold them."""
-    if isinstance(value, dict):
-        return {k: _without_arrays(v) for k, v in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
 class _Pickler(pickle.Pickler):
     """Pickles arrays as calls of `numpy.ndarray` on their bytes: NumPy's own form references modules that NumPy 2 moved."""
 
@@ -194,8 +194,3 @@ class _Pickler(pickle.Pickler):
         if isinstance(value, np.ndarray):
             return np.ndarray, (value.shape, value.dtype.str, bytearray(value.tobytes()))
         return NotImplemented
-
-
-def _dump(value: Value, file: Path) -> None:
-    with file.open("wb") as opened:
-        _Pickler(opened, protocol=PROTOCOL).dump(value)
