@@ -41,14 +41,14 @@ class ExportPlacement:
         """Convert states (N, 4) x, y, z, heading from the scenario to the export."""
         if self.target is not None:
             states = self._projected(states + np.array([*self.offset_m, 0.0]), self.projection, self.target)
-        return states - np.array([*self.origin_m, 0.0])
+        return np.asarray(states - np.array([*self.origin_m, 0.0]))
 
     def back(self, states: Array) -> Array:
         """Convert states (N, 4) from the export to the scenario."""
         states = states + np.array([*self.origin_m, 0.0])
         if self.target is None:
             return states
-        return self._projected(states, self.target, self.projection) - np.array([*self.offset_m, 0.0])
+        return np.asarray(self._projected(states, self.target, self.projection) - np.array([*self.offset_m, 0.0]))
 
     @staticmethod
     def _projected(states: Array, source: str | None, target: str | None) -> Array:

@@ -201,8 +201,8 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
     by_key = {(lane.id, side): (lane, side) for lane in roads for side in ("left", "right")}
     for key, numbers in number_of.items():
         lane, side = by_key[key]
-        name = lane.left if side == "left" else lane.right
-        item, mark = marks.items.get(name), marks.mark(name)
+        border = lane.left if side == "left" else lane.right
+        item, mark = marks.items.get(border), marks.mark(border)
         if isinstance(item, RoadBorder) and item.kind == "edge":
             tags = {"type": "road_border"}
         else:

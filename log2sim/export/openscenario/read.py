@@ -195,7 +195,8 @@ def _agent(
             )
         pose = _pose(start, where)
         vertices = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
-    doubts, text = [], properties.get(PREFIX + "doubts")
+    doubts: Any = []
+    text = properties.get(PREFIX + "doubts")
     if text is not None:
         try:
             doubts = parse_unique(unescaped(text))
