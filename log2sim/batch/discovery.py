@@ -47,7 +47,9 @@ def find_logs(
     if format == SCENARIO:
         inside = root / "logs" if (root / "batch.json").is_file() else root.parent if root.is_file() else root
         paths = (
-            [root] if root.is_file() else [p for p in find_scenarios(inside) if follows_links() or not p.is_symlink()]
+            [root]
+            if root.is_file()
+            else [p for p in map(inside.joinpath, find_scenarios(inside)) if follows_links() or not p.is_symlink()]
         )
         if not paths:
             raise LogError(f"{root}: holds no scenario")
