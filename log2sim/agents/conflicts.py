@@ -176,7 +176,20 @@ def extend_static(
     """
     t_s = timeline.seconds(timeline.t_ns)
     rows = [k for k, agent in enumerate(agents) if agent.static]
-    free = _free_places([agents[k] for k in rows], clouds, t_s)
+    if not rows:
+        return list(agents)
+    # The ticks outside of their lives at which rays pass through their places.
+    free = np.zeros((len(rows), len(t_s)), dtype=bool)
+    boxes = AgentTable.of([agents[k] for k in rows], t_s[:1], margin_s=np.inf)
+    life = np.array([agents[k].waypoints.t_s[[0, -1]] for k in rows])
+    for tick, cloud in enumerate(clouds):
+        if cloud is None or cloud.free is None or not len(cloud.free):
+            continue
+        outside = (t_s[tick] < life[:, 0]) | (t_s[tick] > life[:, 1])
+        near = np.flatnonzero(outside & (np.hypot(*(boxes.xy_m[:, 0] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M))
+        if len(near):
+            inside, through, _ = count_at(boxes.take(near), 0, cloud.origin, cloud.free)
+            free[near, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
     out = list(agents)
     # The surest first: what it takes, the others cannot have.
     for n in sorted(range(len(rows)), key=lambda n: -agents[rows[n]].confidence):
@@ -192,25 +205,6 @@ def extend_static(
             life_s = np.concatenate([t_s[before], w.t_s, t_s[after]])
             out[rows[n]] = replace(agent, waypoints=replace(w.take(index), t_s=life_s, observed=seen))
     return out
-
-
-def _free_places(agents: Sequence[Agent], clouds: Sequence[Obstacles | None], t_s: Array) -> NDArray[np.bool_]:
-    """Return at which ticks (A, T) outside of their lives rays pass through the places of static agents."""
-    free = np.zeros((len(agents), len(t_s)), dtype=bool)
-    if not agents:
-        return free
-    boxes = AgentTable.of(agents, t_s[:1], margin_s=np.inf)
-    life = np.array([a.waypoints.t_s[[0, -1]] for a in agents])
-    for tick, cloud in enumerate(clouds):
-        if cloud is None or cloud.free is None or not len(cloud.free):
-            continue
-        outside = (t_s[tick] < life[:, 0]) | (t_s[tick] > life[:, 1])
-        near = np.hypot(*(boxes.xy_m[:, 0] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M
-        rows = np.flatnonzero(outside & near)
-        if len(rows):
-            inside, through, _ = count_at(boxes.take(rows), 0, cloud.origin, cloud.free)
-            free[rows, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
-    return free
 
 
 def _occupied(agent: Agent, others: Sequence[Agent], t_s: Array) -> NDArray[np.bool_]:

@@ -150,7 +150,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     ordinary = geometry.is_likely and group != "pedestrian"
     shown = image_confidence(track)
     sure = shown >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
-    knows_speed = moving and w.sigma_speed_mps is not None
+    speed_sigma = w.sigma_speed_mps if moving else None
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
@@ -168,7 +168,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "heading": float(log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), 0.01, 0.99))),
         "other_category": float((m.category != agent.category).mean()),
         "impossible": float(any(d.kind != "heading_ambiguous" for d in agent.doubts)),
-        "sigma_speed": np.log(np.median(w.sigma_speed_mps) / 0.3 + 1e-3) if knows_speed else 0.0,
+        "sigma_speed": 0.0 if speed_sigma is None else np.log(np.median(speed_sigma) / 0.3 + 1e-3),
         "moving": float(moving),
         "confirmed": float(moved >= MIN_SWEEP_LOG_ODDS or sure),
         "two_wheeler": float(group == "two_wheeler"),

@@ -233,12 +233,6 @@ def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -
     return float(np.dot(weights, odds) / total) if total > 0 else 0.0
 
 
-def street_axis(xy: Array, paths: Sequence[Array]) -> tuple[float, float]:
-    """Return the yaw in rad, up to half turns, of the street at a place (2,), and the probability that it belongs to it."""
-    surest = max(_passing_by(xy, paths, None), key=lambda passing: passing.belongs, default=None)
-    return (0.0, 0.0) if surest is None else (surest.heading_rad, surest.belongs)
-
-
 @dataclass(frozen=True)
 class _Passing:
     """How a path passes a place."""
@@ -405,7 +399,12 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
             odds = POINTS_SHARE * (odds + outline) if odds and outline else odds + outline
         alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0]))
     own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
-    paths = [_path_of(c, odds) for c, odds in zip(road_users, own.tolist())]
+    paths = []  # x, y and heading at the waypoints at which each shows the direction of traffic
+    for c, known in zip(road_users, own.tolist()):
+        w = c.agent.waypoints
+        moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & (abs(known) > MIN_FLOW_LOG_ODDS)
+        yaw = w.yaw_rad[moving] + (0.0 if known > 0 else np.pi)
+        paths.append(np.stack([w.x_m[moving], w.y_m[moving], yaw], axis=1))
     road_users = [_along_street(c, [ego_path, *paths]) for c in road_users]
     middle = [(c.agent.waypoints, len(c.agent.waypoints) // 2) for c in road_users]
     poses = np.array([[w.x_m[k], w.y_m[k], w.yaw_rad[k]] for w, k in middle])
@@ -427,23 +426,16 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     return [c.doubted(motion_doubts(c.agent.category, c.agent.waypoints)) for c in decided]
 
 
-def _path_of(candidate: AgentCandidate, log_odds: float) -> Array:
-    """Return x, y and heading (K, 3) at the waypoints at which a candidate shows the direction of traffic."""
-    w = candidate.agent.waypoints
-    moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & (abs(log_odds) > MIN_FLOW_LOG_ODDS)
-    yaw = w.yaw_rad[moving] + (0.0 if log_odds > 0 else np.pi)
-    return np.stack([w.x_m[moving], w.y_m[moving], yaw], axis=1)
-
-
 def _along_street(candidate: AgentCandidate, paths: Sequence[Array]) -> AgentCandidate:
     """Lay a candidate that stands and of whose yaw nothing is known along the street."""
     w, known = candidate.agent.waypoints, candidate.geometry.yaw_rad
     if not candidate.agent.static or (known is not None and np.isfinite(known)):
         return candidate
-    yaw, belongs = street_axis(np.array([w.x_m[0], w.y_m[0]]), paths)
-    if belongs < MIN_STREET_SHARE:
+    passing = _passing_by(np.array([w.x_m[0], w.y_m[0]]), paths, None)
+    surest = max(passing, key=lambda path: path.belongs, default=None)
+    if surest is None or surest.belongs < MIN_STREET_SHARE:
         return candidate
-    sigma = np.sqrt(belongs * PARALLEL_SIGMA_RAD**2 + (1 - belongs) * UNKNOWN_YAW_RAD**2)
+    sigma = np.sqrt(surest.belongs * PARALLEL_SIGMA_RAD**2 + (1 - surest.belongs) * UNKNOWN_YAW_RAD**2)
     n = len(w.t_s)
-    w = replace(w, yaw_rad=np.full(n, wrap_angle(yaw)), sigma_yaw_rad=np.full(n, sigma))
+    w = replace(w, yaw_rad=np.full(n, wrap_angle(surest.heading_rad)), sigma_yaw_rad=np.full(n, sigma))
     return replace(candidate, agent=replace(candidate.agent, waypoints=w))

@@ -242,15 +242,9 @@ def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
     log = OUTLIER_LOG * int((label < 0).sum()) + NEXT_OBJECT_LOG * (count - 1)
     log += CHANGE_LOG * int((np.diff(seen) != 0).sum())
     log += sum(marginal_likelihood(few.take(label == k), STANDING).log for k in range(count) if (label == k).any())
-    return log, _parts_of(track, _labels(_positions_of(track, np.arange(len(track))), places, objects, body))
-
-
-def _parts_of(track: Track, label: NDArray[np.intp]) -> list[Part]:
-    """Make a part of each object, given which one each measurement (n,) shows, -1 for none.
-
-    Objects are seen one after the other: what is shown in between by fewer measurements are other points of the same
-    detections. Such measurements belong to the object that is seen next to them.
-    """
+    label = _labels(_positions_of(track, np.arange(len(track))), places, objects, body)
+    # Objects are seen one after the other: what is shown in between by fewer measurements are other points of the same
+    # detections. Such measurements belong to the object that is seen next to them.
     by_size = sorted(set(label[label >= 0].tolist()), key=lambda k: -int((label == k).sum()))
     kept: list[NDArray[np.intp]] = []
     for rows in (np.flatnonzero(label == k) for k in by_size):
@@ -258,11 +252,11 @@ def _parts_of(track: Track, label: NDArray[np.intp]) -> list[Part]:
         if len(rows) >= MIN_ROWS and max(between, default=0.0) < 0.5:
             kept.append(rows)
     if not kept:
-        return []
+        return log, []
     row = np.arange(len(label))
     distance = np.array([np.abs(row[:, None] - rows).min(axis=1) for rows in kept])
     nearest = np.argmin(distance, axis=0)
-    return [Part(_taken(track, nearest == k), True, _taken(track, rows)) for k, rows in enumerate(kept)]
+    return log, [Part(_taken(track, nearest == k), True, _taken(track, rows)) for k, rows in enumerate(kept)]
 
 
 def _places(p: Positions) -> Array:

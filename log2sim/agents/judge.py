@@ -23,6 +23,7 @@ MIN_THERE = {True: 0.5, False: 0.25}
 DOUBT_NATS = 1.0
 # Never 0 or 1: an agent may be right or wrong for a reason that no evidence shows.
 MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
+SAME_M = 0.005  # rounding
 
 
 def judge(
@@ -90,27 +91,15 @@ def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: 
     }
     told = [found for name, found in reasons.items() if -weights.get(name, 0.0) * evidence[name] > DOUBT_NATS]
     told += [Finding("hardly_observed", case="no_points")] if evidence["pointless"] else []
-    return [*told, *doubt_size(agent)]
-
-
-# Rounding.
-SAME_M = 0.005
-
-
-def doubt_size(agent: Agent) -> list[Finding]:
-    """Doubt a vehicle that is wider than any on the road, by more than the error of an observed side, or as long as sizes go.
-
-    Sizes are limited to those of the category: a vehicle at the greatest length was observed to be longer.
-    """
-    length_m, width_m, _ = agent.size_m
-    if GROUP_OF[agent.category] != "vehicle":
-        return []
-    if width_m > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M:
-        return [Finding("unlikely_size", case="width", values={"width_m": width_m, "limit_m": MAX_ROAD_WIDTH_M})]
-    longest_m = MAX_SIZE_M[agent.category][0]
-    if length_m >= longest_m - SAME_M:
-        return [Finding("unlikely_size", case="length", values={"limit_m": longest_m}, other=agent.category)]
-    return []
+    (length_m, width_m, _), longest_m = agent.size_m, MAX_SIZE_M[agent.category][0]
+    # Wider than any on the road, by more than the error of an observed side. Or as long as sizes go: they are limited to those of
+    # the category, so a vehicle at the greatest length was observed to be longer.
+    if GROUP_OF[agent.category] == "vehicle" and width_m > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M:
+        wide = {"width_m": width_m, "limit_m": MAX_ROAD_WIDTH_M}
+        told.append(Finding("unlikely_size", case="width", values=wide))
+    elif GROUP_OF[agent.category] == "vehicle" and length_m >= longest_m - SAME_M:
+        told.append(Finding("unlikely_size", case="length", values={"limit_m": longest_m}, other=agent.category))
+    return told
 
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared

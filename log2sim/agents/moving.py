@@ -161,21 +161,6 @@ def motion_doubts(category: str, w: Waypoints) -> tuple[Finding, ...]:
     )  # fmt: skip
 
 
-def jump_doubts(t_s: Array, residual_m: Array, sigma_m: Array) -> tuple[Finding, ...]:
-    """Doubt a smoothed trajectory where several measurements in a row are far from it.
-
-    `t_s`: (n,), s: times of the measurements. `residual_m`: (n,), m: distances from the trajectory; NaN where not used.
-    `sigma_m`: (n,), m: standard deviations of the measurements, changing views included.
-    """
-    beside = np.nan_to_num(residual_m) > np.sqrt(CHI2_2DOF_999) * sigma_m
-    doubts = []
-    for rows in spans_of(beside) if beside.mean() >= MIN_BESIDE_SHARE else []:
-        if len(rows) >= MIN_BESIDE:
-            values = {"residual_m": float(residual_m[rows].max())}
-            doubts.append(Finding("jump", start_s=float(t_s[rows[0]]), end_s=float(t_s[rows[-1]]), values=values))
-    return tuple(doubts)
-
-
 def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: Array) -> tuple[Finding, ...]:
     """Doubt a vehicle whose length was measured to lie across its way most of the time.
 
@@ -296,7 +281,14 @@ def moving_candidate(
         sigma_speed_mps=path.sigma_speed_mps,
     )
     sigma_m = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2 + CENTER_SIGMA_M[group] ** 2)
-    doubts = path.broken + jump_doubts(positions_s, path.residual_m, sigma_m)
+    doubts = list(path.broken)
+    # Several measurements in a row that are far from the trajectory, where not used NaN.
+    beside = np.nan_to_num(path.residual_m) > np.sqrt(CHI2_2DOF_999) * sigma_m
+    for span in spans_of(beside) if beside.mean() >= MIN_BESIDE_SHARE else ():
+        if len(span) >= MIN_BESIDE:
+            start_s, end_s = positions_s[span[[0, -1]]].tolist()
+            values = {"residual_m": float(path.residual_m[span].max())}
+            doubts.append(Finding("jump", start_s=start_s, end_s=end_s, values=values))
     if group == "vehicle":
         near = np.clip(np.searchsorted(at, t), 0, len(at) - 1)
         doubts += sideways_doubts(m, t, waypoints.yaw_rad[near], waypoints.speed_mps[near])

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, OtherView, Track
+from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, Track
 from log2sim.geometry import Array, weighted_quantile
 from log2sim.perception import boxes
 from log2sim.perception.boxes import box_sigma
@@ -133,23 +133,19 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     real = views.max(axis=0)
     gap = np.where(views == real, gaps, np.inf).min(axis=0)
     ends = Ends(low[None], high[None], real[None], gap[None])
-    if axis is None and _is_length_across(ends, boxes.rotate(m.sensor_m[:, :2] - origin, -yaw), track.category):
-        return yaw + np.pi / 2, ends.swapped()
-    return yaw, ends
-
-
-def _is_length_across(ends: Ends, sensor: Array, category: str) -> bool:
-    """Decide whether the length of an object is the second axis of its ends (one view), seen from sensors (K, 2)."""
-    low, high = (e[0] for e in boxes.corner_correction(
-        ends.low, ends.high, ends.real, np.array([TYPICAL_SIZE_M[category][1]]), gap_m=ends.gap_m
-    ))  # fmt: skip
-    whole = np.all(ends.real[0], axis=-1)
-    doubt_m = boxes.UNIFORM_SIGMA * ends.gap_m[0].sum(axis=-1)
-    log_odds = boxes.swapped_log_odds(high - low, whole, doubt_m, category)
-    if abs(log_odds) >= CLEAR_LOG_ODDS:
-        return log_odds > 0
-    typical = np.array(TYPICAL_SIZE_M[category])
-    return boxes.axes_swapped(ends.high[0] - ends.low[0], sensor - (ends.low + ends.high) / 2, typical)
+    if axis is not None:
+        return yaw, ends
+    # Without boxes it is by the sides whether the length is the second axis.
+    typical = np.array(TYPICAL_SIZE_M[track.category])
+    corners = boxes.corner_correction(ends.low, ends.high, ends.real, typical[1:2], gap_m=ends.gap_m)
+    size = (corners[1] - corners[0])[0]
+    doubt_m = boxes.UNIFORM_SIGMA * gap.sum(axis=-1)
+    log_odds = boxes.swapped_log_odds(size, np.all(real, axis=-1), doubt_m, track.category)
+    across = log_odds > 0
+    if abs(log_odds) < CLEAR_LOG_ODDS:
+        sensors = boxes.rotate(m.sensor_m[:, :2] - origin, -yaw)
+        across = boxes.axes_swapped(high - low, sensors - (ends.low + ends.high) / 2, typical)
+    return (yaw + np.pi / 2, ends.swapped()) if across else (yaw, ends)
 
 
 def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: Array) -> Ends:
@@ -163,42 +159,30 @@ def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: 
     views = track.measurements.views_of(rows)
     count, place = len(rows), {k: i for i, k in enumerate(rows.tolist())}
     of = np.array([place[k] for k, _ in views], dtype=np.intp)
-    seen = _ends_in_views([view for _, view in views], yaw_rad[of], velocity_mps[of], track.category)
+    moved = [
+        v.cluster[:, :2] - v.sensor_m[:2] - (v.cluster[:, 3:] * velocity if v.cluster.shape[1] > 3 else 0.0)
+        for (_, v), velocity in zip(views, velocity_mps[of])
+    ]
+    low, high = boxes.extents_of_clusters(np.concatenate(moved), np.array([len(xy) for xy in moved]), yaw_rad[of])
+    step = np.array([boxes.azimuth_step_rad(boxes.rotate(xy, -yaw)) for xy, yaw in zip(moved, yaw_rad[of])])
+    visible = np.array([view.ends_visible for _, view in views], dtype=bool).reshape(-1, 2)
+    real = boxes.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(track.category))
+    seen = Ends(low, high, real, boxes.end_gaps(step, low, high, real))
     out = seen.take(slice(count))
     if len(views) > count:
         second, sensor = of[count:], np.array([view.sensor_m[:2] for _, view in views])
         apart = boxes.rotate(sensor[count:] - sensor[second], -yaw_rad[second])
-        other = seen.take(slice(count, None))
-        better = _better_ends(out.take(second), replace(other, low=other.low + apart, high=other.high + apart))
-        for name, column in vars(out).items():
-            column[second] = getattr(better, name)
+        one, other = out.take(second), seen.take(slice(count, None))
+        other = replace(other, low=other.low + apart, high=other.high + apart)
+        # Each end is taken from the view that knows it better; of two that do not, the outer one.
+        outer = np.stack([other.low < one.low, other.high > one.high], axis=-1)
+        takes = (other.real > one.real) | ((other.real == one.real) & (other.gap_m < one.gap_m))
+        takes = np.where((one.real == 0) & (other.real == 0), outer, takes)
+        out.low[second] = np.where(takes[..., 0], other.low, one.low)
+        out.high[second] = np.where(takes[..., 1], other.high, one.high)
+        out.real[second] = np.where(takes, other.real, one.real)
+        out.gap_m[second] = np.where(takes, other.gap_m, one.gap_m)
     return out
-
-
-def _ends_in_views(views: list[OtherView], yaw_rad: Array, velocity_mps: Array, category: str) -> Ends:
-    """Find the ends of the points of viewpoints (n,), relative to them, for yaws (n,) and velocities (n, 2)."""
-    moved = [
-        v.cluster[:, :2] - v.sensor_m[:2] - (v.cluster[:, 3:] * velocity if v.cluster.shape[1] > 3 else 0.0)
-        for v, velocity in zip(views, velocity_mps)
-    ]
-    low, high = boxes.extents_of_clusters(np.concatenate(moved), np.array([len(xy) for xy in moved]), yaw_rad)
-    step = np.array([boxes.azimuth_step_rad(boxes.rotate(xy, -yaw)) for xy, yaw in zip(moved, yaw_rad)])
-    visible = np.array([view.ends_visible for view in views], dtype=bool).reshape(-1, 2)
-    real = boxes.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(category))
-    return Ends(low, high, real, boxes.end_gaps(step, low, high, real))
-
-
-def _better_ends(one: Ends, other: Ends) -> Ends:
-    """Take each end from the view that knows it better; of two that do not, the outer one."""
-    outer = np.stack([other.low < one.low, other.high > one.high], axis=-1)
-    takes = (other.real > one.real) | ((other.real == one.real) & (other.gap_m < one.gap_m))
-    takes = np.where((one.real == 0) & (other.real == 0), outer, takes)
-    return Ends(
-        np.where(takes[..., 0], other.low, one.low),
-        np.where(takes[..., 1], other.high, one.high),
-        np.where(takes, other.real, one.real),
-        np.where(takes, other.gap_m, one.gap_m),
-    )
 
 
 def _min_sine(category: str) -> float:

@@ -73,11 +73,6 @@ def choose_records(
     return found
 
 
-def sweep_step_m(points: int) -> float:
-    """Return how far the ego goes, m, between sweeps of a number of points that are taken."""
-    return max(SWEEP_STEP_M, points / POINTS_A_METER)
-
-
 def path_of(log: Log, scenario: Scenario) -> Array:
     """Places (K, 3), m, on the ground that the ego passed, about every half meter; none without known poses."""
     if log.ego is None:
@@ -132,7 +127,8 @@ class GroundMapBuilder:
         self._records, self._progress = records or RecordSource(log), progress or (lambda done, total: None)
         self._path = path_of(log, scenario)
         # Sensors that are fixed in the map, on the ground.
-        fixed = [name for name, sensor in (*log.cameras.items(), *log.lidars.items()) if sensor.mount == "map"]
+        fixed = [name for name, camera in log.cameras.items() if camera.mount == "map"]
+        fixed += [name for name, lidar in log.lidars.items() if lidar.mount == "map"]
         roadside = np.array([log.map_T_sensor(name, scenario.t0_ns)[0][0, :3, 3] for name in fixed]).reshape(-1, 3)
         if log.ego is None:
             roadside[:, 2] = cloud_origin(log, scenario.t0_ns)[1]
@@ -236,8 +232,8 @@ class GroundMapBuilder:
         for index in np.flatnonzero(t_ns >= self._scenario.t0_ns)[:PROBED_SWEEPS].tolist():
             sweep = self._records.get(lidar, index)
             if sweep is not None:
-                return sweep_step_m(len(sweep.xyz_m))
-        return sweep_step_m(0)
+                return max(SWEEP_STEP_M, len(sweep.xyz_m) / POINTS_A_METER)
+        return SWEEP_STEP_M
 
     @cached_property
     def _swept(self) -> tuple[GroundPoints, dict[int, Array]]:

@@ -77,10 +77,21 @@ def _smoothed(line: Polyline) -> Polyline:
 
 def directed_paths(agent: Agent) -> list[Array]:
     """Return the stretches (N, 3) of an agent's path between its reversals; none for one that stands."""
-    points, yaw, jump = _dense(agent)
+    w = agent.waypoints
+    steps = np.hypot(np.diff(w.x_m), np.diff(w.y_m))
+    unknown = agent.trajectory.discontinuous | (np.diff(w.t_s) > MAX_GAP_S)
+    parts = np.where(unknown, 1, np.clip(np.ceil(steps / STEP_M), 1, MAX_STEPS)).astype(int)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(w.t_s, w.t_s[1:], parts)]
+    state = agent.trajectory.at(np.concatenate([*pieces, w.t_s[-1:]]))
+    points = np.column_stack([state.x_m, state.y_m, state.z_m - agent.size_m[2] / 2])
+    yaw, jump = np.unwrap(state.yaw_rad), np.zeros(len(points) - 1, dtype=bool)
+    jump[(np.cumsum(parts) - 1)[unknown]] = True
     found = []
     for rows in np.split(np.arange(len(points)), np.flatnonzero(jump) + 1):
-        for first, last, sign in _monotone_stretches(_progress(points[rows], yaw[rows])):
+        # The distance traveled along the heading, which decreases in reverse.
+        mean, step = (yaw[rows[1:]] + yaw[rows[:-1]]) / 2, np.diff(points[rows, :2], axis=0)
+        progress = np.concatenate([[0.0], np.cumsum(step[:, 0] * np.cos(mean) + step[:, 1] * np.sin(mean))])
+        for first, last, sign in _monotone_stretches(progress):
             stretch = rows[first : last + 1][::sign]
             kept = [stretch[0]]
             # Points that lie ahead of the ones before, by more than aside: no wheel rolls sideways.
@@ -93,30 +104,6 @@ def directed_paths(agent: Agent) -> list[Array]:
             if len(kept) > 1:
                 found.append(points[kept])
     return found
-
-
-def _dense(agent: Agent) -> tuple[Array, Array, Array]:
-    """Ground points (N, 3) and unwrapped headings (N,) along a trajectory, and where it jumps (N - 1,)."""
-    w = agent.waypoints
-    steps = np.hypot(np.diff(w.x_m), np.diff(w.y_m))
-    unknown = agent.trajectory.discontinuous | (np.diff(w.t_s) > MAX_GAP_S)
-    parts = np.where(unknown, 1, np.clip(np.ceil(steps / STEP_M), 1, MAX_STEPS)).astype(int)
-    t = np.concatenate(
-        [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(w.t_s, w.t_s[1:], parts)] + [w.t_s[-1:]]
-    )
-    state = agent.trajectory.at(t)
-    points = np.column_stack([state.x_m, state.y_m, state.z_m - agent.size_m[2] / 2])
-    ends = np.cumsum(parts) - 1
-    jump = np.zeros(len(t) - 1, dtype=bool)
-    jump[ends[unknown]] = True
-    return points, np.unwrap(state.yaw_rad), jump
-
-
-def _progress(points: Array, yaw: Array) -> Array:
-    """Return the distance (N,) traveled along the heading, which decreases in reverse."""
-    mean = (yaw[1:] + yaw[:-1]) / 2
-    step = np.diff(points[:, :2], axis=0)
-    return np.concatenate([[0.0], np.cumsum(step[:, 0] * np.cos(mean) + step[:, 1] * np.sin(mean))])
 
 
 def _monotone_stretches(progress: Array) -> Iterator[tuple[int, int, int]]:

@@ -13,14 +13,13 @@ from scipy.cluster.hierarchy import DisjointSet
 
 from log2sim.datatypes import MapLane, Marking, RoadBorder, Scenario
 from log2sim.geometry import Polyline
-from log2sim.road.driven_paths import MAX_TURN_RAD, MIN_PATH_M, DrivenPath, Match, collect_paths
+from log2sim.road.driven_paths import MAX_TURN_RAD, MIN_PATH_M, DrivenPath, collect_paths
 from log2sim.road.routes import (
     BESIDE_M,
     CLEARANCE_M,
     JOIN_M,
     LANE_M,
     MAX_LANE_M,
-    Beside,
     Route,
     continued,
     find_beside,
@@ -151,17 +150,38 @@ def direct_strips(
     strips: Sequence[LaneStrip], paths: Sequence[DrivenPath], sides: Mapping[str, Marking | RoadBorder]
 ) -> list[LaneStrip]:
     """Turn strips the way that they lead, with the probability of it."""
-    found = [_driven(strip, paths) for strip in strips]
+    found = []
+    for strip in strips:
+        # The way that most vehicles drive it, by the lengths of their paths on it.
+        along = 0
+        for path in paths:
+            for sign, turn in ((1, 0.0), (-1, np.pi)):
+                at = strip.line.project(path.line.points_m[:, :2], path.line.heading_rad + turn)
+                half = np.interp(at.s_m, strip.width_s_m, strip.width_m) / 2
+                inside = at.inside & (np.abs(at.aside_m) <= half) & (np.abs(at.turn_rad) <= MAX_TURN_RAD)
+                along += sign * int(inside.sum())
+        driven = strip if along >= 0 else strip.reversed()
+        found.append(replace(driven, directed=DRIVEN) if along else driven)
     traffic = find_side_of_traffic(paths) or 1
     beside = find_beside([strip.line for strip in found])
     for _ in range(len(found)):
         known = [strip.directed > UNKNOWN for strip in found]
         news = {}
         for pair in beside:
-            if known[pair.route] and not known[pair.other] and pair.other not in news:
+            if not known[pair.route] or known[pair.other] or pair.other in news:
+                continue
+            neighbor, strip = found[pair.route], found[pair.other]
+            same, probability = True, OUTER
+            if pair.aside_m[0] * traffic > 0:
+                # Towards oncoming traffic it is the line between them that tells: a dashed line in the middle of a road with two
+                # lanes parts its directions, one between more lanes those of one direction.
                 both = {pair.route, pair.other}
                 alone = not any(other.route in both and other.other not in both for other in beside)
-                news[pair.other] = _from_neighbor(found[pair.route], found[pair.other], pair, (traffic, alone), sides)
+                between = sides.get(neighbor.left if pair.aside_m[0] > 0 else neighbor.right)
+                dashed = isinstance(between, Marking) and between.kind == "dashed" and between.color != "yellow"
+                same, probability = dashed and not alone, INNER
+            strip = strip if pair.same_way == same else strip.reversed()
+            news[pair.other] = replace(strip, directed=probability * neighbor.directed)
         if not news:
             break
         turned = {k: strip.line is not found[k].line for k, strip in news.items()}
@@ -169,39 +189,6 @@ def direct_strips(
         if any(turned.values()):
             beside = find_beside([strip.line for strip in found])
     return found
-
-
-def _driven(strip: LaneStrip, paths: Sequence[DrivenPath]) -> LaneStrip:
-    """Turn a strip the way that most vehicles drive it, by the lengths of their paths on it."""
-    along = 0
-    for path in paths:
-        for sign, turned in ((1, 0.0), (-1, np.pi)):
-            at = strip.line.project(path.line.points_m[:, :2], path.line.heading_rad + turned)
-            half = np.interp(at.s_m, strip.width_s_m, strip.width_m) / 2
-            inside = at.inside & (np.abs(at.aside_m) <= half) & (np.abs(at.turn_rad) <= MAX_TURN_RAD)
-            along += sign * int(inside.sum())
-    if along == 0:
-        return strip
-    return replace(strip if along > 0 else strip.reversed(), directed=DRIVEN)
-
-
-def _from_neighbor(
-    known: LaneStrip, strip: LaneStrip, pair: Beside, road: tuple[int, bool], sides: Mapping[str, Marking | RoadBorder]
-) -> LaneStrip:
-    """Turn a strip by the one beside it: outside of it the same way, towards oncoming traffic by the line between them.
-
-    `road` is the side of traffic, and whether there are just these two: a dashed line in the middle of a road with two lanes
-    parts its directions, one between more lanes those of one direction.
-    """
-    traffic, alone = road
-    inner = pair.aside_m[0] * traffic > 0
-    between = sides.get(known.left if pair.aside_m[0] > 0 else known.right)
-    same, probability = True, OUTER
-    if inner:
-        dashed = isinstance(between, Marking) and between.kind == "dashed" and between.color != "yellow"
-        same, probability = dashed and not alone, INNER
-    turned = strip if pair.same_way == same else strip.reversed()
-    return replace(turned, directed=probability * known.directed)
 
 
 # That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles.
@@ -228,7 +215,13 @@ def infer_lanes(
     (`lay_out`), and the ways of the vehicles from one section to the next become connections (`connect`).
     """
     driven = collect_paths(scenario)
-    marked = _marked_routes(markings, borders, driven)
+    sides: dict[str, Marking | RoadBorder] = {marking.id: marking for marking in markings}
+    sides |= {border.id: border for border in borders}
+    marked = []  # routes along the strips between lines, in the direction of traffic
+    for strip in direct_strips(find_strips(markings, borders), driven, sides):
+        widths, span = (strip.width_m, strip.width_s_m), (0.0, strip.line.length_m)
+        confidence = strip.confidence * strip.directed
+        marked.append(Route(strip.line, *widths, (True, True), span, strip.left, strip.right, confidence))
     notes = []
     if not marked:
         notes.append(
@@ -244,20 +237,6 @@ def infer_lanes(
     return _name_opposites(name_lines(lanes, markings, borders)), tuple(notes)
 
 
-def _marked_routes(
-    markings: Sequence[Marking], borders: Sequence[RoadBorder], paths: Sequence[DrivenPath]
-) -> list[Route]:
-    """Return routes along the strips between lines, in the direction of traffic."""
-    sides: dict[str, Marking | RoadBorder] = {marking.id: marking for marking in markings}
-    sides |= {border.id: border for border in borders}
-    routes = []
-    for strip in direct_strips(find_strips(markings, borders), paths, sides):
-        widths, span = (strip.width_m, strip.width_s_m), (0.0, strip.line.length_m)
-        confidence = strip.confidence * strip.directed
-        routes.append(Route(strip.line, *widths, (True, True), span, strip.left, strip.right, confidence))
-    return routes
-
-
 def _linked_lanes(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> list[MapLane]:
     """Return the sections of routes and the connections between them as lanes with their links."""
     seen = [match_path(routes, path) for path in paths]
@@ -265,7 +244,17 @@ def _linked_lanes(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> list[
     matches = [match_path(routes, path) for path in whole]
     beside = find_beside([route.line for route in routes])
     areas, crossing = join_conflicts(find_conflicts(routes, whole, matches))
-    sections = cut_sections(routes, areas, beside, _passed_ends(routes, whole, matches))
+    # Routes whose start (True) or end (False) some path passes, coming from or going to another.
+    passed = set()
+    for path, match in zip(whole, matches):
+        for one, two in find_transitions(match):
+            if is_lane_change(routes, path, one, two):
+                continue
+            if match.s_m[two.first] < JOIN_M:
+                passed.add((two.route, True))
+            if routes[one.route].line.length_m - match.s_m[one.last] < JOIN_M:
+                passed.add((one.route, False))
+    sections = cut_sections(routes, areas, beside, passed)
     strips = lay_out(routes, sections, beside)
     drivers: list[list[str]] = [[] for _ in strips]
     for path, match in zip(paths, seen):
@@ -323,23 +312,14 @@ def _linked_lanes(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> list[
                 confidence=_confidence(way.agents, confidence_of),
             )
         )
-    return [thin(lane) for lane in _meeting(lanes, links)]
-
-
-def _passed_ends(
-    routes: Sequence[Route], paths: Sequence[DrivenPath], matches: Sequence[Match]
-) -> set[tuple[int, bool]]:
-    """Return the routes whose start (True) or end (False) some path passes, coming from or going to another."""
-    passed = set()
-    for path, match in zip(paths, matches):
-        for one, two in find_transitions(match):
-            if is_lane_change(routes, path, one, two):
-                continue
-            if match.s_m[two.first] < JOIN_M:
-                passed.add((two.route, True))
-            if routes[one.route].line.length_m - match.s_m[one.last] < JOIN_M:
-                passed.add((one.route, False))
-    return passed
+    for a, b in links:  # linked lanes meet in exactly the same point
+        points, lane, heading = lanes[b].points_m.copy(), lanes[b], Polyline(lanes[b].points_m).heading_rad[0]
+        points[0] = lanes[a].points_m[-1]
+        ahead = (points[1:, :2] - points[0, :2]) @ [np.cos(heading), np.sin(heading)]
+        kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > MIN_AHEAD_M))])
+        if len(kept) > 1:
+            lanes[b] = replace(lane, points_m=points[kept], width_m=lane.width_m[kept])
+    return [thin(lane) for lane in lanes]
 
 
 def _junctions(strips: Sequence[Strip], connections: Sequence[Connection], crossing: frozenset[int]) -> dict[int, str]:
@@ -361,19 +341,6 @@ def _junctions(strips: Sequence[Strip], connections: Sequence[Connection], cross
 def _confidence(agents: Sequence[str], confidence_of: dict[str, float]) -> float:
     missing = float(np.prod([1 - PATH_PROBABILITY * confidence_of.get(agent, 0.0) for agent in agents]))
     return round(min(1 - missing, MAX_CONFIDENCE), 3)
-
-
-def _meeting(lanes: Sequence[MapLane], links: Sequence[tuple[int, int]]) -> list[MapLane]:
-    """Let linked lanes meet in exactly the same point."""
-    found = list(lanes)
-    for a, b in links:
-        points, lane, heading = found[b].points_m.copy(), found[b], Polyline(found[b].points_m).heading_rad[0]
-        points[0] = found[a].points_m[-1]
-        ahead = (points[1:, :2] - points[0, :2]) @ [np.cos(heading), np.sin(heading)]
-        kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > MIN_AHEAD_M))])
-        if len(kept) > 1:
-            found[b] = replace(lane, points_m=points[kept], width_m=lane.width_m[kept])
-    return found
 
 
 def add_missing_lanes(lanes: Sequence[MapLane], scenario: Scenario) -> tuple[MapLane, ...]:

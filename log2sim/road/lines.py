@@ -66,17 +66,16 @@ class _Ends:
 def touching_chains(pieces: Pieces) -> list[Chain]:
     """Join pieces that touch or almost do."""
     single = [Chain(np.array([k]), np.array([False])) for k in range(len(pieces))]
-    return [_trimmed(pieces, chain) for chain in _join(pieces, single, TOUCH_M, MIN_RADIUS_M)]
-
-
-def _trimmed(pieces: Pieces, chain: Chain) -> Chain:
-    """Leave out short pieces at the ends that lie beside the line of the next piece: grain beyond the paint."""
-    first, last = 0, len(chain.members) - 1
-    while last > first and _beside(pieces, chain.members[last], chain.members[last - 1]):
-        last -= 1
-    while last > first and _beside(pieces, chain.members[first], chain.members[first + 1]):
-        first += 1
-    return Chain(chain.members[first : last + 1], chain.flipped[first : last + 1])
+    chains = []
+    for chain in _join(pieces, single, TOUCH_M, MIN_RADIUS_M):
+        # Short pieces at the ends that lie beside the line of the next piece are grain beyond the paint.
+        first, last = 0, len(chain.members) - 1
+        while last > first and _beside(pieces, chain.members[last], chain.members[last - 1]):
+            last -= 1
+        while last > first and _beside(pieces, chain.members[first], chain.members[first + 1]):
+            first += 1
+        chains.append(Chain(chain.members[first : last + 1], chain.flipped[first : last + 1]))
+    return chains
 
 
 def _beside(pieces: Pieces, end: int, inner: int) -> bool:

@@ -91,9 +91,13 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         odds = log_odds_of_line(own, sum(lengths), dashes=len(chosen), alone=False)
         if not np.isfinite(own.color).any() and len(chosen) < SURE_BARS:
             odds += FEW_BARS
-        corners = np.concatenate([_corners(bar) for _, bar in chosen])
-        origin = corners.mean(axis=0)
-        hull = cv2.approxPolyDP(cv2.convexHull((corners - origin).astype(np.float32)), HULL_ERROR_M, True)
+        corners = []
+        for _, bar in chosen:
+            d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
+            n = np.array([-np.sin(bar.direction), np.cos(bar.direction)]) * bar.width_m / 2
+            corners += [bar.middle + d + n, bar.middle + d - n, bar.middle - d - n, bar.middle - d + n]
+        origin = np.mean(corners, axis=0)
+        hull = cv2.approxPolyDP(cv2.convexHull((np.array(corners) - origin).astype(np.float32)), HULL_ERROR_M, True)
         outline = np.asarray(hull, np.float64).reshape(-1, 2) + origin
         areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, odds))
     return areas, [chain for k, chain in enumerate(chains) if k not in used]
@@ -130,12 +134,6 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     alike &= np.maximum(length[:, None], length) <= 2.0 * shorter
     beside = near & alike & (turn <= MAX_BAR_TURN_RAD)
     return np.asarray(beside | beside.T)
-
-
-def _corners(bar: _Bar) -> Array:
-    d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
-    n = np.array([-np.sin(bar.direction), np.cos(bar.direction)]) * bar.width_m / 2
-    return np.array([bar.middle + d + n, bar.middle + d - n, bar.middle - d - n, bar.middle - d + n])
 
 
 def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[PaintedLine]]:

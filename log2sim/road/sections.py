@@ -364,7 +364,21 @@ def connect(
     driven: dict[tuple[int, int], list[tuple[DrivenPath, Array]]] = {}
     for path, match in zip(paths, matches):
         for origin, target, span in _passages(routes, strips, path, match):
-            points = _fitted(path.line.part(*span), strips[origin], strips[target])
+            # Bent so that it begins and ends on the middles of the lanes, in their directions.
+            line = Polyline.through(path.line.part(*span))
+            points, s, length = line.points_m.copy(), line.s_m, line.length_m
+            reach = length if length <= 2 * BLEND_M else BLEND_M
+            for end, lane, since, sign in ((0, origin, s, 1.0), (-1, target, length - s, -1.0)):
+                middle, other = strips[lane].line, -1 - end
+                u = np.clip(since / reach, 0.0, 1.0)
+                gap, wanted, own = (
+                    middle.points_m[other] - line.points_m[end],
+                    middle.heading_rad[other],
+                    line.heading_rad[end],
+                )
+                slope = sign * np.array([np.cos(wanted) - np.cos(own), np.sin(wanted) - np.sin(own), 0.0])
+                fade, swing = (1 - u) ** 2 * (1 + 2 * u), u * (1 - u) ** 2 * reach
+                points += fade[:, None] * gap + swing[:, None] * slope
             driven.setdefault((origin, target), []).append((path, points))
     out = []
     for (origin, target), ways in sorted(driven.items()):
@@ -406,23 +420,6 @@ def _passages(
         span = float(path.line.s_m[k] + out), float(path.line.s_m[j] - into)
         if span[1] - span[0] >= MIN_CONNECTION_M:
             yield one, two, span
-
-
-def _fitted(points: Array, origin: Strip, target: Strip) -> Array:
-    """Bend a path (N, 3) so that it begins and ends on the middles of the lanes, in their directions."""
-    line = Polyline.through(points)
-    s, length = line.s_m, line.length_m
-    reach = length if length <= 2 * BLEND_M else BLEND_M
-    moved = line.points_m.copy()
-    for end, strip, since, sign in ((0, origin, s, 1.0), (-1, target, length - s, -1.0)):
-        other = -1 if end == 0 else 0
-        u = np.clip(since / reach, 0.0, 1.0)
-        gap = strip.line.points_m[other] - line.points_m[end]
-        wanted, own = strip.line.heading_rad[other], line.heading_rad[end]
-        slope = sign * np.array([np.cos(wanted) - np.cos(own), np.sin(wanted) - np.sin(own), 0.0])
-        fade, swing = (1 - u) ** 2 * (1 + 2 * u), u * (1 - u) ** 2 * reach
-        moved += fade[:, None] * gap + swing[:, None] * slope
-    return moved
 
 
 def continuations(strips: Sequence[Strip]) -> list[tuple[int, int]]:

@@ -244,7 +244,12 @@ def place_lights(log: Log, boxes: Sequence[LightBox]) -> list[Housing]:
             if cost[row, column] <= GATE:
                 _update(housings[column], sights[row])
                 taken.add(row)
-        housings += [_new_housing(sight) for k, sight in enumerate(sights) if k not in taken]
+        for sight in (sight for k, sight in enumerate(sights) if k not in taken):
+            ranged, along = _range_of(sight), np.outer(sight.ray, sight.ray)
+            distance = SIDE_M / sight.side_rad if ranged is None else ranged
+            spread = SIDE_SIGMA if ranged is None else RANGE_SIGMA_M / ranged
+            covariance = (spread * distance) ** 2 * along + (sight.sigma_rad * distance) ** 2 * (np.eye(3) - along)
+            housings.append(Housing(sight.eye + distance * sight.ray, covariance, [sight.box], [sight.eye]))
     return _merged(housings)
 
 
@@ -287,14 +292,6 @@ def _across(ray: Array) -> Array:
     side = np.cross(ray, [0.0, 0.0, 1.0]) if abs(ray[2]) < 0.9 else np.cross(ray, [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     return np.stack([side, np.cross(side, ray)])
-
-
-def _new_housing(sight: _Sight) -> Housing:
-    ranged = _range_of(sight)
-    distance, spread = (SIDE_M / sight.side_rad, SIDE_SIGMA) if ranged is None else (ranged, RANGE_SIGMA_M / ranged)
-    covariance = (spread * distance) ** 2 * np.outer(sight.ray, sight.ray)
-    covariance += (sight.sigma_rad * distance) ** 2 * (np.eye(3) - np.outer(sight.ray, sight.ray))
-    return Housing(sight.eye + distance * sight.ray, covariance, [sight.box], [sight.eye])
 
 
 def _update(housing: Housing, sight: _Sight) -> None:
@@ -377,7 +374,12 @@ def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tup
         # Seen often enough, placed well enough, and where signals hang.
         if len(housing.boxes) < MIN_BOXES or housing.sigma_m > MAX_SIGMA_M:
             continue
-        height = housing.position[2] - ground_height(log, housing)
+        ground_z = 0.0  # of the road where the vehicle was nearest to the housing
+        if log.ego is not None:
+            poses = log.ego.at(np.array([box.t_ns for box in housing.boxes]))[0]
+            away = np.linalg.norm(poses[:, :2, 3] - housing.position[:2], axis=1)
+            ground_z = float(poses[int(np.nanargmin(away)), 2, 3]) + log.ground_z_ego_m
+        height = housing.position[2] - ground_z
         margin = HEIGHT_MARGIN_M + float(np.sqrt(housing.covariance[2, 2]))
         if HEIGHT_M[0] - margin <= height <= HEIGHT_M[1] + margin:
             signal = _signal(f"signal_{len(signals) + 1}", housing, scenario)
@@ -386,15 +388,6 @@ def find_signals(log: Log, scenario: Scenario, boxes: Sequence[LightBox]) -> tup
     if left_out := len(housings) - len(signals):
         text += f"; {left_out} places left out: seen too rarely, placed too roughly, not where signals hang, no lamp lit, or too unsure"
     return tuple(signals), text
-
-
-def ground_height(log: Log, housing: Housing) -> float:
-    """Return the height of the road, m, map frame, where the vehicle was nearest to a housing; of a log without ego 0."""
-    if log.ego is None:
-        return 0.0
-    poses = log.ego.at(np.array([box.t_ns for box in housing.boxes]))[0]
-    away = np.linalg.norm(poses[:, :2, 3] - housing.position[:2], axis=1)
-    return float(poses[int(np.nanargmin(away)), 2, 3]) + log.ground_z_ego_m
 
 
 def _signal(name: str, housing: Housing, scenario: Scenario) -> Signal | None:
