@@ -369,13 +369,10 @@ def connect(
             points, s, length = line.points_m.copy(), line.s_m, line.length_m
             reach = length if length <= 2 * BLEND_M else BLEND_M
             for end, lane, since, sign in ((0, origin, s, 1.0), (-1, target, length - s, -1.0)):
-                middle, other = strips[lane].line, -1 - end
+                toward, other = strips[lane].line, -1 - end
                 u = np.clip(since / reach, 0.0, 1.0)
-                gap, wanted, own = (
-                    middle.points_m[other] - line.points_m[end],
-                    middle.heading_rad[other],
-                    line.heading_rad[end],
-                )
+                gap = toward.points_m[other] - line.points_m[end]
+                wanted, own = toward.heading_rad[other], line.heading_rad[end]
                 slope = sign * np.array([np.cos(wanted) - np.cos(own), np.sin(wanted) - np.sin(own), 0.0])
                 fade, swing = (1 - u) ** 2 * (1 + 2 * u), u * (1 - u) ** 2 * reach
                 points += fade[:, None] * gap + swing[:, None] * slope
