@@ -16,8 +16,7 @@ from log2sim.datatypes.color_names import name_indices, name_of, to_lab
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera
 from log2sim.perception.detect3d import network as lidar
-from log2sim.road.color_network import SIDE_PX, crop, open_color_network, shipped_network
-from log2sim.road.colors import ColorSampler, _clear_heights
+from log2sim.road.colors import SIDE_PX, ColorSampler, _clear_heights, crop, open_color_network, shipped_network
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from log2sim.datatypes import COLOR_NAMES
-from log2sim.road.color_network import LAB_SCALE, METADATA_KEY, SIDE_PX, ColorNetwork, open_color_network
+from log2sim.road.colors import LAB_SCALE, METADATA_KEY, SIDE_PX, ColorNetwork, open_color_network
 
 WORLDS, STEPS, BATCH, RATE = 20_000, 4_500, 64, 3e-3
 PER_FILE, SHAPES_PER_FILE = 2_000, 150
@@ -126,8 +126,8 @@ def calibrate(network: ColorNetwork, path: Path) -> tuple[float, float]:
 def report(network: ColorNetwork, path: Path) -> dict[str, object]:
     """Measure names on pictures, by light, and on tracks."""
     data = np.load(path)
-    single = np.array([network.probabilities([track[0]]) for track in data["picture"]])
-    joined = np.array([network.probabilities(list(track)) for track in data["picture"]])
+    single = np.array([network.decide(network.raw([track[0]]))[1] for track in data["picture"]])
+    joined = np.array([network.decide(network.raw(list(track)))[1] for track in data["picture"]])
     rank = (single > np.take_along_axis(single, data["name"][:, None], 1)).sum(axis=1)
     sure, right = single.max(axis=1), rank == 0
     bins = np.minimum((sure * 10).astype(int), 9)

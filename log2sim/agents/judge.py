@@ -31,14 +31,8 @@ def judge(
 ) -> list[AgentCandidate]:
     """Keep the candidates that are there and can be true together, each named, with its confidence and what speaks against it.
 
-    Parameters
-    ----------
-    candidates : sequence of AgentCandidate
-        Of all tracks.
-    ego : Agent, optional
-        At its place there is no other agent.
-    jobs : int
-        Processes that share the candidates; the result is the same for any number.
+    At the place of the `ego` there is no other agent. `jobs`: processes that share the candidates; the result is the same for any
+    number.
     """
     t_s, lidar = recording.t_s, bool(recording.log.lidars)
     table = gather(candidates, recording, jobs)
@@ -74,12 +68,7 @@ def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
 def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: bool) -> list[Finding] | None:
     """Return what is doubtful about a candidate, None if it is dropped: nothing is there, or something else.
 
-    Parameters
-    ----------
-    evidence : mapping
-        Its row of the table.
-    there : float
-        Probability that something is there, from `probabilities`.
+    `evidence`: its row of the table. `there`: probability that something is there, from `probabilities`.
     """
     if not evidence["confirmed"] or there < MIN_THERE[lidar]:
         return None

@@ -15,8 +15,14 @@ from log2sim.geometry.boxes import (
     box_lines,
     cross_slab,
     outline,
+    overlap_of_smaller,
     points_in_box,
     project_boxes,
+    rectangle_iou,
+    rectangle_overlap,
+    rectangles_overlap,
+    separating_axes,
+    upright_box_iou,
 )
 from log2sim.geometry.camera import (
     DISTORTION_LENGTHS,
@@ -37,14 +43,6 @@ from log2sim.geometry.camera import (
 )
 from log2sim.geometry.polyline import SPACING_M, Polyline, Projection, crossings
 from log2sim.geometry.poses import PoseTrack
-from log2sim.geometry.rectangles import (
-    overlap_of_smaller,
-    rectangle_iou,
-    rectangle_overlap,
-    rectangles_overlap,
-    separating_axes,
-    upright_box_iou,
-)
 from log2sim.geometry.statistics import (
     CHI2_2DOF_99,
     CHI2_2DOF_999,

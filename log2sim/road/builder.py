@@ -311,21 +311,10 @@ def map_ground(
 ) -> GroundMap:
     """Map the ground of a log.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        Its agents are left out of the map; its span of time is what is mapped.
-    records : RecordSource, optional
-        Counts the records that cannot be read.
-    progress : callable, optional
-        Called as `progress(stage, done, total)`.
-    refine : bool
-        Whether the poses are refined first, see `refine_poses`.
+    `scenario`: its agents are left out of the map; its span of time is what is mapped. `records`: counts the records that cannot be
+    read. `progress`: called as `progress(stage, done, total)`. `refine`: whether the poses are refined first, see `refine_poses`.
 
-    Raises
-    ------
-    LogError
-        When no pose is known, or no record that is wanted can be read.
+    Raises `LogError` when no pose is known, or no record that is wanted can be read.
     """
     records, settings = records or RecordSource(log), settings or MapConfig()
     if refine:

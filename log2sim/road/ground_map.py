@@ -81,34 +81,17 @@ def coarsened_cell_m(extent_m: Extent, wanted_m: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class GroundMap:
-    """North-up raster of the ground in the map frame; R rows from north to south, C columns from west to east.
+    """North-up raster of the ground in the map frame; R rows from north to south, C columns from west to east."""
 
-    Attributes
-    ----------
-    color_bgr : (R, C, 3) uint8
-        Black where no camera saw the ground.
-    alpha : (R, C) uint8
-        How well a camera saw it, 0 where none did.
-    height_m : (R, C) float32, m
-        Of the ground in the map frame; NaN where no LiDAR saw it nearby.
-    intensity : (R, C) float32
-        Of LiDAR returns relative to the road at their range: 0.2 where they are as usual there, 1 from five times as strong
-        on; NaN where there are none.
-    resolution_m : float, m
-        Edge of a cell.
-    extent_m : (float, float, float, float)
-        x0, x1, y0, y1 of the outer edges, m.
-    notes : tuple of str
-        What could not be mapped, and why.
-    """
-
-    color_bgr: NDArray[np.uint8]
-    alpha: NDArray[np.uint8]
-    height_m: NDArray[np.float32]
+    color_bgr: NDArray[np.uint8]  # (R, C, 3): black where no camera saw the ground
+    alpha: NDArray[np.uint8]  # (R, C): how well a camera saw it, 0 where none did
+    height_m: NDArray[np.float32]  # (R, C): of the ground; NaN where no LiDAR saw it nearby
+    # (R, C): of LiDAR returns relative to the road at their range: 0.2 where they are as usual there, 1 from five times as strong
+    # on; NaN where there are none
     intensity: NDArray[np.float32]
-    resolution_m: float
-    extent_m: Extent
-    notes: tuple[str, ...] = ()
+    resolution_m: float  # edge of a cell
+    extent_m: Extent  # x0, x1, y0, y1 of the outer edges, m
+    notes: tuple[str, ...] = ()  # what could not be mapped, and why
 
     @property
     def raster(self) -> Raster:

@@ -26,8 +26,7 @@ from benchmarks.table import markdown
 from log2sim.datatypes import COLOR_NAMES, Log, Scenario
 from log2sim.datatypes.color_names import to_lab
 from log2sim.files.inputs import read_bytes
-from log2sim.road.color_network import CONTEXT, crop, shipped_network
-from log2sim.road.colors import ColorSampler
+from log2sim.road.colors import CONTEXT, ColorSampler, crop, shipped_network
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
@@ -119,8 +118,8 @@ def photos(folder: Path) -> Iterator[tuple[str, Path]]:
 
 def ranked(image: NDArray[np.uint8]) -> list[str]:
     """Return the merged names by their probability for the vehicle in a photo."""
-    size, total = np.array(image.shape[1::-1], float), Counter[str]()
+    size, total, network = np.array(image.shape[1::-1], float), Counter[str](), shipped_network()
     box = np.concatenate([size * (1 - 1 / CONTEXT) / 2, size * (1 + 1 / CONTEXT) / 2])
-    for name, share in zip(COLOR_NAMES, shipped_network().probabilities([crop(image, box)])):
+    for name, share in zip(COLOR_NAMES, network.decide(network.raw([crop(image, box)]))[1]):
         total[MERGED.get(name, name)] += float(share)
     return [name for name, _ in total.most_common()]

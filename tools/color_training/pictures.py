@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import COLOR_NAMES
 from log2sim.datatypes.color_names import name_indices
 from log2sim.geometry import Array
-from log2sim.road.color_network import CONTEXT, SIDE_PX
+from log2sim.road.colors import CONTEXT, SIDE_PX
 from log2sim.synth.paint import Appearance, paint
 from log2sim.synth.raster import Samples, nearest_of
 from log2sim.synth.shapes import bus, car, truck
