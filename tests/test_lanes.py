@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.geometry import Array, Polyline
-from log2sim.road.driven_paths import collect_paths
-from log2sim.road.lane_graph import find_covered, find_side_of_traffic, infer_lanes
+from log2sim.road.lane_graph import find_covered, find_side_of_traffic, find_strips, infer_lanes
 from log2sim.road.lane_keeping import find_lane_changes, locate_in_lanes, summarize_lane_keeping
-from log2sim.road.strips import find_strips
+from log2sim.road.routes import collect_paths
 from log2sim.road.strokes import fit_curve
 
 

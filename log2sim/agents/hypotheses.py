@@ -85,7 +85,7 @@ def _observed_ends(t: Array, ends: Ends, origin: Array, axis: int, sigma_m: floa
         positions = Positions(t[seen], place, variance[seen, axis, side, None].repeat(2, axis=1))
         # What no motion of a vehicle explains is an outlier of each hypothesis.
         motion = MotionPriorSigmas(FIRST_SPEED_MPS["vehicle"], ACCELERATION_MPS2["vehicle"])
-        p = positions.take(marginal_likelihood(positions, motion).inlier)
+        p = positions.take(marginal_likelihood(positions, motion)[1])
         if len(p) < MIN_START_ROWS:
             continue
         # Variances of positions that scatter more about those next to them than they say are enlarged (Birge, 1932).
@@ -160,25 +160,25 @@ def explain_track(track: Track) -> list[Part]:
     positions = _positions_of(track, rows)
     group = GROUP_OF[track.category]
     expected = MotionPriorSigmas(FIRST_SPEED_MPS[group], ACCELERATION_MPS2[group])
-    moving, at_rest = (marginal_likelihood(positions, motion) for motion in (expected, STANDING))
+    (moving, inlier), (at_rest, _) = (marginal_likelihood(positions, motion) for motion in (expected, STANDING))
     log, parts = _standing_parts(track, positions)
     drives, starts = motion_of_ends(track)
     # The center of a long vehicle wanders while more of it comes into view; its ends do not.
-    is_at_rest = at_rest.log >= moving.log or drives < -MIN_LOG_ODDS
-    if is_at_rest and log <= at_rest.log + MIN_LOG_ODDS:
+    is_at_rest = at_rest >= moving or drives < -MIN_LOG_ODDS
+    if is_at_rest and log <= at_rest + MIN_LOG_ODDS:
         return [Part(track, static=starts + STARTS_LOG <= MIN_LOG_ODDS)]
     if len(track) == MIN_ROWS:
         return [Part(track, static=False)]
-    if parts and log > moving.log:
+    if parts and log > moving:
         return [replace(p, static=motion_of_ends(p.track)[1] + STARTS_LOG <= MIN_LOG_ODDS) for p in parts]
-    if not moving.inlier.all() and len(positions) >= 2 * MIN_ROWS:
+    if not inlier.all() and len(positions) >= 2 * MIN_ROWS:
         # Two objects, of which the second is seen after the first.
         count = min(len(positions) - 2 * MIN_ROWS + 1, MAX_SPLITS)
         cuts = np.unique(np.linspace(MIN_ROWS, len(positions) - MIN_ROWS, count).astype(np.intp))
         halves = [(positions.take(slice(k)), positions.take(slice(k, None))) for k in cuts]
-        logs = [sum(marginal_likelihood(half, expected).log for half in both) for both in halves]
+        logs = [sum(marginal_likelihood(half, expected)[0] for half in both) for both in halves]
         best = int(np.argmax(logs))
-        if logs[best] + NEXT_OBJECT_LOG > moving.log + MIN_LOG_ODDS:
+        if logs[best] + NEXT_OBJECT_LOG > moving + MIN_LOG_ODDS:
             first = rows[cuts[best]]
             parts = [p for part in (slice(first), slice(first, None)) for p in explain_track(_taken(track, part))]
             return [p for p in parts if p.static or len(p.track) >= MIN_MOVING_ROWS]
@@ -241,7 +241,7 @@ def _standing_parts(track: Track, few: Positions) -> tuple[float, list[Part]]:
     seen = label[label >= 0]
     log = OUTLIER_LOG * int((label < 0).sum()) + NEXT_OBJECT_LOG * (count - 1)
     log += CHANGE_LOG * int((np.diff(seen) != 0).sum())
-    log += sum(marginal_likelihood(few.take(label == k), STANDING).log for k in range(count) if (label == k).any())
+    log += sum(marginal_likelihood(few.take(label == k), STANDING)[0] for k in range(count) if (label == k).any())
     label = _labels(_positions_of(track, np.arange(len(track))), places, objects, body)
     # Objects are seen one after the other: what is shown in between by fewer measurements are other points of the same
     # detections. Such measurements belong to the object that is seen next to them.

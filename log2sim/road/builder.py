@@ -20,7 +20,7 @@ from log2sim.perception.frames import give_pictures, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.records import RecordSource
 from log2sim.road.ground_map import GroundMap, Raster, coarsened_cell_m
-from log2sim.road.pictures import ColorRaster, Image, StandingPictures, View, find_hidden, sample_nearest, warp_onto
+from log2sim.road.pictures import ColorRaster, Image, View, find_hidden, median_picture, sample_nearest, warp_onto
 from log2sim.road.road_users import MASK_SHRINK, RoadUsers, covered, draw_footprints, draw_outlines
 from log2sim.road.surface import (
     MAX_POINTS,
@@ -156,7 +156,7 @@ class GroundMapBuilder:
         self._frames = choose_records(log, scenario, dict.fromkeys(used or log.cameras, PICTURE_STEP_M), MAX_PICTURES)
         stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
         self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
-        self._standing: dict[str, tuple[View, StandingPictures]] = {}
+        self._standing: dict[str, tuple[View, list[tuple[Image, NDArray[np.uint8]]]]] = {}
         self._colors = ColorRaster(self.raster) if any(len(i) for i in self._frames.values()) else None
 
     def inputs(self) -> list[Any]:
@@ -178,7 +178,7 @@ class GroundMapBuilder:
         view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
         users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
         if view.camera.mount == "map":
-            self._standing.setdefault(camera, (view, StandingPictures()))[1].add(image_bgr, users)
+            self._standing.setdefault(camera, (view, []))[1].append((image_bgr, users))
         else:
             self._lay(self._colors, view, image_bgr, users)
 
@@ -207,7 +207,7 @@ class GroundMapBuilder:
             color, alpha = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
         else:
             for view, pictures in self._standing.values():
-                self._lay(self._colors, view, *pictures.median())
+                self._lay(self._colors, view, *median_picture(*zip(*pictures)))
             self._standing.clear()
             color, alpha = self._colors.image()
             self._colors = None

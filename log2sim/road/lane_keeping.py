@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.geometry import Array, Polyline
-from log2sim.road.driven_paths import MAX_TURN_RAD
 from log2sim.road.lane_graph import infer_lanes
+from log2sim.road.routes import MAX_TURN_RAD
 
 # Times at which positions are taken: a vehicle drifts within its lane by centimeters in that time.
 STEP_S = 0.1

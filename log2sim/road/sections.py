@@ -10,8 +10,7 @@ import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 
 from log2sim.geometry import Array, Polyline, Projection, crossings
-from log2sim.road.driven_paths import JUMP_M, STAY_M, DrivenPath, Match, Run
-from log2sim.road.routes import JOIN_M, LANE_M, MAX_LANE_M, Beside, Route
+from log2sim.road.routes import JOIN_M, JUMP_M, LANE_M, MAX_LANE_M, STAY_M, Beside, DrivenPath, Match, Route, Run
 
 # A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two.
 ALIGNED_RAD = float(np.deg2rad(2.0))

@@ -82,16 +82,8 @@ class MotionPriorSigmas:
 STANDING = MotionPriorSigmas()
 
 
-@dataclass(frozen=True, eq=False)
-class MarginalLikelihood:
-    """How well a hypothesis explains positions."""
-
-    log: float  # logarithm of the marginal likelihood, outliers included
-    inlier: NDArray[np.bool_]  # (n,)
-
-
-def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> MarginalLikelihood:
-    """Compute the marginal likelihood of one object that moves as expected, or stands.
+def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> tuple[float, NDArray[np.bool_]]:
+    """Compute the logarithm of the marginal likelihood of one object that moves as expected, or stands, and which positions (n,) are inliers.
 
     Notes
     -----
@@ -100,12 +92,12 @@ def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> Marg
     and errors are a motion where it is too small. O(n^3).
     """
     inlier = np.ones(len(positions), dtype=bool)
-    best = MarginalLikelihood(-np.inf, inlier)
+    best = -np.inf, inlier
     for _ in range(MAX_ROUNDS):
         log, each = _likelihoods(positions.take(inlier), motion)
         log += OUTLIER_LOG * int((~inlier).sum())
-        if log > best.log:
-            best = MarginalLikelihood(log, inlier)
+        if log > best[0]:
+            best = log, inlier
         padded = np.full(len(each) + 2 * NEIGHBORS, np.inf)
         padded[NEIGHBORS : NEIGHBORS + len(each)] = each
         lowest = reduce(np.minimum, [padded[k : k + len(each)] for k in range(2 * NEIGHBORS + 1)])
