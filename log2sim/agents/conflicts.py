@@ -91,8 +91,6 @@ def resolve_conflicts(candidates: Sequence[AgentCandidate], ego: Agent | None, t
 
     The confidence of the candidates says which is more likely; the ego is where it is. `t_s`: (T,): ticks.
 
-    Notes
-    -----
     A life is cut to its longest part without a conflict if that is at least `MIN_KEPT_SHARE` of it; otherwise it stays, to be
     doubted. Nothing of it stays in the ego, at whose place nothing else can be.
     """

@@ -194,8 +194,6 @@ def simplify_waypoints(w: Waypoints) -> Waypoints:
 
     Where `observed` changes, both neighbors are kept; so are the first and the last one.
 
-    Notes
-    -----
     Greedy: from each kept waypoint the farthest next one is searched with steps that double, then halve.
     """
     exact = np.full(len(w), 0.0)

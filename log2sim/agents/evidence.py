@@ -220,8 +220,6 @@ def image_confidence(track: Track) -> float:
 def sweep_log_odds(track: Track) -> float:
     """Return the log-odds that a track is an object, from its boxes in LiDAR sweeps, of which it has some.
 
-    Notes
-    -----
     The scores are calibrated probabilities, so their log-odds add up, scaled down to those of as many independent ticks. A
     long false track has a few high scores by chance, which is why not the best alone count.
     """
@@ -418,8 +416,6 @@ FALSE_RATE, MAX_USUAL_RATE, MIN_SHOWN_TICKS = 0.05, 0.9, 8
 def missing_nats(shown: Array, detected: Array) -> Array:
     """Return the nats (C,) against candidates by the ticks at which images show them well, and those at which one detects them.
 
-    Notes
-    -----
     The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, that of all that is detected
     in images at all, nothing at `FALSE_RATE`. Successive images err alike, which is why they count as few independent ones.
     """

@@ -103,8 +103,6 @@ def outline_log_odds(track: Track, waypoints: Waypoints, t_s: Array, size_m: tup
 
     `t_s`: (n,), s: times of the n measurements of the track since the start. `size_m`: (3,), m.
 
-    Notes
-    -----
     A logistic regression on which cells of the outline have points, less the same with front and back swapped, so the
     log-odds of a vehicle that is turned round are exactly the opposite. `tools/fit.py outline` fits the weights to random
     vehicles seen by simulated LiDARs.
@@ -188,8 +186,6 @@ def side_log_odds(paths: Sequence[Array]) -> float:
 
     `paths`: (K, 3) each: x, y in m and heading in rad of each vehicle that moved, the ego among them.
 
-    Notes
-    -----
     Each pair of vehicles of opposite headings has one vote: where the oncoming one passes on the left, traffic keeps
     right.
     """
@@ -215,8 +211,6 @@ def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -
 
     `pose`: (3,): x, y in m and yaw in rad. `paths`: (K, 3) each: as in `side_log_odds`.
 
-    Notes
-    -----
     The mean over the paths, the nearer the heavier. A path says the less the farther it is and the less parallel, so nothing
     follows the traffic of another street.
     """
@@ -330,8 +324,6 @@ def headings_of(rows: Sequence[Row], own: Array, street: Array, right: float) ->
     `own`: (M,): log-odds by what is known of each alone. `street`: (2, M): log-odds that the street goes that way, if traffic
     keeps right, and if it keeps left. `right`: log-odds that traffic keeps right, by other evidence.
 
-    Notes
-    -----
     Exact: rows are independent given the side of traffic, and members of a row given its direction.
     """
     total, chance = np.array([right, -right]) / 2, np.zeros((2, len(own)))
@@ -382,8 +374,6 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
 
     `candidates`: with a yaw, known up to half a turn, and a speed along it. `ego_path`: (K, 3): x, y and heading of the ego.
 
-    Notes
-    -----
     What is known of each alone (motion, boxes of a 3D detector, the outline of its points) is combined with the direction
     of traffic beside it and with its neighbors (`headings_of`), for traffic on either side of the road.
     """

@@ -43,8 +43,6 @@ def motion_of_ends(track: Track) -> tuple[float, float]:
 
     They are 0 and minus infinity where its ends do not tell.
 
-    Notes
-    -----
     Compared are the marginal likelihoods of ends that stay, of ends that move evenly, and of ends that move with a constant
     acceleration from or until an unknown time, both together since the object is rigid. Errors of an end repeat while the view
     stays the same. An end that moves because more of the object comes into view moves alone.
@@ -149,8 +147,6 @@ class Part:
 def explain_track(track: Track) -> list[Part]:
     """Decide which objects a track shows, and which of them stand.
 
-    Notes
-    -----
     Compared are one object that moves as its kind does, one that stands, standing objects of which each measurement shows one or
     none, and two objects of which the second is seen after the first.
     """

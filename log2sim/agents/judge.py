@@ -51,8 +51,6 @@ def judge(
 def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
     """Return the probabilities (C,) that something is where each candidate is, and that the candidate is right.
 
-    Notes
-    -----
     Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
     speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
     is right where it is. Each weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points
@@ -141,8 +139,6 @@ SEEN_QUANTILE = 0.85
 def _rated(candidate: AgentCandidate, confidence: float, timeline: Timeline) -> AgentCandidate:
     """Return a candidate with its confidence and larger standard deviations.
 
-    Notes
-    -----
     A variance is a sum of terms, each a reason for an error, times weights that fit simulated logs (`tools/fit.py confidence`).
     Smoothing and fits take the errors of ticks as independent; but a box that is laid against the wrong end, or has a wrong length,
     is off by as much at every tick.

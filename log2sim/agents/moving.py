@@ -44,8 +44,6 @@ MIN_AXIS_COS = 0.7
 def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
     """Return the log-odds that the object of a track points along a yaw rather than backward; 0 without boxes.
 
-    Notes
-    -----
     The sum of the log-odds of all ticks, scaled down to that of as many independent ones (`independent`).
     """
     rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
@@ -72,8 +70,6 @@ def forward_log_odds(speed_mps: float) -> float:
 def course_log_odds(w: Waypoints, length_m: float) -> float:
     """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way.
 
-    Notes
-    -----
     The center of a standing vehicle seems to move by up to its length while more and more of it comes into view.
     """
     step_s = np.gradient(w.t_s) if len(w.t_s) > 1 else np.zeros(1)
@@ -93,8 +89,6 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
 
     `found`: map frame. `t_ns`: (T,): stamps of the sweeps.
 
-    Notes
-    -----
     Boxes are tracked. What a track moves around a sweep counts beside what the detector says of its box there; what stands, is
     in one sweep alone, or is laid across its course stays as it is.
     """
@@ -207,8 +201,6 @@ def moving_candidate(
 ) -> AgentCandidate:
     """Make an agent with a waypoint at every tick from its first to its last observation.
 
-    Notes
-    -----
     Smoothing the provisional positions gives headings; with these the evidence gives one size and, by laying the whole box
     against the observed ends, better positions. That is done twice, since provisional positions jump where the view
     changes and mislead the headings. LiDAR matches before, after and between the detections join the positions, and the

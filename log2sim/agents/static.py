@@ -158,8 +158,6 @@ def _reach_around(size_m: Array) -> float:
 def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
     """Match a predicted box, at the stamp of a cloud, against its points; None where they do not determine its position.
 
-    Notes
-    -----
     Of a vehicle beside the sensor only a flank is seen, and of a long one not even all of that. It has the place across
     from the flank, and the place along from an end behind which rays go on. A wall has no such ends.
     """
@@ -354,8 +352,6 @@ def standing_speed_sigma(m: Measurements, sigma_m: float) -> float:
 def yaw_sigma(m: BoxEvidence, geometry: TrackGeometry) -> float:
     """Return the standard deviation in rad of the yaw of a track that stands, given that front and back are not swapped.
 
-    Notes
-    -----
     By the boxes of a 3D detector it is their scatter about the yaw, whose errors repeat from tick to tick; by points alone
     the distance of half of them from the sides of the box, seen over the length of the longest side.
     """

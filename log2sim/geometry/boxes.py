@@ -236,8 +236,6 @@ def separating_axes(
     Yields `nx`, `ny`: (N,): unit direction of the axis; `reach_m`: (N,): distance of the centers along it from which on the
     rectangles are apart; `of_a`: whether it is an axis of a.
 
-    Notes
-    -----
     Gottschalk, Lin and Manocha (1996), "OBBTree", in the plane.
     """
     turn = yaw_b_rad - yaw_a_rad

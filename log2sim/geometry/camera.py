@@ -249,8 +249,6 @@ def project_moving(
     Returns `uv_px`: (N, 2): NaN where `project` gives NaN; `depth_m`: (N,): along the optical axis at the time of the point's
     line; `valid`: (N,): in front of the camera and inside the image.
 
-    Notes
-    -----
     The line in which a point appears depends on the pose at the time of that line: a fixed point, found by iteration from the
     pose of the middle. It converges while the image of a point moves by less than the readout does.
     """

@@ -378,8 +378,6 @@ def infer_lanes(
     in one lane make one lane; it branches where they part, merges where they meet, and where they cross is a junction. Every
     path lies within the width of some lane.
 
-    Notes
-    -----
     Routes are merged from paths (`merge_paths`), cut where they conflict (`find_conflicts`) into sections that lie side by side
     (`lay_out`), and the ways of the vehicles from one section to the next become connections (`connect`).
     """

@@ -34,8 +34,6 @@ MIN_SUPPORT = 0.1  # of the width, on either side
 def find_vanishing_point(image_bgr: NDArray[np.uint8], *, rng: np.random.Generator) -> tuple[float, float] | None:
     """Find the pixel (u, v) in which lines along the road meet; None where too few do.
 
-    Notes
-    -----
     Straight segments (von Gioi et al., "LSD: a fast line segment detector with a false detection control", PAMI 2010)
     that lean to the left and to the right are intersected in random pairs. The point is taken to which most length of
     both sides points: the lesser side counts.
@@ -309,8 +307,6 @@ def find_markings_in_picture(
 
     Returns PictureMarkings: without markings where no lines meet.
 
-    Notes
-    -----
     Where the direction is estimated, markings are found again after the horizon is corrected so that lane lines stay at one
     distance from each other.
     """
@@ -406,8 +402,6 @@ def _camera_towards(image_bgr: Image, point: tuple[float, float], height_m: floa
 def _make_parallel(found: PictureMarkings, image_bgr: Image, height_m: float) -> Camera | None:
     """Correct the horizon so that lane lines keep their distances; None where there are no two, or nothing changes.
 
-    Notes
-    -----
     A row that is wrong by d pixels adds d / (f h) to 1 / x, with focal length f and height h, and leaves y / x as it is:
     the line y = a + b x becomes y = a + (b + a d / (f h)) x. So b grows by a line with a.
     """

@@ -250,8 +250,6 @@ class _Coarse:
 def find_borders(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[tuple[RoadBorder, ...], tuple[str, ...]]:
     """Find borders of the roads that lane lines are painted on; the second result says why there are none.
 
-    Notes
-    -----
     Both sides of a border are compared over `ACROSS_M` by yellowness, LiDAR intensity and height, each in sigmas of one
     surface. One side has to look like the ground beside lane lines, so without them there are no borders.
     """
@@ -407,8 +405,6 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
 
     Returns `markings`: sure ones first; `borders`; `notes`: what was not found, and why.
 
-    Notes
-    -----
     Ridges of color and LiDAR intensity (`ridges`) become straight pieces with profiles (`pieces`), chains of pieces
     (`chains`) and smooth curves (`curves`). What lies along a curve tells solid from dashed lines (`strokes`), parallel
     bars are crosswalks, and wide strokes across lanes are stop lines (`areas`). Each is rated by both sensors

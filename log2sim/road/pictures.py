@@ -226,8 +226,6 @@ MIN_COMMON_OPACITY = 0.5
 class ColorRaster:
     """Accumulate pictures that were warped onto a raster.
 
-    Notes
-    -----
     Weights are the fourth power of the pixels along a cell's edge, so that the nearest view decides and far ones only fill the
     rest. The gain of a picture is the median ratio of its colors to those mapped so far, after Brown and Lowe (2007), section
     6, but one picture after the other; without an overlap it is that of the last picture of its camera.

@@ -330,8 +330,6 @@ class Route:
 def merge_paths(paths: Sequence[DrivenPath], marked: Sequence[Route] = ()) -> list[Route]:
     """Return routes that hold all paths: those that markings make, and one wherever a path leaves the routes before.
 
-    Notes
-    -----
     Incremental merging of traces (as Cao and Krumm 2009, From GPS traces to a routable road map), then the median of the
     offsets at each station. Cost: paths times routes times samples.
     """

@@ -124,8 +124,6 @@ def most_probable_states(t_s: Array, evidence: Array) -> tuple[NDArray[np.intp],
     `t_s`: (T,): increasing times of pictures; equal ones are of several cameras. `evidence`: (T, S): log-likelihoods of
     `STATES`.
 
-    Notes
-    -----
     Viterbi (1967) for the course, forward-backward (Rabiner 1989) for the probabilities, with the transitions of a Markov process
     in continuous time.
     """

@@ -52,8 +52,6 @@ class Curve:
 def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:
     """Fit a curve to points (N, 2) in order along it, N >= 2.
 
-    Notes
-    -----
     The sum of squared distances, in sigmas, plus that of the curvature's rate of change, in `CURVATURE_RATE_PER_M2`, along
     the line (its third derivative by length) is the least; points far off count less (Huber). Bands of seven diagonals:
     the cost grows as the length.
@@ -248,8 +246,6 @@ def stretches_of(strokes: Array) -> list[Stretch]:
 def is_dashed(strokes: Array) -> bool:
     """Whether strokes (K, 2) are dashes at one distance, some of them worn in part or altogether.
 
-    Notes
-    -----
     The strokes are laid over each other by every possible period. Of a dashed line, the phases with paint are together,
     and the others are bare: of the best period by likelihood that is to be so beyond chance.
     """

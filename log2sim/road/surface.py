@@ -150,8 +150,6 @@ class Surface:
     def smoothed(self) -> Surface:
         """Return the surface that pictures are laid on: cells of half the resolution, smoothed over `WARP_SMOOTHING_M`.
 
-        Notes
-        -----
         At a distance of ten times its height a camera moves what it shows by ten times an error of the height: the noise of
         single rings would bend straight lines.
         """
@@ -204,8 +202,6 @@ def _trimmed_means(
 ) -> tuple[Array, Array]:
     """Means (count,) of the lowest heights that agree, and their weights, 0 where there are none.
 
-    Notes
-    -----
     From the mean of a cell down: in each round points too far above the last mean are left out, so that it sinks through grass
     and tires until it rests on points that are all within the noise.
     """
@@ -224,8 +220,6 @@ def _trimmed_means(
 def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
     """Fill cells (R, C) without weight from those around them, smoothly; zeros where nothing has any.
 
-    Notes
-    -----
     Pull and push over a pyramid, Gortler et al., The Lumigraph (1996), section 3.4.2.
     """
     if min(values.shape) < 2:
@@ -313,8 +307,6 @@ def map_intensity(
 def normalize(points: GroundPoints, ground: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Divide intensities by what is usual for their LiDAR and beam: (N,) relative ones, NaN where that is not known.
 
-    Notes
-    -----
     On the ground a beam has one range and one angle of incidence, so that one number for each elevation takes out range,
     incidence and the gain of the beam's detector at once. Usual is the mean of the middle half of the intensities: of points
     on the ego's way (`road`), or of the ground all around where these are too few.

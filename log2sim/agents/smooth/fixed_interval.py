@@ -85,8 +85,6 @@ STANDING = MotionPriorSigmas()
 def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> tuple[float, NDArray[np.bool_]]:
     """Compute the logarithm of the marginal likelihood of one object that moves as expected, or stands, and which positions (n,) are inliers.
 
-    Notes
-    -----
     The velocity is a Wiener process about the middle of the track. The scale of the noise is unknown along each axis, and is
     integrated out over `NOISE_SCALES`: with stated noise alone, a walk is an error that drifts where the statement is too large,
     and errors are a motion where it is too small. O(n^3).
@@ -317,8 +315,6 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
 
     `asked_s`: (T,), s: times of the result.
 
-    Notes
-    -----
     For given densities the estimate equals that of a Kalman filter with the smoother of Rauch, Tung and Striebel (AIAA
     Journal 3, 1965) for the constant-acceleration model, found in one banded solve. Jerk densities and the scale of the
     noise maximize the marginal likelihood; outliers are reweighted iteratively; standstill and the nonholonomic

@@ -106,8 +106,6 @@ def _band_view(slab: Array) -> Array:
 def selected_inverse(diagonal: Array, off: Array) -> tuple[Array, Array]:
     """Blocks on (K, p, p) and above (K-1, p, p) the diagonal of the inverse of a block-tridiagonal matrix.
 
-    Notes
-    -----
     Cyclic reduction (Buzbee, Golub and Nielson, SIAM J. Numer. Anal. 7, 1970): every other state is eliminated at once, which leaves a chain of half the length. Its O(log K) rounds
     are each a few stacked products, where elimination along the chain would take K.
     """
@@ -345,8 +343,6 @@ def zero_motion(state: Array, velocity_information: Array, acceleration_informat
 def geman_mcclure_weights(squared: Array) -> Array:
     """Robust weights (n,) of squared residuals in sigmas, while the outliers are not yet known.
 
-    Notes
-    -----
     Geman and McClure, Statistical methods for tomographic image reconstruction (1987).
     """
     return np.asarray(1.0 / (1.0 + squared / GEMAN_MCCLURE_SIGMAS**2) ** 2)
@@ -355,8 +351,6 @@ def geman_mcclure_weights(squared: Array) -> Array:
 def inlier_probability(squared: Array) -> Array:
     """Probability (n,) of being an inlier, from squared residuals in sigmas, relative to that of a residual of zero.
 
-    Notes
-    -----
     Mixture of two Gaussians, that of the outliers `OUTLIER_WIDTH` times as wide (expectation step of Dempster, Laird and
     Rubin, 1977, section 4.3). Inliers keep nearly all their weight, unlike with `geman_mcclure_weights`.
     """
@@ -365,21 +359,9 @@ def inlier_probability(squared: Array) -> Array:
     return np.asarray((1.0 + odds) / (1.0 + odds * np.exp(exponent)))
 
 
-@dataclass(frozen=True)
-class LogNormalPrior:
-    """Prior of a jerk density: median in m2/s5 and standard deviation of its logarithm."""
-
-    median: float
-    log_sigma: float
-
-    def penalty(self, log_density: float) -> float:
-        """Twice the negative log density, up to a constant."""
-        return ((log_density - float(np.log(self.median))) / self.log_sigma) ** 2
-
-
-# The weak prior is outweighed by some seconds of data. The strong one is for errors that repeat from tick to tick, which
-# look like maneuvers.
-WEAK_PRIOR, STRONG_PRIOR = LogNormalPrior(1.5, 2.5), LogNormalPrior(3.0, 0.7)
+# Lognormal priors of a jerk density: median in m2/s5 and standard deviation of its logarithm. The weak one is outweighed by some
+# seconds of data. The strong one is for errors that repeat from tick to tick, which look like maneuvers.
+WEAK_PRIOR, STRONG_PRIOR = (1.5, 2.5), (3.0, 0.7)
 # Information that ties two knots beyond this leaves no digits of float64 for the data.
 MAX_INFORMATION = 1e13
 MIN_DENSITY, MAX_DENSITY = 1e-4, 1e4  # m2/s5
@@ -391,9 +373,13 @@ SEARCH_WIDTHS = (2.0, 0.8)
 class DensityEstimator:
     """Maximizes the marginal likelihood of jerk densities."""
 
-    prior: LogNormalPrior = WEAK_PRIOR
+    prior: tuple[float, float] = WEAK_PRIOR
     unknown_scale: bool = False  # whether the variance of the noise is known up to a factor only
     rounds: int = 2  # rounds of the search for one density, each narrower; 1 where a finer search follows
+
+    def _penalty(self, log_density: float) -> float:
+        """Twice the negative log density of the prior, up to a constant."""
+        return ((log_density - float(np.log(self.prior[0]))) / self.prior[1]) ** 2
 
     def isotropic(
         self, motion: MotionPrior, state: Array, likelihood: Quadratic, weight_sum: float
@@ -412,10 +398,10 @@ class DensityEstimator:
             u = float(log_density[0])
             least = minimize(weighted_sum([(1.0, likelihood), (np.exp(-u), jerk)]))
             noise = freedom * np.log(least.value) if self.unknown_scale else least.value
-            return float(noise + 2.0 * least.log_determinant + 6.0 * steps * u + self.prior.penalty(u))
+            return float(noise + 2.0 * least.log_determinant + 6.0 * steps * u + self._penalty(u))
 
         lowest = min_density(motion)
-        start = np.array([np.log(max(self.prior.median, lowest))])
+        start = np.array([np.log(max(self.prior[0], lowest))])
         u = _coordinate_descent(objective, start, SEARCH_WIDTHS[: self.rounds], lowest)
         ratio = float(np.exp(u[0]))
         if not self.unknown_scale:
@@ -434,11 +420,10 @@ class DensityEstimator:
         steps = len(motion) - 1
 
         def objective(logs: Array) -> float:
-            least = minimize(
-                weighted_sum([(1.0, likelihood), (np.exp(-logs[0]), jerk[0]), (np.exp(-logs[1]), jerk[1])])
-            )
+            along, across = (np.exp(-logs[0]), jerk[0]), (np.exp(-logs[1]), jerk[1])
+            least = minimize(weighted_sum([(1.0, likelihood), along, across]))
             misfit = least.value + least.log_determinant + 3.0 * steps * logs.sum()
-            return float(misfit + self.prior.penalty(logs[0]) + self.prior.penalty(logs[1]))
+            return float(misfit + self._penalty(logs[0]) + self._penalty(logs[1]))
 
         logs = _coordinate_descent(objective, np.full(2, np.log(start)), SEARCH_WIDTHS, min_density(motion))
         return float(np.exp(logs[0])), float(np.exp(logs[1]))

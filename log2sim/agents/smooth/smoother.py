@@ -142,8 +142,6 @@ def _inflated_in_gaps(covariance: Array, at_s: Array, inlier_s: Array, density: 
 def estimate_sigma(t: Array, xy: Array) -> float:
     """Estimate the standard deviation of the noise in m from third divided differences, zero at constant acceleration.
 
-    Notes
-    -----
     The median absolute value, 0.6745 standard deviations of a Gaussian, is insensitive to outliers (Rousseeuw and Croux,
     J. Am. Stat. Assoc. 88, 1993).
     """
