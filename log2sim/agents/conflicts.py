@@ -193,7 +193,16 @@ def extend_static(
     for n in sorted(range(len(rows)), key=lambda n: -agents[rows[n]].confidence):
         agent, w = agents[rows[n]], agents[rows[n]].waypoints
         others = [a for k, a in enumerate(out) if k != rows[n]] + ([] if ego is None else [ego])
-        taken = free[n] | _occupied(agent, others, t_s)
+        (length, width), taken = agent.size_m[:2], free[n].copy()
+        place = np.array([w.x_m[0], w.y_m[0], length, width, w.yaw_rad[0]])
+        for other in others:  # in its place
+            reach_m, v = (np.hypot(length, width) + np.hypot(*other.size_m[:2])) / 2, other.waypoints
+            if np.hypot(v.x_m - place[0], v.y_m - place[1]).min() > reach_m + np.hypot(np.ptp(v.x_m), np.ptp(v.y_m)):
+                continue
+            there = AgentTable.of([other], t_s)
+            near = np.flatnonzero(np.hypot(*(there.xy_m[0] - place[:2]).T) <= reach_m)
+            shared = overlap_of_smaller(np.tile(place, (len(near), 1)), there.rectangles(0, near))
+            taken[near] |= shared > TOUCHING
         before, after = np.flatnonzero(t_s < w.t_s[0]), np.flatnonzero(t_s > w.t_s[-1])
         before = before[before > max(before[taken[before]], default=-1)]
         after = after[after < min(after[taken[after]], default=len(t_s))]
@@ -203,19 +212,3 @@ def extend_static(
             life_s = np.concatenate([t_s[before], w.t_s, t_s[after]])
             out[rows[n]] = replace(agent, waypoints=replace(w.take(index), t_s=life_s, observed=seen))
     return out
-
-
-def _occupied(agent: Agent, others: Sequence[Agent], t_s: Array) -> NDArray[np.bool_]:
-    """Return at which times (T,) another agent is in the place of a static one."""
-    w, (length, width) = agent.waypoints, agent.size_m[:2]
-    place = np.array([w.x_m[0], w.y_m[0], length, width, w.yaw_rad[0]])
-    occupied = np.zeros(len(t_s), dtype=bool)
-    for other in others:
-        reach_m = (np.hypot(length, width) + np.hypot(*other.size_m[:2])) / 2
-        v = other.waypoints
-        if np.hypot(v.x_m - place[0], v.y_m - place[1]).min() > reach_m + np.hypot(np.ptp(v.x_m), np.ptp(v.y_m)):
-            continue
-        boxes = AgentTable.of([other], t_s)
-        rows = np.flatnonzero(np.hypot(*(boxes.xy_m[0] - place[:2]).T) <= reach_m)
-        occupied[rows] |= overlap_of_smaller(np.tile(place, (len(rows), 1)), boxes.rectangles(0, rows)) > TOUCHING
-    return occupied

@@ -395,7 +395,18 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
         moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & (abs(known) > MIN_FLOW_LOG_ODDS)
         yaw = w.yaw_rad[moving] + (0.0 if known > 0 else np.pi)
         paths.append(np.stack([w.x_m[moving], w.y_m[moving], yaw], axis=1))
-    road_users = [_along_street(c, [ego_path, *paths]) for c in road_users]
+    for k, c in enumerate(road_users):
+        # What stands and of whose yaw nothing is known is laid along the street.
+        w, axis = c.agent.waypoints, c.geometry.yaw_rad
+        if not c.agent.static or (axis is not None and np.isfinite(axis)):
+            continue
+        passing = _passing_by(np.array([w.x_m[0], w.y_m[0]]), [ego_path, *paths], None)
+        surest = max(passing, key=lambda path: path.belongs, default=None)
+        if surest is not None and surest.belongs >= MIN_STREET_SHARE:
+            sigma = np.sqrt(surest.belongs * PARALLEL_SIGMA_RAD**2 + (1 - surest.belongs) * UNKNOWN_YAW_RAD**2)
+            yaw_rad = np.full(len(w.t_s), wrap_angle(surest.heading_rad))
+            w = replace(w, yaw_rad=yaw_rad, sigma_yaw_rad=np.full(len(w.t_s), sigma))
+            road_users[k] = replace(c, agent=replace(c.agent, waypoints=w))
     middle = [(c.agent.waypoints, len(c.agent.waypoints) // 2) for c in road_users]
     poses = np.array([[w.x_m[k], w.y_m[k], w.yaw_rad[k]] for w, k in middle])
     street = np.zeros((2, len(of)))
@@ -414,18 +425,3 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
         doubts = [Finding("heading_ambiguous")] if confidence < MIN_HEADING_CONFIDENCE else []
         decided[k] = replace(candidate, agent=agent).doubted(doubts)
     return [c.doubted(motion_doubts(c.agent.category, c.agent.waypoints)) for c in decided]
-
-
-def _along_street(candidate: AgentCandidate, paths: Sequence[Array]) -> AgentCandidate:
-    """Lay a candidate that stands and of whose yaw nothing is known along the street."""
-    w, known = candidate.agent.waypoints, candidate.geometry.yaw_rad
-    if not candidate.agent.static or (known is not None and np.isfinite(known)):
-        return candidate
-    passing = _passing_by(np.array([w.x_m[0], w.y_m[0]]), paths, None)
-    surest = max(passing, key=lambda path: path.belongs, default=None)
-    if surest is None or surest.belongs < MIN_STREET_SHARE:
-        return candidate
-    sigma = np.sqrt(surest.belongs * PARALLEL_SIGMA_RAD**2 + (1 - surest.belongs) * UNKNOWN_YAW_RAD**2)
-    n = len(w.t_s)
-    w = replace(w, yaw_rad=np.full(n, wrap_angle(surest.heading_rad)), sigma_yaw_rad=np.full(n, sigma))
-    return replace(candidate, agent=replace(candidate.agent, waypoints=w))

@@ -401,7 +401,19 @@ def infer_lanes(
         return (), tuple(notes)
     lanes = _linked_lanes(merge_paths(driven, marked), driven)
     lanes = [*lanes, *_free_lanes(lanes, driven)]
-    return _name_opposites(name_lines(lanes, markings, borders)), tuple(notes)
+    lanes = name_lines(lanes, markings, borders)
+    # The lane beside each that leads the other way, along at least half of it.
+    flat = [k for k, lane in enumerate(lanes) if lane.junction is None]
+    lines = [Polyline.through(lanes[k].points_m) for k in flat]
+    best: dict[int, tuple[float, int]] = {}
+    for pair in find_beside(lines):
+        length = float(pair.s_m[-1] - pair.s_m[0])
+        if not pair.same_way and length >= lines[pair.route].length_m / 2:
+            best[pair.route] = max(best.get(pair.route, (0.0, -1)), (length, pair.other))
+    for k, (_, other) in best.items():
+        if best.get(other, (0.0, -1))[1] == k:
+            lanes[flat[k]] = replace(lanes[flat[k]], opposite=lanes[flat[other]].id)
+    return tuple(lanes), tuple(notes)
 
 
 def _linked_lanes(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> list[MapLane]:
@@ -534,19 +546,3 @@ def _free_lanes(lanes: Sequence[MapLane], paths: Sequence[DrivenPath]) -> list[M
             full = np.full(len(line.points_m), width)
             found.append(thin(MapLane(name, line.points_m, full, inferred_from="paths", confidence=confidence)))
     return found
-
-
-def _name_opposites(lanes: Sequence[MapLane]) -> tuple[MapLane, ...]:
-    """Name for each lane the one beside it that leads the other way, along at least half of it."""
-    flat = [k for k, lane in enumerate(lanes) if lane.junction is None]
-    lines = [Polyline.through(lanes[k].points_m) for k in flat]
-    best: dict[int, tuple[float, int]] = {}
-    for pair in find_beside(lines):
-        length = float(pair.s_m[-1] - pair.s_m[0])
-        if not pair.same_way and length >= lines[pair.route].length_m / 2:
-            best[pair.route] = max(best.get(pair.route, (0.0, -1)), (length, pair.other))
-    found = list(lanes)
-    for k, (_, other) in best.items():
-        if best.get(other, (0.0, -1))[1] == k:
-            found[flat[k]] = replace(found[flat[k]], opposite=lanes[flat[other]].id)
-    return tuple(found)

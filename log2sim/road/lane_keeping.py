@@ -72,26 +72,18 @@ def locate_in_lanes(agent: Agent, lanes: Sequence[MapLane], t_s: Array | None = 
             aside[k, there[held]], width[k, there] = at.aside_m[held], own
     if not lanes:
         return LanePosition(t_s, np.full(len(t_s), -1), np.full(len(t_s), np.nan), np.full(len(t_s), np.nan))
-    chosen = _choose(lanes, np.abs(aside), width)
+    number, distance = {lane.id: k for k, lane in enumerate(lanes)}, np.abs(aside)
+    chosen, current = np.full(len(t_s), -1), -1
+    for t in range(len(t_s)):
+        if current < 0 or not np.isfinite(distance[current, t]):
+            onward = [number[name] for name in lanes[current].successors if name in number] if current >= 0 else []
+            half = np.where(np.isnan(width[:, t]), 0.0, width[:, t]) / 2
+            inside = np.flatnonzero(distance[:, t] <= half).tolist()
+            candidates = [k for k in onward if np.isfinite(distance[k, t])] or inside
+            current = min(candidates, key=lambda k: distance[k, t]) if candidates else -1
+        chosen[t] = current
     pick = np.maximum(chosen, 0), np.arange(len(t_s))
     return LanePosition(t_s, chosen, *(np.where(chosen >= 0, column[pick], np.nan) for column in (aside, width)))
-
-
-def _choose(lanes: Sequence[MapLane], distance: Array, width: Array) -> NDArray[np.intp]:
-    """Choose a lane (T,) by distances from the middles (L, T), infinite where a lane does not hold the agent."""
-    number = {lane.id: k for k, lane in enumerate(lanes)}
-    chosen = np.full(distance.shape[1], -1)
-    current = -1
-    for t in range(len(chosen)):
-        inside = np.flatnonzero(distance[:, t] <= np.where(np.isnan(width[:, t]), 0.0, width[:, t]) / 2)
-        if current >= 0 and np.isfinite(distance[current, t]):
-            chosen[t] = current
-            continue
-        onward = [number[name] for name in lanes[current].successors if name in number] if current >= 0 else []
-        candidates = [k for k in onward if np.isfinite(distance[k, t])] or inside.tolist()
-        current = min(candidates, key=lambda k: distance[k, t]) if candidates else -1
-        chosen[t] = current
-    return chosen
 
 
 def find_lane_changes(position: LanePosition, lanes: Sequence[MapLane]) -> list[LaneChange]:

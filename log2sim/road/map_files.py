@@ -143,7 +143,19 @@ def write_map(
         if suffix in (".tif", ".tiff"):
             _write_geotiff(ground, temporary, layer, frame or MapFrame())
             return
-        image = _png_values(ground, layer) if suffix == ".png" else on_white(ground, layer)
+        known = known_cells(ground, layer)
+        image: NDArray[Any]
+        if suffix != ".png":
+            image = on_white(ground, layer)
+        elif layer == "color":
+            image = np.dstack([ground.color_bgr, ground.alpha])
+        elif layer == "intensity":
+            gray = np.rint(255 * np.nan_to_num(ground.intensity)).astype(np.uint8)
+            image = np.dstack([gray, gray, gray, np.where(known, 255, 0).astype(np.uint8)])
+        else:
+            image = np.zeros(known.shape, np.uint16)
+            above = (ground.height_m[known] - lowest_m(ground)) / HEIGHT_STEP_M
+            image[known] = np.clip(np.rint(above), 0, 65534).astype(np.uint16) + 1
         done, data = cv2.imencode(suffix, image)
         if not done:
             raise ConfigError(f"OpenCV cannot encode a picture of {image.shape[1]} x {image.shape[0]} px as {suffix}")
@@ -215,20 +227,6 @@ def _read_world_file(path: Path) -> tuple[float, float, float]:
             f"{path}: the cells are {d:g} x {down:g} m, turned by {turned:g} and {also:g}; expected square ones, north up"
         )
     return d, x, y
-
-
-def _png_values(ground: GroundMap, layer: Layer) -> NDArray[Any]:
-    if layer == "color":
-        return np.dstack([ground.color_bgr, ground.alpha])
-    known = known_cells(ground, layer)
-    if layer == "intensity":
-        gray = np.rint(255 * np.nan_to_num(ground.intensity)).astype(np.uint8)
-        return np.dstack([gray, gray, gray, np.where(known, 255, 0).astype(np.uint8)])
-    steps = np.zeros(known.shape, np.uint16)
-    if known.any():
-        above = (ground.height_m[known] - lowest_m(ground)) / HEIGHT_STEP_M
-        steps[known] = np.clip(np.rint(above), 0, 65534).astype(np.uint16) + 1
-    return steps
 
 
 def lowest_m(ground: GroundMap) -> float:

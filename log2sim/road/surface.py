@@ -171,16 +171,26 @@ def estimate_surface(points: GroundPoints, raster: Raster, path: Array, z0_m: fl
     height of reference, m.
     """
     base = _base_of(path, raster, z0_m)
-    cell = cells_of_points(points, raster)
-    rest = points.z - base.ravel()[cell]
-    near = 1 / (1 + (points.range_m / HALF_WEIGHT_RANGE_M) ** 2)
-    sums = _trimmed_means(cell, rest, near.astype(np.float32), raster.shape[0] * raster.shape[1])
-    raw_weight, raw_middle = (a.reshape(raster.shape).astype(np.float32) for a in sums)
+    cell, count = cells_of_points(points, raster), raster.shape[0] * raster.shape[1]
+    z = points.z - base.ravel()[cell]
+    near = (1 / (1 + (points.range_m / HALF_WEIGHT_RANGE_M) ** 2)).astype(np.float32)
+    # Means of the lowest heights that agree, from the mean of a cell down: in each round points too far above the last mean are
+    # left out, so that it sinks through grass and tires until it rests on points that are all within the noise.
+    heavy, weights = (near * z).astype(np.float64), near.astype(np.float64)
+    kept: NDArray[Any] = np.ones(len(z), dtype=bool)
+    for k in range(ROUNDS + 1):
+        # A weight of 0 takes less time than a copy of the rows that are left.
+        weight, total = (np.bincount(cell, a * kept, count).astype(np.float64, copy=False) for a in (weights, heavy))
+        mean = np.divide(total, weight, out=np.zeros(count), where=weight > 0)
+        wide = 2.0 ** max(ROUNDS - 2 - k, 0)
+        off = z - mean.astype(np.float32).take(cell)
+        kept = (off < wide * ABOVE_M) & (off > -wide * BELOW_M)
+    raw_weight, raw_middle = (a.reshape(raster.shape).astype(np.float32) for a in (weight, mean))
     # Smoothed by a Gaussian of one cell with their weights.
     raw_weight = np.minimum(raw_weight, FULL_WEIGHT)
-    weight, heavy = (cv2.GaussianBlur(a, (5, 5), 1.0) for a in (raw_weight, raw_weight * raw_middle))
-    middle = np.divide(heavy, weight, out=np.zeros_like(heavy), where=weight > 0)
-    measured = weight > 0.05
+    soft, sums = (cv2.GaussianBlur(a, (5, 5), 1.0) for a in (raw_weight, raw_weight * raw_middle))
+    middle = np.divide(sums, soft, out=np.zeros_like(sums), where=soft > 0)
+    measured = soft > 0.05
     filled = fill(np.where(measured, middle, 0), measured.astype(np.float32))
     distance = cv2.distanceTransform((~measured).astype(np.uint8), cv2.DIST_L2, 3)
     return Surface(raster, base + filled, distance * raster.resolution_m <= MAX_FILLED_M)
@@ -195,26 +205,6 @@ def cells_of_points(points: GroundPoints, raster: Raster) -> NDArray[np.int64]:
     cell = np.multiply(row, raster.shape[1], dtype=np.int64)
     cell += column
     return np.asarray(cell, dtype=np.int64)
-
-
-def _trimmed_means(
-    cell: NDArray[np.int64], z: NDArray[np.float32], near: NDArray[np.float32], count: int
-) -> tuple[Array, Array]:
-    """Means (count,) of the lowest heights that agree, and their weights, 0 where there are none.
-
-    From the mean of a cell down: in each round points too far above the last mean are left out, so that it sinks through grass
-    and tires until it rests on points that are all within the noise.
-    """
-    heavy, weights = (near * z).astype(np.float64), near.astype(np.float64)
-    kept: NDArray[Any] = np.ones(len(z), dtype=bool)
-    for k in range(ROUNDS + 1):
-        # A weight of 0 takes less time than a copy of the rows that are left.
-        weight, total = (np.bincount(cell, a * kept, count).astype(np.float64, copy=False) for a in (weights, heavy))
-        mean = np.divide(total, weight, out=np.zeros(count), where=weight > 0)
-        wide = 2.0 ** max(ROUNDS - 2 - k, 0)
-        off = z - mean.astype(np.float32).take(cell)
-        kept = (off < wide * ABOVE_M) & (off > -wide * BELOW_M)
-    return weight, mean
 
 
 def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:

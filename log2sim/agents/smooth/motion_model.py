@@ -89,7 +89,7 @@ def course_is_known(
 
     `xy_m`: (T, 2), m. `velocity_mps`: (T, 2), m/s. `covariance`: (T, 2, 2), m2/s2: of the velocity. `correlated`: whether the
     errors of the positions repeat. The covariances are too small then, so the speed alone decides. `max_curvature_1pm`: 1/m: of
-    a path that is not holonomic. Courses that a vehicle could not turn between are not both known, see `_turns_feasible`.
+    a path that is not holonomic. Courses that a vehicle could not turn between are not both known.
     """
     speed = np.hypot(*velocity_mps.T)
     if correlated:
@@ -102,35 +102,27 @@ def course_is_known(
         return known
     course = np.arctan2(velocity_mps[rows, 1], velocity_mps[rows, 0])
     sigma = np.sqrt(_course_variance(velocity_mps[rows], covariance[rows]))
-    known[rows] = _turns_feasible(_distance_covered(xy_m, speed)[rows], course, sigma, max_curvature_1pm)
-    return known
-
-
-def _turns_feasible(
-    distance_m: Array, course_rad: Array, sigma_rad: Array, max_curvature_1pm: float
-) -> NDArray[np.bool_]:
-    """Select courses (n,), (n,) bool, of which no two differ by more than a vehicle can turn on the way between them.
-
-    A smoothed velocity swings round where an object comes to rest or is seen for the first time. A course counts if it
-    differs from the surer ones that count by no more than the distance driven times the largest curvature, plus the
-    standard deviation of the difference. Forward and backward are the same.
-    """
-    counts = np.ones(len(course_rad), dtype=bool)
-    turned = np.abs(wrap_angle(2 * np.diff(course_rad))) / 2
+    distance_m = _distance_covered(xy_m, speed)[rows]
+    turned = np.abs(wrap_angle(2 * np.diff(course))) / 2
     if np.all(turned <= max_curvature_1pm * np.diff(distance_m)):  # then it holds between any two
-        return counts
-    counts[:] = False
-    # Within this distance any turn is feasible.
-    reach_m = np.pi / 2 / max_curvature_1pm
+        return known
+    # A smoothed velocity swings round where an object comes to rest or is seen for the first time. A course counts if it differs
+    # from the surer ones that count by no more than the distance driven times the largest curvature, plus the standard deviation
+    # of the difference. Forward and backward are the same.
+    counts, reach_m = (
+        np.zeros(len(rows), dtype=bool),
+        np.pi / 2 / max_curvature_1pm,
+    )  # within which any turn is feasible
     first = np.searchsorted(distance_m, distance_m - reach_m)
     last = np.searchsorted(distance_m, distance_m + reach_m, side="right")
-    for k in np.argsort(sigma_rad, kind="stable").tolist():
+    for k in np.argsort(sigma, kind="stable").tolist():
         near = slice(first[k], last[k])
-        turned = np.abs(wrap_angle(2 * (course_rad[near] - course_rad[k]))) / 2
+        turned = np.abs(wrap_angle(2 * (course[near] - course[k]))) / 2
         feasible = max_curvature_1pm * np.abs(distance_m[near] - distance_m[k])
-        feasible += np.hypot(sigma_rad[near], sigma_rad[k])
+        feasible += np.hypot(sigma[near], sigma[k])
         counts[k] = np.all((turned <= feasible) | ~counts[near])
-    return counts
+    known[rows] = counts
+    return known
 
 
 def _course_variance(velocity_mps: Array, covariance: Array) -> Array:
