@@ -341,7 +341,7 @@ class FirstPass:
             return part, clock, (0, 0, None)
         with clock.stage("recall"):
             kept = cache.put(key, part)
-        return part, clock, (0, count * kept, cache.store_problem)
+        return part, clock, (0, count * kept, cache.store.problem)
 
     def _content(self, task: Task, records: RecordSource) -> bytes:
         """Return a digest of the records of some ticks, and of all else that what is seen there depends on."""

@@ -94,8 +94,8 @@ def points_of_boxes(
     row = (first[box, 0] + ramp(rows)) * shape[1]
     begin, end, count = row + first[box, 1], row + last[box, 1] + 1, int(shape.prod())
     touched = np.cumsum(np.bincount(begin, minlength=count) - np.bincount(end, minlength=count)) > 0
-    near = touched.take(code)
-    near = np.flatnonzero(near if usable is None else near & usable)
+    counted = touched.take(code)
+    near = np.flatnonzero(counted if usable is None else counted & usable)
     code = code.take(near)
     order = near.take(np.argsort(code, kind="stable"))
     edges = np.concatenate([[0], np.cumsum(np.bincount(code, minlength=count))])

@@ -12,7 +12,6 @@ from log2sim.files.documents import rounded
 from log2sim.geometry import CHI2_2DOF_99, Array, apply_homography
 from log2sim.perception.homography.normalized import (
     Linearization,
-    NormalizedCorrespondences,
     normalize,
     pose_tangent,
     scale_free_basis,
@@ -66,37 +65,6 @@ def ground_covariances(ground_H_image: Array, covariance: Array, uv: Array) -> A
     by_h[:, 0, 0:3] = by_h[:, 1, 3:6] = pixel / q[:, 2:]
     by_h[:, :, 6:] = -(q[:, :2] / q[:, 2:])[:, :, None] * by_h[:, :1, 0:3]
     return np.asarray(by_h @ covariance @ by_h.swapaxes(1, 2))
-
-
-def predicted_sigma(
-    data: NormalizedCorrespondences, h: Array, covariance: Array | None, use: NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Predict the standard deviation on the ground one spread of the inliers from their mean.
-
-    Returns `sigma`, `spread`: the standard deviation and that spread, normalized units.
-    """
-    ground_xy = data.ground[:2, use]
-    mean = ground_xy.mean(axis=1, keepdims=True)
-    spread = float(np.sqrt(((ground_xy - mean) ** 2).sum(axis=0).mean() / 2))
-    if spread == 0 or covariance is None:
-        return float("inf"), spread
-    q: Array = h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
-    seen: Array = (q[:2, q[2] > 0] / q[2, q[2] > 0]).T
-    back = np.asarray(np.linalg.inv(h), dtype=np.float64)
-    variance = ground_covariances(back, covariance, seen).trace(axis1=1, axis2=2)
-    return (float(np.sqrt(variance.max())) if len(variance) else float("inf")), spread
-
-
-def singular_values(data: NormalizedCorrespondences, use: NDArray[np.bool_]) -> Array:
-    """Compute the singular values (9,), descending, of the DLT matrix of the rows in `use`, normalized anew."""
-    (u, v), (x, y) = (normalize(a[:2, use])[1] for a in (data.image, data.ground))
-    p = np.stack([u, v, np.ones_like(u)])
-    gram = np.zeros((9, 9))
-    gram[0:3, 0:3] = gram[3:6, 3:6] = p @ p.T
-    gram[0:3, 6:9] = gram[6:9, 0:3] = -(p * x) @ p.T
-    gram[3:6, 6:9] = gram[6:9, 3:6] = -(p * y) @ p.T
-    gram[6:9, 6:9] = (p * (x * x + y * y)) @ p.T
-    return np.asarray(np.sqrt(np.clip(np.linalg.eigvalsh(gram)[::-1], 0.0, None)))
 
 
 # Ground points straight ahead, m, at which the jitter of a homography is measured.
@@ -242,11 +210,27 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
     needed = max(minimum, int(np.ceil(absorbed + MIN_INLIER_SHARE * (rows - absorbed))))
     if count < needed:
         return refused_fit(f"{count} of {rows} correspondences agree, at least {needed} are needed", rows)
-    s = singular_values(data, inliers)
+    # Singular values, descending, of the DLT matrix of the inliers, normalized anew.
+    (u, v), (x, y) = (normalize(a[:2, inliers])[1] for a in (data.image, data.ground))
+    p, gram = np.stack([u, v, np.ones_like(u)]), np.zeros((9, 9))
+    gram[0:3, 0:3] = gram[3:6, 3:6] = p @ p.T
+    gram[0:3, 6:9] = gram[6:9, 0:3] = -(p * x) @ p.T
+    gram[3:6, 6:9] = gram[6:9, 3:6] = -(p * y) @ p.T
+    gram[6:9, 6:9] = (p * (x * x + y * y)) @ p.T
+    s = np.sqrt(np.clip(np.linalg.eigvalsh(gram)[::-1], 0.0, None))
     if image_K is None and s[7] < MIN_S8_S1 * s[0]:
         return refused_fit(f"the {count} correspondences that agree lie on a line or a point", rows)
     covariance = homography_covariance(robust.h, robust.linear, inliers, image_K)
-    sigma, spread = predicted_sigma(data, robust.h, covariance, inliers)
+    # The standard deviation on the ground that it predicts one spread of the inliers from their mean, normalized units.
+    ground_xy = data.ground[:2, inliers]
+    mean = ground_xy.mean(axis=1, keepdims=True)
+    spread, sigma = float(np.sqrt(((ground_xy - mean) ** 2).sum(axis=0).mean() / 2)), float("inf")
+    if spread > 0 and covariance is not None:
+        q: Array = robust.h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
+        seen: Array = (q[:2, q[2] > 0] / q[2, q[2] > 0]).T
+        inverse = np.asarray(np.linalg.inv(robust.h), dtype=np.float64)
+        variance = ground_covariances(inverse, covariance, seen).trace(axis1=1, axis2=2)
+        sigma = float(np.sqrt(variance.max())) if len(variance) else sigma
     scale = data.ground_N_m[0, 0]
     if not sigma < MAX_RELATIVE_SIGMA * spread:
         reason = (

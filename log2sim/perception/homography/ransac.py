@@ -67,7 +67,11 @@ def solve_samples(data: NormalizedCorrespondences, rows: NDArray[np.int64], max_
     columns = np.empty((len(usable), 3, 3))
     columns[:, :2] = (data.image[:, rows[:3, usable]] * depth).transpose(2, 0, 1)
     columns[:, 2] = depth.T
-    return np.asarray(columns @ _adjugate(data.ground[:2, rows[:3, usable]]), dtype=np.float64)
+    ground, adjugate = data.ground[:2, rows[:3, usable]], np.empty((len(usable), 3, 3))
+    for k in range(3):
+        (ax, bx), (ay, by) = ground[:, [(k + 1) % 3, (k + 2) % 3]]
+        adjugate[:, k, 0], adjugate[:, k, 1], adjugate[:, k, 2] = ay - by, bx - ax, ax * by - ay * bx
+    return np.asarray(columns @ adjugate, dtype=np.float64)
 
 
 def _triangle_areas(points: Array) -> Array:
@@ -79,27 +83,6 @@ def _triangle_areas(points: Array) -> Array:
     ay, by, cy = points[1, 1:] - points[1, 0]
     ab, ac, bc = ax * by - ay * bx, ax * cy - ay * cx, bx * cy - by * cx
     return np.stack([ab - ac + bc, -bc, ac, ab])
-
-
-def _adjugate(points: Array) -> Array:
-    """Compute the adjugates (count, 3, 3) of the homogeneous matrices of three points (2, 3, count) each."""
-    out = np.empty((points.shape[2], 3, 3))
-    for k in range(3):
-        (ax, bx), (ay, by) = points[:, [(k + 1) % 3, (k + 2) % 3]]
-        out[:, k, 0], out[:, k, 1], out[:, k, 2] = ay - by, bx - ax, ax * by - ay * bx
-    return out
-
-
-def best_hypotheses(
-    data: NormalizedCorrespondences, h: Array, rng: np.random.Generator, pitch_sigma: float, count: int
-) -> Array:
-    """Return the `count` homographies (K, 3, 3) of least bounded loss; only the best on some rows are scored on all."""
-    rows = data.image.shape[1]
-    if rows > 2 * PRESCORE_ROWS and len(h) > 2 * count:
-        some = data.coarse(np.sort(rng.permutation(rows)[:PRESCORE_ROWS]), MINIMAL_SAMPLE_SIGMA_SCALE)
-        h = h[np.argsort(bounded_losses(some, h, pitch_sigma), kind="stable")[: 2 * count]]
-    loss = bounded_losses(data.coarse(slice(None), MINIMAL_SAMPLE_SIGMA_SCALE), h, pitch_sigma)
-    return np.asarray(h[np.argsort(loss, kind="stable")[:count]])
 
 
 class RansacRound(NamedTuple):
@@ -154,16 +137,31 @@ def ransac(
     -----
     LO-RANSAC (Chum, Matas & Kittler, 2003) with the bounded loss of MSAC (Torr & Zisserman, 2000).
     """
-    candidates = np.zeros((0, 3, 3))
+    candidates, count = np.zeros((0, 3, 3)), data.image.shape[1]
     for samples, scored, min_inlier_share in schedule:
         rows = np.concatenate(
             [draw_samples(data, rng, samples // 2, across_ticks=across) for across in (False, True)], axis=1
         )
-        hypotheses = solve_samples(data, rows, scored)
-        if len(hypotheses):
-            hypotheses = best_hypotheses(data, hypotheses, rng, pitch_sigma, OPTIMIZED_HYPOTHESES)
-            optimized = _optimize_locally(data, hypotheses, rng, pitch_sigma, image_K)
-            candidates = np.concatenate([candidates, optimized])
+        h = solve_samples(data, rows, scored)
+        if len(h):
+            # Only the best on some rows are scored on all.
+            if count > 2 * PRESCORE_ROWS and len(h) > 2 * OPTIMIZED_HYPOTHESES:
+                some = data.coarse(np.sort(rng.permutation(count)[:PRESCORE_ROWS]), MINIMAL_SAMPLE_SIGMA_SCALE)
+                h = h[np.argsort(bounded_losses(some, h, pitch_sigma), kind="stable")[: 2 * OPTIMIZED_HYPOTHESES]]
+            loss = bounded_losses(data.coarse(slice(None), MINIMAL_SAMPLE_SIGMA_SCALE), h, pitch_sigma)
+            h = h[np.argsort(loss, kind="stable")[:OPTIMIZED_HYPOTHESES]]
+            # A few Gauss-Newton steps on some of the rows.
+            few = count <= 2 * OPTIMIZATION_ROWS
+            part = data if few else data.take(np.sort(rng.permutation(count)[:OPTIMIZATION_ROWS]))
+            part = replace(part, sigma_image=float(np.hypot(part.sigma_image, pitch_sigma)))
+            h = refine_many(part, h, OPTIMIZATION_GATES)
+            if image_K is not None:
+                h = nearest_poses(image_K, h[np.argsort(bounded_losses(part, h), kind="stable")[:OPTIMIZED_POSES]])
+                h = h[np.isfinite(h).all(axis=(1, 2))]
+                for gate in POSE_GATES if len(h) else ():
+                    linear = linearize(part, h)
+                    h = np.array([newton_step(linear, pose, image_K, gate, k) for k, pose in enumerate(h)])
+            candidates = np.concatenate([candidates, h])
         if len(candidates):
             squared = squared_errors(data, candidates, pitch_sigma)
             best = int(np.argmin(np.minimum(squared, CHI2_2DOF_99).sum(axis=1)))
@@ -172,38 +170,17 @@ def ransac(
                 break
     if len(candidates) == 0:
         return RobustFit(None, data)
-    return RobustFit(candidates[0], data) if pitch_sigma else refine_with_noise(data, candidates[0], image_K)
-
-
-def _optimize_locally(
-    data: NormalizedCorrespondences, h: Array, rng: np.random.Generator, pitch_sigma: float, image_K: Array | None
-) -> Array:
-    """Take a few Gauss-Newton steps of hypotheses (K, 3, 3) on some of the rows."""
-    rows = data.image.shape[1]
-    part = data if rows <= 2 * OPTIMIZATION_ROWS else data.take(np.sort(rng.permutation(rows)[:OPTIMIZATION_ROWS]))
-    part = replace(part, sigma_image=float(np.hypot(part.sigma_image, pitch_sigma)))
-    h = refine_many(part, h, OPTIMIZATION_GATES)
-    if image_K is None:
-        return h
-    poses = nearest_poses(image_K, h[np.argsort(bounded_losses(part, h), kind="stable")[:OPTIMIZED_POSES]])
-    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
-    for gate in POSE_GATES if len(poses) else ():
-        linear = linearize(part, poses)
-        poses = np.array([newton_step(linear, pose, image_K, gate, k) for k, pose in enumerate(poses)])
-    return poses
-
-
-def refine_with_noise(data: NormalizedCorrespondences, h: Array, image_K: Array | None) -> RobustFit:
-    """Refine `h` (3, 3) over all inliers, and estimate the noise from their errors."""
-    # Leaving far outliers out saves half of the time where there are many.
-    near = np.flatnonzero(squared_errors(data, h[None])[0] < REFINEMENT_GATE)
-    if len(near) < 4:
-        return RobustFit(h, data, linearize(data, h[None]))
-    part, parameters = data.take(near), 8 if image_K is None else 6
-    for _ in range(NOISE_ROUNDS):
-        linear = linearize(part, h[None])
-        h = newton_step(linear, h, image_K)
-        part = part.scale_noise(*noise_factors(part, linear, parameters))
-    h = refine(part, h, FINAL_ROUNDS, image_K)
-    data = replace(data, sigma_image=part.sigma_image, sigma_ground=part.sigma_ground)
-    return RobustFit(h, data, linearize(data, h[None]))
+    best_h: Array = candidates[0]
+    if pitch_sigma:
+        return RobustFit(best_h, data)
+    # Refined over all inliers, whose errors tell the noise. Leaving far outliers out saves half of the time where there are many.
+    near = np.flatnonzero(squared_errors(data, best_h[None])[0] < REFINEMENT_GATE)
+    if len(near) >= 4:
+        part, parameters = data.take(near), 8 if image_K is None else 6
+        for _ in range(NOISE_ROUNDS):
+            linear = linearize(part, best_h[None])
+            best_h = newton_step(linear, best_h, image_K)
+            part = part.scale_noise(*noise_factors(part, linear, parameters))
+        best_h = refine(part, best_h, FINAL_ROUNDS, image_K)
+        data = replace(data, sigma_image=part.sigma_image, sigma_ground=part.sigma_ground)
+    return RobustFit(best_h, data, linearize(data, best_h[None]))
