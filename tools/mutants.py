@@ -34,7 +34,7 @@ MUTANTS = (
     ("homographies of one tick alone", "perception/homography/ransac.py", "for across in (False, True)", "for across in (False, False)", "homography_ransac homography"),
     ("a vehicle's length is its width", "perception/boxes.py", "return bool(across > along)", "return bool(across < along)", "fusion size measure"),
     ("ends of boxes", "perception/boxes.py", "low[k], high[k] = [low[k, 1], -high[k, 0]], [high[k, 1], -low[k, 0]]", "low[k], high[k] = low[k], high[k]", "size fusion measure"),
-    ("one sweep, one object", "perception/fusion.py", "gated &= ~(from_sweep[:, None] & from_sweep)", "gated &= True", "fusion"),
+    ("one sweep, one object", "perception/fusion.py", 'possible &= ~((rows.camera[:, None] == "") & (rows.camera == ""))', "possible &= True", "fusion"),
     ("cameras are not fused", "perception/fusion.py", "squared <= CHI2_2DOF_99 * determinant", "squared <= 0 * determinant", "fusion"),
     ("Kalman gain", "tracking/forward.py", "gain @ (xy[:, :, None]", "0.5 * gain @ (xy[:, :, None]", "track"),
     ("process noise", "tracking/forward.py", "(span**3 / 3)", "(span**3 / 30)", "track"),

@@ -423,9 +423,9 @@ class FirstPass:
         out = SeenTick(rows.take(~far))
         for view, _, cloud in shown if self.plan.keeps(Stage.HOMOGRAPHY) else ():
             # Where the ego is when a line is read, one homography maps all lines of a rolling shutter to the ground.
-            camera = view.camera
-            ego_T_map = inverse(base_poses(self.log, line_stamps_ns(camera, view.t_ns, feet_of_boxes(rows.box_px))))
-            out.feet[camera.name] = foot_points(camera, rows, ego_T_map, tick)
+            sensor = view.camera
+            ego_T_map = inverse(base_poses(self.log, line_stamps_ns(sensor, view.t_ns, feet_of_boxes(rows.box_px))))
+            out.feet[sensor.name] = foot_points(sensor, rows, ego_T_map, tick)
             if cloud is None:
                 continue
             # The LiDAR's ground points that the camera sees, some, evenly.
@@ -436,10 +436,10 @@ class FirstPass:
             some = np.linspace(0, len(seen.index) - 1, count).round().astype(np.intp)
             uv = np.stack([seen.u, seen.v], axis=1)[some].astype(np.float64)
             points = cloud.xyz[cloud.ground_sample[seen.index[some]]].astype(np.float64) + cloud.origin
-            ego_T_map = inverse(base_poses(self.log, line_stamps_ns(camera, view.t_ns, uv)))
+            ego_T_map = inverse(base_poses(self.log, line_stamps_ns(sensor, view.t_ns, uv)))
             xy = ((ego_T_map[:, :3, :3] @ points[:, :, None])[:, :, 0] + ego_T_map[:, :3, 3])[:, :2]
             number = np.full(count, tick, dtype=np.int64)
-            out.ground[camera.name] = Correspondences(undistorted_pixels(camera, uv), xy, number)
+            out.ground[sensor.name] = Correspondences(undistorted_pixels(sensor, uv), xy, number)
         return out
 
     def _view(self, camera: str, tick: int) -> View | None:

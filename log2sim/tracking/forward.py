@@ -220,10 +220,10 @@ class ForwardTracker:
         self._now_ns = now_ns
         if len(columns.row) == 0:
             return columns.row, np.zeros(0, dtype=np.intp)
-        fresh = columns.score >= self.birth_score
+        strong = columns.score >= self.birth_score
         costs, flows = self._costs(columns, np.zeros(2) if flow_mps is None else flow_mps, now_ns)
-        tracks, taken = self._choose(columns, fresh, costs)
-        fresh = fresh.copy()
+        tracks, taken = self._choose(columns, strong, costs)
+        fresh = strong.copy()
         fresh[taken] = False
         if len(tracks):
             xy, r = columns.xy[taken], columns.r[taken]

@@ -87,11 +87,11 @@ def estimate_homography(
     if method not in METHODS:
         raise ValueError(f"unknown method '{method}'; known: {', '.join(METHODS)}")
     uv, xy, sigma_m = correspondences.uv, correspondences.xy_ego, options.sigma_m
-    K = np.zeros(0) if options.K is None else np.asarray(options.K, dtype=np.float64)
-    if method == "calibrated" and K.shape != (3, 3):
-        raise ValueError(f"method 'calibrated' needs the intrinsics K (3, 3), got shape {np.shape(options.K)}")
+    shape = () if options.K is None else options.K.shape
+    if method == "calibrated" and shape != (3, 3):
+        raise ValueError(f"method 'calibrated' needs the intrinsics K (3, 3), got shape {shape}")
     if method == "straw-man":
-        if np.shape(correspondences.xy_by_size) != uv.shape:
+        if correspondences.xy_by_size is None or correspondences.xy_by_size.shape != uv.shape:
             raise ValueError("method 'straw-man' needs the ground positions by average sizes, xy_by_size (N, 2)")
         xy = np.asarray(correspondences.xy_by_size, dtype=np.float64)
         # Off by a tenth of the range, for which twice the spread of the positions stands: it does not depend on the origin.
@@ -108,6 +108,7 @@ def estimate_homography(
     if of_stream:
         image_K = None
         if method == "calibrated":
+            K = np.asarray(options.K, dtype=np.float64)
             if not (np.isfinite(K).all() and np.linalg.cond(K) < MAX_CONDITION):
                 return refused_fit("the intrinsics K are singular", len(uv), ticks)
             image_K = data.image_N_px @ K
