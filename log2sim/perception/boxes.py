@@ -39,8 +39,6 @@ def fit_yaws(xy_m: Array, count: NDArray[np.intp]) -> tuple[Array, Array]:
     Returns `yaw_rad`: (M,): in [0, pi/2); `contrast`: (M,): score of the best direction over the median score, less 1: 0
     for a round or shapeless cluster; below about `MIN_CONTRAST` the yaw carries no information.
 
-    Notes
-    -----
     Closeness criterion of Zhang, Xu, Dong & Dolan, "Efficient L-Shape Fitting for Vehicle Detection Using Laser
     Scanners" (IV 2017), section III-B: a point scores the inverse of its distance to the nearer side. Cost O(45 N), with
     the points of a cluster limited to `MAX_FIT_POINTS` by an even subsample.
@@ -253,8 +251,6 @@ def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp],
     `range_m`: (N,), m: distances from the sensor of the points of the first cluster, then those of the next. `count`: (R,):
     number of points of each cluster, at least 1.
 
-    Notes
-    -----
     A ray stands for a surface that grows with the square of the distance. Of every n-th point hardly one would be on
     the far end of a long vehicle beside the sensor.
     """
@@ -321,8 +317,6 @@ def swapped_log_odds(extents_m: Array, whole: NDArray[np.bool_], sigma_m: Array,
     `extents_m`: (2,): of what was seen along both axes. `whole`: (2,): whether that is the whole side; else the side may be
     longer. `sigma_m`: (2,): standard deviation of the extents.
 
-    Notes
-    -----
     The logarithm of a side is normal, with the limits of the category two standard deviations off its middle.
     """
     low, high = (np.log(np.array(t[category][:2])) for t in (MIN_SIZE_M, MAX_SIZE_M))
@@ -380,8 +374,6 @@ def real_ends(
     Returns `real`: (..., 2, 2): for each axis, the kind of its lower and upper end: `FACING_END` for a side that faces the
     sensor, `SIDE_END` for one observed from the side, 0 where the box may extend beyond the points.
 
-    Notes
-    -----
     A side that faces the sensor is real. A side seen at a flat angle shows its near end only; otherwise its ends are the
     right and left ends of the points.
     """
@@ -418,8 +410,6 @@ def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.
     `step_rad`: (...), rad: angle between neighboring rays, from `azimuth_step_rad`. `low`, `high`: (..., 2), m:
     ends of the extents along the length and the width, relative to the sensor. `real`: (..., 2, 2): from `real_ends`.
 
-    Notes
-    -----
     Rays that are a small angle apart meet a side at distance d from the sensor's foot point on it, which is c away, at
     points angle x (c^2 + d^2) / c apart.
     """
@@ -447,8 +437,6 @@ def complete_box(
 
     Returns `center`: (..., 2), m; `sigma_m`: (..., 2): its standard deviation along each axis.
 
-    Notes
-    -----
     The box is aligned with its better real end; between two equally good ones it is centered, nearer to the one where rays
     are closer together, and without any it is centered on the points.
     """

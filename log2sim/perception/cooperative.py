@@ -220,8 +220,6 @@ def take_off_offset(a: SeenBoxes, b: SeenBoxes, b_all: SeenBoxes) -> SeenBoxes:
 
     `a`, `b`: of the vehicle and of the road, row by row the same objects. `b_all`: N SeenBoxes: of the road.
 
-    Notes
-    -----
     A shift and a turn about the sensor by weighted least squares. Their prior is what registration leaves: a single pair says
     little, and many move the boxes where they agree to. Cauchy's weights make single wrong pairs harmless (Holland & Welsch,
     "Robust regression using iteratively reweighted least-squares", 1977).

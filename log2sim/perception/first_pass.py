@@ -471,8 +471,6 @@ def observe(
     are searched as one. `jobs`: processes that share the ticks. The result is the same for any number; with fusion of
     points each cloud needs the one before, so that one process does all.
 
-    Notes
-    -----
     Whether a record repeats another depends on all before it. A part is made with what is known when it begins; its records are
     judged again when all before are known, and it is made again, by then in this process, where that changes anything.
     """

@@ -109,8 +109,6 @@ def quantile_of_change(change: NDArray[np.float32]) -> float:
 def shows_nothing(thumbnail: Thumbnail) -> bool:
     """Return whether a picture holds nothing but noise and a smooth shade: black, of one color, saturated, or covered.
 
-    Notes
-    -----
     What a scene shows is as strong in a coarse copy as in a fine one, since images of scenes have the same contrast at every
     scale (Field, J. Opt. Soc. Am. A 4, 1987); independent noise falls with the number of cells averaged. Second
     differences leave out the shade of a covered lens. A scene at night has at least one cell that stands out, a lamp.
@@ -146,8 +144,6 @@ def expect_change(picture: Thumbnail, log: Log, name: str, before_ns: int, after
     That is the 95 % quantile over the cells; 0 where the poses are not known. The distortion of the lens is left out; it changes
     where things are in a picture, not how far they move.
 
-    Notes
-    -----
     Every cell of the later picture is followed to flat ground or to `FAR_M`, and from there to the earlier picture. A picture
     without texture, as in fog, is expected not to change.
     """
@@ -203,8 +199,6 @@ def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
 
     Of many points those are looked at whose cells along x are of one slice in `SLICES`, the same in every sweep.
 
-    Notes
-    -----
     The finalizer of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) spreads neighboring cells evenly over the hashes.
     """
     xyz, lidar = sweep.xyz_m, log.lidars[name]
@@ -236,8 +230,6 @@ def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
 def common_share(a: SweepSketch, b: SweepSketch) -> float:
     """Estimate the share of the obstacle points of two sweeps that both have; 0 without any.
 
-    Notes
-    -----
     The smallest hashes are a sample of all cells, the same for both (Broder, "On the resemblance and containment of
     documents", 1997). With the Jaccard index J of two sets of one size the share is 2 J / (1 + J).
     """
@@ -282,8 +274,6 @@ class CameraWatch:
 
         `thumbnail`: (h, w). `found`: whether a detector found something in it: then it does show something.
 
-        Notes
-        -----
         Identical pictures are harmless as long as the camera has not moved since the first of them enough to change them: they
         show what it sees of all that stands. Pictures that are nearly identical are copies where the poses say at every step
         that they cannot be; poses that drift or scatter while the ego stands do not.
@@ -348,8 +338,6 @@ class LidarWatch:
     def is_repeated(self, t_ns: int, sketch: SweepSketch) -> bool:
         """Return whether a sweep repeats the one before it, and remember it.
 
-        Notes
-        -----
         A LiDAR that stands in a synthetic world without noise gives the same points again and again, and rightly so. Hence a
         sweep is a copy where the LiDAR moved meanwhile, or where its sweeps are known to differ even from one place.
         """

@@ -161,8 +161,6 @@ def nearest_records(
 
     Returns `index`: (T,): -1 beyond the tolerance; `residual_s`: (T,): NaN beyond the tolerance.
 
-    Notes
-    -----
     The offline equivalent of the online rule of Bhardwaj & Kalra, which waits for the incoming record if it will be nearer
     than the last one. Of two equally near records the earlier is taken.
     """

@@ -259,8 +259,6 @@ class ForwardTracker:
     def _choose(self, columns: _Columns, strong: NDArray[np.bool_], costs: _Costs) -> tuple[Index, Index]:
         """Return tracks and measurements of the likeliest assignment inside the gate, strong measurements first.
 
-        Notes
-        -----
         The cost of a pair is minus twice the logarithm of the ratio of two likelihoods: that the track was measured
         there, and that it was not detected and the measurement is another object's or nobody's (Blackman, "Multiple
         hypothesis tracking for multiple target tracking", IEEE AES Magazine 19, 2004). A pair that is less likely than

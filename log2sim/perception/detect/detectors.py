@@ -192,8 +192,6 @@ def road_users(labels: Labels, usable: NDArray[np.bool_] | bool = True) -> tuple
 def window_ns(t_ns: NDArray[np.int64]) -> int:
     """Compute the time around a frame in which its labels are searched: one period of the labels, ns.
 
-    Notes
-    -----
     Some logs stamp all boxes of a sweep alike, others each by its own points, from which no period can be read.
     """
     stamps = np.unique(t_ns)
@@ -208,8 +206,6 @@ def interpolate_boxes(boxes: Boxes3D, t_ns: int, window: int) -> Boxes3D:
 
     `boxes`: boxes of all stamps in ascending order. `window`: from `window_ns`.
 
-    Notes
-    -----
     Partners before and after are mutual nearest neighbors in place and size: without interpolation a car at 15 m/s is
     0.75 m off between two stamps at 10 Hz. A box without a partner is kept in its place up to `MAX_AGE_S`.
     """
@@ -238,8 +234,6 @@ def interpolate_boxes(boxes: Boxes3D, t_ns: int, window: int) -> Boxes3D:
 def drop_repeated_objects(boxes: Boxes3D, index: NDArray[np.intp]) -> NDArray[np.intp]:
     """Drop rows of `index` that overlap an earlier row of another stamp: the same object once more.
 
-    Notes
-    -----
     Two objects never share ground, so boxes of different stamps that overlap are one object seen twice.
     """
     if not len(index):

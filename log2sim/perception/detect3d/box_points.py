@@ -63,8 +63,6 @@ def points_of_boxes(
     `xyz`: (N, 3), m: points that are not finite are in no box. `center_m`, `size_m`: (M, 3), m: length, width, height.
     `yaw_rad`: (M,). `usable`: (N,): the points that count; by default all.
 
-    Notes
-    -----
     Points in cells of `CELL_M` that a box touches are sorted by cell; every box is compared with those of its own cells.
     A point within rounding, 1e-5 m at 100 m, of a face may be on either side of it.
     """
@@ -119,8 +117,6 @@ def most_points(counts: NDArray[np.float32], low: Array, cell_m: float, center_m
 
     `low`: (2,), m: lower corner of the cells. `center_m`, `reach_m`: (M, 2), m: centers and half sides of the rectangles.
 
-    Notes
-    -----
     By a table of sums (Crow, SIGGRAPH 1984), in time that does not depend on the sizes of the rectangles.
     """
     import cv2

@@ -226,8 +226,6 @@ def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> 
 
     `maps`: (C, h, w): output of the network. `low`: (2,), m: lower corner of the maps.
 
-    Notes
-    -----
     Zhou, Wang and Kraehenbuehl (2019), "Objects as Points": a cell of the greatest heat among its eight neighbors is an
     object's center. Networks are taught an object's box in the cells around its center too; the mean over those that mean
     the same object errs less than the box of a single cell.
@@ -275,8 +273,6 @@ def decode_votes(maps: NDArray[np.float32], grid: NDArray[np.float32], info: Net
     `maps`: (C, h, w): output of the network. `grid`: (12, H, W): its input, by whose greatest heights cells of the ground
     and empty ones are left out. `low`: (2,), m: lower corner of both.
 
-    Notes
-    -----
     The box is that which the network regresses around the middle of the cluster: only there is it taught, and the mean
     over all cells of the cluster is much worse.
     """
@@ -342,8 +338,6 @@ def mean_shift(vote: Array, bandwidth_m: float) -> tuple[Array, NDArray[np.intp]
 
     Returns `modes`: (K, 2), m; `index`: (n,): the mode of each vote.
 
-    Notes
-    -----
     Kernel-weighted means are computed once, on a grid: three blurs instead of a sum over neighbors at every step, in time
     that does not depend on how dense the votes are. Every cell then points to the cell of its mean.
     """

@@ -151,8 +151,6 @@ class NetworkDetector:
 
         `weak`: whether boxes that cannot reach the least score are among them.
 
-        Notes
-        -----
         The calibration of a network is fitted to the terms of these.
         """
         info, sensors = self.network.info, viewpoints_xy(cloud)

@@ -155,8 +155,6 @@ def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDA
 def stack_points(cloud: Cloud, earlier: Sequence[Cloud], range_m: float) -> NDArray[np.float32]:
     """Merge the points of earlier clouds that are in range of a cloud's sensors: (n, 3) as from `level_points`.
 
-    Notes
-    -----
     Clouds are in map axes already, so that only their origins differ. Each keeps its height above its own ground.
     """
     parts = [np.zeros((0, 3), np.float32)]
@@ -194,8 +192,6 @@ def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[
 
     All are relative to the cloud's origin. Each box has a point; `index` (n,) are those that `inside` numbers in the cloud.
 
-    Notes
-    -----
     A car is seen from one side: on a slope of 10 % the ground under its points is 0.1 to 0.2 m off that under its center.
     """
     inside = inside.sample(PLANE_POINTS)

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import CHI2_2DOF_99, Array, Camera, undistort
 from log2sim.perception.boxes import quantile_of_sorted
-from log2sim.perception.homography.fit import HomographyFit, refused_fit, validated_fit
+from log2sim.perception.homography.fit import HomographyFit, RobustFit, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import NormalizedCorrespondences, bounded_losses, linearize
-from log2sim.perception.homography.ransac import RobustFit
 
 # Heights of cars differ by about a tenth (standard deviation), and so does a range derived from them.
 SIZE_SIGMA_SHARE = 0.1

@@ -16,7 +16,18 @@ from log2sim.perception.homography.correspondences import (
     ransac_skimage,
     undistorted_pixels,
 )
-from log2sim.perception.homography.fit import HomographyFit, PitchRoll, ground_covariances, refused_fit, validated_fit
+from log2sim.perception.homography.fit import (
+    RANSAC_SCHEDULE,
+    RANSAC_SCHEDULE_OF_A_FRAME,
+    HomographyFit,
+    PitchRoll,
+    RansacRound,
+    RansacSchedule,
+    ground_covariances,
+    ransac,
+    refused_fit,
+    validated_fit,
+)
 from log2sim.perception.homography.normalized import NormalizedCorrespondences, scaled
 from log2sim.perception.homography.pitch_roll import (
     PITCH_SIGMA_PX,
@@ -27,13 +38,6 @@ from log2sim.perception.homography.pitch_roll import (
     stabilized,
     stabilizing_warps,
     two_folds,
-)
-from log2sim.perception.homography.ransac import (
-    RANSAC_SCHEDULE,
-    RANSAC_SCHEDULE_OF_A_FRAME,
-    RansacRound,
-    RansacSchedule,
-    ransac,
 )
 
 STREAM_METHODS = ("time-aware", "calibrated")
@@ -75,8 +79,6 @@ def estimate_homography(
     Raises `ValueError` for an unknown method, or when the method lacks its input: intrinsics for "calibrated", positions by
     average sizes for "straw-man".
 
-    Notes
-    -----
     "time-aware" draws one half of its samples from single frames, where correspondences share the camera's momentary
     pose, and one half from all frames. It scores each hypothesis over all frames and obstacles with a bounded loss of
     the whitened error, and refines the best over all of its inliers. "calibrated" does the same over the six parameters
@@ -181,7 +183,7 @@ def fit_camera(
     fit, source = _fit_fixed(feet, ground, options, rng)
     if options.method not in STREAM_METHODS or (len(ground) < 4 and len(feet) < MIN_FEET):
         return fit, source
-    feet, ground = _finite(feet), _finite(ground)
+    feet, ground = (c.take(np.isfinite(np.column_stack([c.uv, c.xy_ego])).all(axis=1)) for c in (feet, ground))
     rng = rng.spawn(1)[0]
     tested = _test_ground(fit, feet, ground, options, rng)
     if tested is None or not tested[1].per_tick:
@@ -268,12 +270,6 @@ def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: 
     pitches = bool(np.abs(stabilizing_warps(moving) - np.eye(3)).max() > MIN_WARP)
     sigmas_deg = (float("nan"), float("nan")) if options.K is None else angle_sigmas_deg(moving, options.K)
     return errors.decide(source, sigmas_deg, moves=pitches)
-
-
-def _finite(correspondences: Correspondences) -> Correspondences:
-    """Select the rows whose pixels and positions are finite."""
-    values = np.column_stack([correspondences.uv, correspondences.xy_ego])
-    return correspondences.take(np.isfinite(values).all(axis=1))
 
 
 # Beyond this range one pixel of a camera at car height is several meters.

@@ -104,8 +104,6 @@ def squared_errors(
 
     `pitch_sigma` is a further standard deviation along v, for cameras that pitch, in normalized units.
 
-    Notes
-    -----
     Sampson's distance: the error of the cross-multiplied equations weighted by its first-order covariance. Errors, depth
     and covariance are linear in products of the coordinates, so one matrix product gives them for all homographies.
     """
@@ -158,8 +156,6 @@ def nearest_poses(image_K: Array, h: Array) -> Array:
     The first two columns of `inv(image_K) @ h` are the ground axes in the camera frame, so they must be orthogonal and
     of equal length. Columns that are zero or parallel give NaN.
 
-    Notes
-    -----
     The polar factor of these two columns is the nearest such matrix in the Frobenius norm (Zhang, 2000, appendix C).
     """
     m = np.linalg.inv(image_K) @ h
@@ -340,8 +336,6 @@ def noise_factors(data: NormalizedCorrespondences, linear: Linearization, parame
 
     `parameters` is the number of fitted parameters, subtracted from the degrees of freedom.
 
-    Notes
-    -----
     Variance components by one step of Fisher scoring of the normal likelihood, with the assumed noise as prior.
     """
     use = linear.squared[0] < CHI2_2DOF_99

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.fit import HomographyFit, PitchRoll
+from log2sim.perception.homography.fit import HomographyFit, PitchRoll, RobustFit
 from log2sim.perception.homography.normalized import (
     Linearization,
     NormalizedCorrespondences,
@@ -28,7 +28,6 @@ from log2sim.perception.homography.normalized import (
     pose_tangent,
     scale_free_basis,
 )
-from log2sim.perception.homography.ransac import RobustFit
 
 # Standard deviations of pitch, as a shift along v, and of roll, before they are estimated.
 PITCH_SIGMA_PX = 4.0
@@ -61,8 +60,6 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     Returns the fit; the image homography of each tick on top of it (T, 3, 3); and the image motions (T, 2, 3, 3) by one standard
     deviation of its two angles. An angle counts among the effective parameters by how little its prior determines it.
 
-    Notes
-    -----
     Each tick's shift starts at the candidate that most of its correspondences agree with. Then Gauss-Newton over the
     homography and all angles, which are coupled only through the homography, so that a tick costs a 2x2 system (Schur's
     complement). Noise and standard deviations of the angles are estimated anew after each step.

@@ -272,8 +272,6 @@ class HeightRows:
 def find_plane(rows: HeightRows, rng: np.random.Generator, samples: int = SAMPLES) -> Array | None:
     """Find the plane (3,) that most rows agree with; None where no three rows span one.
 
-    Notes
-    -----
     As for a single camera, one half of the samples come from single ticks and one half from all, and hypotheses are judged
     over all cameras and ticks by a bounded loss (MSAC, Torr & Zisserman, 2000); then least squares over what agrees.
     """
@@ -310,8 +308,6 @@ def find_plane(rows: HeightRows, rng: np.random.Generator, samples: int = SAMPLE
 def tilt_of_ticks(rows: HeightRows, plane: Array) -> tuple[NDArray[np.int64], Array]:
     """Estimate the slopes of each tick's ground against the plane: ticks (T,), and slopes (T, 2).
 
-    Notes
-    -----
     The slopes have a zero-mean normal prior whose standard deviations are estimated from all ticks (empirical Bayes), so that a
     tick with few rows keeps the plane of all.
     """
@@ -365,8 +361,6 @@ def fit_feet(
 ) -> FeetFit:
     """Fit the two parameters of feet and the rotation of each camera that they ask for, over all cameras and ticks.
 
-    Notes
-    -----
     Gauss-Newton on whitened errors with a bounded loss, from the shift that most feet of a camera agree with. Normal priors
     keep what is not observed at the calibration, such as a camera without feet. With `is_start` False the state is that of an
     earlier fit to the same rows, from which fewer steps lead on.

@@ -58,8 +58,6 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
     `xyz`: (N, 3), m. `center`: (2,), m: in the frame of the points. `z_hint`: expected height at the center, m. Without any
     point the ground is flat at this height.
 
-    Notes
-    -----
     A quadratic surface is fitted to the lowest point of every cell by iteratively reweighted least squares, with
     `z_hint` as an anchor; the smoothed residuals of cells near that surface are added.
     """
@@ -171,8 +169,6 @@ class AzimuthIndex:
 
         `members`: R arrays (n,): rows of each cluster's points in the cloud, at least one.
 
-        Notes
-        -----
         Next to an end of the object, rays at its height reach what lies behind it. If they stop at something nearer, if
         they hit the same surface, or if there are no rays at all, the object may extend beyond what was seen.
         """
@@ -480,8 +476,6 @@ def assemble_views(log: Log, sweeps: Mapping[str, Sweep], **options: Any) -> Clo
     A part holds the vehicle's LiDARs, or those of one place at the road. The options are those of `assemble_cloud`, which
     makes the cloud of a log with one end.
 
-    Notes
-    -----
     The ground is estimated from each viewpoint's own points: between two of them there may be none.
     """
     groups: list[list[str]] = [list(sweeps)]
@@ -592,8 +586,6 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
 def first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
     """Return the indices of the first point of every voxel among points (3, N), in the order of the points.
 
-    Notes
-    -----
     Points are written into a table from the last to the first, each in the place of its voxel, which so holds its first. Voxels
     that share a place with another's are looked up again in other places.
     """
@@ -624,8 +616,6 @@ MAX_REACH_M = 70.0
 def sample_rays(cloud: Cloud) -> Rays:
     """Take a ray of every cell of directions and every sensor of those that end within reach and below what hangs over the road.
 
-    Notes
-    -----
     Cells of directions, unlike voxels, keep the same share of the rays that hit something near and of those that pass it.
     Directions are those from the middle of the sensors of a viewpoint, which does for a sample.
     """
