@@ -19,23 +19,20 @@ from log2sim.simulation.vehicles import vehicle
 class ControllerGains:
     """Gains of the controllers. The defaults are stable with actuator lags of 0.1 s and steps of up to 0.1 s."""
 
-    # along_s, across_s: time constants of the errors along and across the path.
-    along_s: float = 0.6
+    along_s: float = 0.6  # time constants of the errors along and across the path
     across_s: float = 0.6
     across_min_m: float = 1.5  # at walking pace errors decay over this distance, since a car cannot move sideways
     integral_s: float = 4.0
     derivative_filter_s: float = 0.05
     damping: float = 1.0
     point_s: float = 0.3  # time constant of point masses
-    # hold_below_mps, hold_brake_mps2, hold_within_m: the brake holds a vehicle below this speed that has stopped
-    # within this distance; one that stopped earlier drives up.
+    # The brake holds a vehicle below this speed that has stopped within this distance; one that stopped earlier drives up.
     hold_below_mps: float = 0.05
     hold_brake_mps2: float = 2.0
     hold_within_m: float = 0.1
     max_lateral_accel_mps2: float = 9.0  # grip of a dry road
     integral_limit_mps2: float = 1.0
-    # Limit of the lateral integral, as a share of the curvature that steering and grip allow.
-    integral_share: float = 0.2
+    integral_share: float = 0.2  # limit of the lateral integral, of the curvature that steering and grip allow
     max_along_m: float = 3.0  # longest extrapolation along the arc at the reference; limits catching up to 2.5 m/s
 
 

@@ -16,11 +16,9 @@ from log2sim.geometry import Array
 from log2sim.simulation.feasible_trajectory import (
     KNOT_S,
     LOCK_SHARE,
-    MAX_KNOTS,
     FeasibilityLimits,
     FeasibleTrajectory,
     fit_trajectory,
-    unfitted_trajectory,
 )
 from log2sim.simulation.follower import control_step
 from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, parameters_for
@@ -66,7 +64,17 @@ def vehicle_reference(
     course, departure_m = feasible_trajectory_of(trajectory, limits)
     first, t = _grid_times(trajectory)
     motion = _interpolated(course, t)
-    gear, stands = _gears(motion[3])
+    # For every row the gear, +1 or -1, of the present or next movement, and whether the agent stands.
+    speed = motion[3]
+    direction = np.where(np.abs(speed) < REFERENCE_HOLD_MPS, 0, np.sign(speed)).astype(int)
+    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
+    gear, stands, begin = np.ones(len(speed)), np.ones(len(speed)), 0
+    for run in runs:
+        distance_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
+        if direction[run[0]] != 0 and (distance_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
+            gear[begin:] = direction[run[0]]
+            stands[run] = 0.0
+            begin = run[-1] + 1
 
     def rows_at(at_s: Array, motion: Array) -> Array:
         rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
@@ -80,7 +88,15 @@ def vehicle_reference(
     def exact(at_s: Array) -> Array:
         return rows_at(at_s, _interpolated(course, at_s))
 
-    flags = _flags(trajectory, course, departure_m, max_curvature_1pm)
+    flags = _discontinuity_flags(trajectory)
+    for name, values, limit, unit in (
+        ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
+        ("curvature", course.curvature_1pm, max_curvature_1pm, "1/m"),
+        ("distance from what can be driven", departure_m, MAX_DEPARTURE_M, "m"),
+    ):
+        worst = int(np.argmax(np.abs(values)))
+        if abs(values[worst]) > limit:
+            flags += (f"{name} of {values[worst]:.2f} {unit} at {course.t_s[worst]:.2f} s, limit {limit:g}",)
     return Reference(trajectory, first, rows_at(t, motion), exact, limits.offset_m, flags)
 
 
@@ -93,24 +109,19 @@ def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) ->
     pieces, departures = [], []
     for begin, end in pairwise(edges.tolist()):
         # A piece before a discontinuity goes on as it was, and ends just before the time of the next waypoint.
-        until_s = (
-            trajectory.t_s[end - 1]
-            if end == len(trajectory.t_s)
-            else np.nextafter(trajectory.t_s[end], trajectory.t_s[begin])
-        )
-        begin_s = trajectory.t_s[begin]
+        begin_s, until_s = trajectory.t_s[begin], trajectory.t_s[end - 1]
+        if end < len(trajectory.t_s):
+            until_s = np.nextafter(trajectory.t_s[end], begin_s)
         count = max(int(np.ceil((until_s - begin_s) / KNOT_S - 1e-6)), 1) + 1 if until_s > begin_s else 1
         t = np.linspace(begin_s, until_s, count)
         x, y, yaw, speed = trajectory.relative(t)
-        course = (fit_trajectory if 1 < count <= MAX_KNOTS else unfitted_trajectory)(t, x, y, yaw, speed, limits)
+        course = fit_trajectory(t, x, y, yaw, speed, limits)
         pieces.append(course)
         o = limits.offset_m
         center_x, center_y = course.x_m + o * np.cos(course.yaw_rad), course.y_m + o * np.sin(course.yaw_rad)
         departures.append(np.hypot(center_x - x, center_y - y))
-    whole = FeasibleTrajectory(
-        *(np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(FeasibleTrajectory))
-    )
-    return whole, np.concatenate(departures)
+    columns = (np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(FeasibleTrajectory))
+    return FeasibleTrajectory(*columns), np.concatenate(departures)
 
 
 def _interpolated(course: FeasibleTrajectory, t_s: Array) -> Array:
@@ -182,39 +193,8 @@ def _smooth(values: Array) -> Array:
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")
 
 
-def _gears(speed: Array) -> tuple[Array, Array]:
-    """Return for every row the gear, +1 or -1, of the present or next movement, and whether the agent stands."""
-    direction = np.where(np.abs(speed) < REFERENCE_HOLD_MPS, 0, np.sign(speed)).astype(int)
-    runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
-    gear, stands = np.ones(len(speed)), np.ones(len(speed))
-    begin = 0
-    for run in runs:
-        distance_m, peak_mps = np.abs(speed[run]).sum() * GRID_S, np.abs(speed[run]).max()
-        if direction[run[0]] != 0 and (distance_m >= MIN_RUN_M or peak_mps >= MIN_RUN_MPS):
-            gear[begin:] = direction[run[0]]
-            stands[run] = 0.0
-            begin = run[-1] + 1
-    return gear, stands
-
-
 def _discontinuity_flags(trajectory: Trajectory) -> tuple[str, ...]:
     return tuple(f"the scenario is discontinuous at {at:.2f} s" for at in trajectory.discontinuity_times())
-
-
-def _flags(
-    trajectory: Trajectory, course: FeasibleTrajectory, departure_m: Array, max_curvature_1pm: float
-) -> tuple[str, ...]:
-    """Describe what cannot be driven: discontinuities, large distances, acceleration or curvature beyond limits."""
-    flags = list(_discontinuity_flags(trajectory))
-    for name, values, limit, unit in (
-        ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
-        ("curvature", course.curvature_1pm, max_curvature_1pm, "1/m"),
-        ("distance from what can be driven", departure_m, MAX_DEPARTURE_M, "m"),
-    ):
-        worst = int(np.argmax(np.abs(values)))
-        if abs(values[worst]) > limit:
-            flags.append(f"{name} of {values[worst]:.2f} {unit} at {course.t_s[worst]:.2f} s, limit {limit:g}")
-    return tuple(flags)
 
 
 def vehicle_limits(agent: Agent) -> FeasibilityLimits:
@@ -231,13 +211,9 @@ def vehicle_limits(agent: Agent) -> FeasibilityLimits:
 
 def vehicle_reference_of(agent: Agent, dt_s: float) -> Reference:
     """Build a vehicle's table; feed-forward is ahead by the lag of the actuator and half a control step."""
-    limits = vehicle_limits(agent)
+    limits, half_s = vehicle_limits(agent), control_step(dt_s) / 2
+    bends = MAX_CURVATURE_1PM if agent.category in ("car", "truck", "bus") else MAX_TWO_WHEELER_CURVATURE_1PM
     return vehicle_reference(
-        Trajectory.through(agent.waypoints, limits.offset_m),
-        limits,
-        accel_ahead_s=PEDAL_LAG_S + control_step(dt_s) / 2,
-        curvature_ahead_s=STEER_LAG_S + control_step(dt_s) / 2,
-        max_curvature_1pm=MAX_CURVATURE_1PM
-        if agent.category in ("car", "truck", "bus")
-        else MAX_TWO_WHEELER_CURVATURE_1PM,
-    )
+        Trajectory.through(agent.waypoints, limits.offset_m), limits, accel_ahead_s=PEDAL_LAG_S + half_s,
+        curvature_ahead_s=STEER_LAG_S + half_s, max_curvature_1pm=bends,
+    )  # fmt: skip

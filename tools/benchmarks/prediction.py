@@ -15,9 +15,8 @@ from benchmarks.table import markdown
 from log2sim.agents.smooth import MotionModel, smooth_track
 from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import wrap_angle
-from log2sim.simulation.prediction.displacement import CHI2_95
 from log2sim.simulation.prediction.motion_table import MotionTable, table_of
-from log2sim.simulation.prediction.prediction import METHODS, leads_of, predict_table
+from log2sim.simulation.prediction.prediction import CHI2_95, METHODS, leads_of, predict_table
 from log2sim.synth.motion import RoundedPath
 
 Array = NDArray[np.float64]

@@ -36,7 +36,7 @@ class CarlaServer:
 
 
 class CarlaSimulator:
-    """The groups of a replay in a CARLA world; see `log2sim.simulation.simulators.ExternalSimulator`."""
+    """The groups of a replay in a CARLA world; which from then on only decide their controls; a step of the replay is one tick."""
 
     name = "carla"
     max_dt_s = 0.1  # as far as CARLA's physics goes with its substeps

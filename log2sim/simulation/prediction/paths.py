@@ -13,6 +13,8 @@ from log2sim.datatypes import GROUP_OF
 from log2sim.geometry import Array
 from log2sim.simulation.prediction.motion_table import MIN_COURSE_MPS, Complex, MotionTable
 
+Index = NDArray[np.intp]
+
 SPACING_M = 0.5
 """Of the points of a path: the middle of a chord on a circle of 6 m is 5 mm off."""
 
@@ -46,9 +48,7 @@ class Paths:
 
     point_m: Complex  # (N,) m, map frame
     direction: Complex  # (N,) unit vectors of travel
-    distance_m: (
-        Array  # (N,) along the path; of the next path it goes on from the end of the one before, so that it rises
-    )
+    distance_m: Array  # (N,) along the path; of the next path it goes on from the end of the one before: it rises
     path: NDArray[np.intp]  # (N,)
     known_s: Array  # (N,) s, when an agent was there; minus infinity on lanes, which are known beforehand
     agent: NDArray[np.intp]  # (N,) row of the agent that was there; -1 on lanes
@@ -68,10 +68,12 @@ class Paths:
                     parts.append((*part, k, kind_of(agent.category)))
         parts = [part for part in parts if len(part[0]) > 1]
         counts = [len(part[0]) for part in parts]
+        # The direction of a point is that of the step to it; of the first, of the step from it.
+        steps = [np.diff(part[0])[np.maximum(np.arange(-1, len(part[0]) - 1), 0)] for part in parts]
         starts = np.cumsum([0.0, *(part[1][-1] + SPACING_M for part in parts)])
         return cls(
             np.concatenate([np.zeros(0, dtype=complex), *(part[0] for part in parts)]),
-            np.concatenate([np.zeros(0, dtype=complex), *(_directions(part[0]) for part in parts)]),
+            np.concatenate([np.zeros(0, dtype=complex), *(step / np.abs(step) for step in steps)]),
             np.concatenate([np.zeros(0), *(start + part[1] for start, part in zip(starts, parts))]),
             np.repeat(np.arange(len(parts)), counts),
             np.concatenate([np.zeros(0), *(part[2] for part in parts)]),
@@ -79,82 +81,49 @@ class Paths:
             np.repeat(np.array([part[4] for part in parts], dtype=np.intp), counts),
         )
 
-    def ends_at(self, row: NDArray[np.intp], t_s: Array) -> Array:
-        """Compute up to where the paths of points (Q,) were known at times (Q,): `distance_m` (Q,)."""
-        late_s = np.nan_to_num(self.known_s, neginf=0.0)
-        span = float(np.ptp(late_s)) + 1.0 if len(late_s) else 1.0
-        key = self.path * span + np.where(np.isfinite(self.known_s), self.known_s - late_s.min(), 0.0)
-        asked = self.path[row] * span + np.clip(t_s - late_s.min(), 0.0, span - 0.5)
-        return np.asarray(self.distance_m[np.searchsorted(key, asked, side="right") - 1])
 
+def follow(
+    paths: Paths, table: MotionTable, at: tuple[Index, ...], course: Complex, speed_mps: Array, lead_s: Array
+) -> tuple[Complex, Complex]:
+    """Compute positions, m, and courses, (N, H) complex128, of agents along the paths that they are on, after leads (H,), s.
 
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Where Q agents are on paths."""
-
-    row: NDArray[np.intp]  # (Q,) of the nearest point; -1 where there is no path
-    distance_m: Array  # (Q,) along the path
-    aside_m: Array  # (Q,) to the left of it
-    end_m: Array  # (Q,) up to where the path was known
-
-
-@dataclass(frozen=True, eq=False)
-class Seekers:
-    """Q agents that look for the paths that they are on."""
-
-    position_m: Complex  # (Q,) box centers, m, map frame
-    direction: Complex  # (Q,) unit vectors of the courses; NaN where the course is unknown
-    t_s: Array  # (Q,)
-    agent: NDArray[np.intp]  # (Q,) rows of the agents
-    kind: NDArray[np.intp]  # (Q,) of the agents, see `kind_of`
-
-
-def locate(paths: Paths, seekers: Seekers) -> Places:
-    """Find the path that each of Q agents is on, of those that others of its kind had made by then."""
+    Each agent, at a row and tick of the table `at` (N,), (N,), follows a path that others of its kind had made by then, or a
+    lane. `course` (N,): unit vectors, NaN where it is unknown. NaN without a path, and beyond where it was known.
+    """
     from scipy.spatial import cKDTree
 
-    chosen = np.full(len(seekers.t_s), -1)
-    distance, aside = np.full(len(chosen), np.nan), np.full(len(chosen), np.nan)
-    asked = np.flatnonzero(np.isfinite(seekers.direction))
-    if not len(paths.point_m) or not len(asked):
-        return Places(chosen, distance, aside, distance)
-    position, direction = seekers.position_m[asked, None], seekers.direction[asked, None]
+    point = np.full((len(course), len(lead_s)), np.nan, dtype=complex)
+    heading, count, asked = point.copy(), min(NEIGHBORS, len(paths.point_m)), np.flatnonzero(np.isfinite(course))
+    if not count or not len(asked):
+        return point, heading
+    agent, t_s = at[0][asked, None], table.t_s[at[1]][asked, None]
+    position, direction = table.position_m[at][asked, None], course[asked, None]
     tree = cKDTree(_features(paths.point_m, paths.direction))
-    count = min(NEIGHBORS, len(paths.point_m))
     _, near = tree.query(_features(position[:, 0], direction[:, 0]), count, distance_upper_bound=TURN_M)
     near = near.reshape(-1, count)
     row = np.minimum(near, len(paths.point_m) - 1)
     offset = (position - paths.point_m[row]) * paths.direction[row].conj()
-    usable = (near < len(paths.point_m)) & (paths.known_s[row] <= seekers.t_s[asked, None])
-    usable &= paths.agent[row] != seekers.agent[asked, None]
-    kind = seekers.kind[asked, None]
+    usable = (near < len(paths.point_m)) & (paths.known_s[row] <= t_s) & (paths.agent[row] != agent)
+    kind = np.array([kind_of(a.category) for a in table.agents], dtype=np.intp)[agent]
     usable &= (paths.kind[row] == kind) | (paths.kind[row] == VEHICLES) & (kind == RIDERS)
     usable &= (np.abs(offset.imag) < MAX_ASIDE_M) & (np.abs(offset.real) <= SPACING_M)
     usable &= (direction * paths.direction[row].conj()).real > MIN_COS
-    pick = np.arange(len(asked)), usable.argmax(axis=1)
-    chosen[asked] = np.where(usable[pick], row[pick], -1)
-    distance[asked], aside[asked] = paths.distance_m[row[pick]] + offset[pick].real, offset[pick].imag
-    return Places(chosen, distance, aside, paths.ends_at(np.maximum(chosen, 0), seekers.t_s))
-
-
-def follow(paths: Paths, places: Places, speed_mps: Array, lead_s: Array) -> tuple[Complex, Complex]:
-    """Compute positions, m, and courses, (Q, H) complex128, of agents with speeds (Q,), m/s, after leads (H,), s.
-
-    NaN beyond where a path was known.
-    """
-    on = places.row >= 0
-    ahead = places.distance_m[:, None] + speed_mps[:, None] * lead_s
-    point = np.full(ahead.shape, np.nan, dtype=complex)
-    heading = point.copy()
-    if not on.any():
-        return point, heading
-    begin, end = paths.distance_m[places.row[on], None], places.end_m[on, None]
-    inside = np.clip(ahead[on], begin, end)
-    heading[on] = paths.direction[np.searchsorted(paths.distance_m, inside)]
-    point[on] = np.interp(inside, paths.distance_m, paths.point_m)
-    point[on] += heading[on] * (1j * places.aside_m[on, None] + ahead[on] - inside)
-    known = ahead <= np.where(on, places.end_m, -np.inf)[:, None] + MAX_BEYOND_M
-    return np.where(known, point, np.nan), np.where(known, heading, np.nan)
+    pick = np.flatnonzero(usable.any(axis=1)), usable.argmax(axis=1)[usable.any(axis=1)]
+    on, row, offset, t_s = asked[pick[0]], row[pick], offset[pick], t_s[pick[0], 0]
+    # Up to where each path was known at these times.
+    late_s = np.nan_to_num(paths.known_s, neginf=0.0)
+    span, first_s = float(np.ptp(late_s)) + 1.0, late_s.min()
+    key = paths.path * span + np.where(np.isfinite(paths.known_s), paths.known_s - first_s, 0.0)
+    wanted = paths.path[row] * span + np.clip(t_s - first_s, 0.0, span - 0.5)
+    end = paths.distance_m[np.searchsorted(key, wanted, side="right") - 1][:, None]
+    ahead = (paths.distance_m[row] + offset.real)[:, None] + speed_mps[on, None] * lead_s
+    inside = np.clip(ahead, paths.distance_m[row, None], end)
+    way = paths.direction[np.searchsorted(paths.distance_m, inside)]
+    place = np.interp(inside, paths.distance_m, paths.point_m)
+    place = place + way * (1j * offset.imag[:, None] + ahead - inside)
+    known = ahead <= end + MAX_BEYOND_M
+    point[on], heading[on] = np.where(known, place, np.nan), np.where(known, way, np.nan)
+    return point, heading
 
 
 def _features(position_m: Complex, direction: Complex) -> Array:
@@ -173,10 +142,3 @@ def _resampled(point_m: Complex, known_s: Array) -> tuple[Complex, Array, Array]
     if len(known_s) > 1:
         known_s[0] = known_s[1]  # its direction is that of the step to the second point
     return np.interp(at, way, point_m), at, known_s
-
-
-def _directions(point_m: Complex) -> Complex:
-    """Return unit vectors of the steps to the points of a path; at the first, of the step from it."""
-    step = np.diff(point_m)
-    step = np.append(step[:1], step)
-    return np.asarray(step / np.abs(step))

@@ -1,4 +1,4 @@
-"""Short predictions of every agent at every tick, by several methods, with their spread."""
+"""Short predictions of every agent at every tick, by several methods, with their spread, and how far they are off."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Scenario
+from log2sim.datatypes import CATEGORIES, EGO, GROUP_OF, STANDSTILL_MPS, Scenario
 from log2sim.errors import ConfigError
-from log2sim.files.documents import short_repr
+from log2sim.files.documents import rounded, short_repr
 from log2sim.geometry import Array
 from log2sim.simulation.prediction.motion_table import (
     MIN_COURSE_MPS,
@@ -25,7 +25,7 @@ from log2sim.simulation.prediction.motion_table import (
     table_of,
     turn_rates,
 )
-from log2sim.simulation.prediction.paths import Paths, Seekers, follow, kind_of, locate
+from log2sim.simulation.prediction.paths import Paths, follow
 
 
 class Restlessness(NamedTuple):
@@ -77,18 +77,13 @@ def usual_sigma(table: MotionTable, lead_s: Array) -> Array:
     moving, waiting = (
         np.array([kind[g] for g in groups], dtype=np.float64).reshape(-1, 1, 2) for kind in (MOVING, WAITING)
     )
-    stands = speed < STANDSTILL_MPS
-    patience = np.sqrt(WAITING_S / (WAITING_S + _lasting(stands, table) * table.tick_s))
+    stands, ticks = speed < STANDSTILL_MPS, np.arange(speed.shape[1])
+    since = np.maximum.accumulate(np.where(~stands | table.begins, ticks, 0), axis=1)
+    stood_s = np.where(stands, ticks - since, 0) * table.tick_s
+    patience = np.sqrt(WAITING_S / (WAITING_S + stood_s))
     acceleration = np.where(stands[..., None], waiting * patience[..., None], moving)
     variance = drift_variance(lead_s)[:, None] * acceleration[:, :, None] ** 2
     return np.asarray(np.sqrt(table.sigma_m[..., None, None] ** 2 + variance))
-
-
-def _lasting(state: NDArray[np.bool_], table: MotionTable) -> NDArray[np.intp]:
-    """For how many ticks (A, T) a state has lasted; 0 where it is not so."""
-    ticks = np.arange(state.shape[1])
-    since = np.maximum.accumulate(np.where(~state | table.begins, ticks, 0), axis=1)
-    return np.where(state, ticks - since, 0)
 
 
 def own_scale(table: MotionTable, error_m: Complex, course: Complex, sigma_m: Array, ticks: int) -> Array:
@@ -103,18 +98,17 @@ def own_scale(table: MotionTable, error_m: Complex, course: Complex, sigma_m: Ar
     squared = (off.real / sigma_m[..., 0]) ** 2 + (off.imag / sigma_m[..., 1]) ** 2
     moves = np.abs(np.where(table.present, table.velocity_mps, 0.0)) >= STANDSTILL_MPS
     known = np.isfinite(squared) & moves
-    sums = [_known_sums(np.where(known, v, 0.0), table, ticks) / ticks for v in (squared, 2.0)]
+    # Sums within each piece, up to the tick after which each error is known.
+    ticks_on = np.arange(squared.shape[1])
+    start = np.maximum.accumulate(np.where(table.begins, ticks_on, 0), axis=1)
+    sums = []
+    for value in (squared, 2.0):
+        total = np.zeros_like(squared)
+        total[:, ticks:] = np.cumsum(np.where(known, value, 0.0), axis=1)[:, : max(len(ticks_on) - ticks, 0)]
+        sums.append((total - np.take_along_axis(total, start, axis=1)) / ticks)
     usual = 2.0 * USUAL_SPREAD_ERRORS
     scale = np.sqrt(np.maximum((usual + sums[0]) / (usual + sums[1]), MIN_SCALE))
     return np.where(moves, scale, 1.0)
-
-
-def _known_sums(value: Array, table: MotionTable, ticks: int) -> Array:
-    """Sum values (A, T) within each piece, up to the tick after which each is known."""
-    total = np.zeros_like(value)
-    total[:, ticks:] = np.cumsum(value, axis=1)[:, : value.shape[1] - ticks] if ticks < value.shape[1] else 0.0
-    start = np.maximum.accumulate(np.where(table.begins, np.arange(value.shape[1]), 0), axis=1)
-    return np.asarray(total - np.take_along_axis(total, start, axis=1))
 
 
 METHODS: Mapping[str, str] = {
@@ -220,87 +214,166 @@ def predict_table(
     for name in methods:
         if name not in METHODS:
             raise ConfigError(f"method: '{name}' is not known; known: {', '.join(METHODS)}")
-    present = _Present(table, *np.nonzero(table.present))
+    at = row, tick = np.nonzero(table.present)
     smooth = smooth_motion(table)
-    latest, velocity = present.of(table.velocity_mps), present.of(smooth.velocity_mps)
-    motions = {
-        "velocity": (latest, np.zeros(len(latest))),
-        "turn": (latest, present.of(turn_rates(table))),
-        "smoothed": (velocity, present.of(smooth.turn_radps)),
-    }
+    latest, smoothed = table.velocity_mps[at], (smooth.velocity_mps[at], smooth.turn_radps[at])
+    motions = {"velocity": (latest, np.zeros(len(latest))), "turn": (latest, turn_rates(table)[at])}
     # The last lead is that by which the past is judged.
-    leads = np.append(lead_s, PROOF_S)
+    leads, ticks = np.append(lead_s, PROOF_S), round(PROOF_S / table.tick_s)
+    usual, (later, observed) = usual_sigma(table, leads), table.later(ticks)
     known = np.zeros(len(latest), dtype=bool)
     forecasts = {}
     for name in methods:
-        way = _turn_on(present, *motions[name if name in motions else "smoothed"], leads)
-        if name == "path":
-            paths = Paths.driven(table, lanes)
-            way, known = _drawn_to_paths(present, way, np.abs(velocity), paths, leads)
-        forecasts[name] = _with_sigma(present, way, lead_s)
-    return Predictions(table, lead_s, present.row, present.tick, forecasts, present.of(smooth.constants_s), known)
+        velocity, turn = motions.get(name, smoothed)
+        speed, heading = np.abs(velocity), np.exp(1j * table.yaw_rad[at])
+        fast = speed > MIN_COURSE_MPS
+        heading[fast] = velocity[fast] / speed[fast]
+        position = table.position_m[at][:, None] + displacement(velocity[:, None], turn[:, None], leads)
+        course = heading[:, None] * np.exp(1j * turn[:, None] * leads)
+        if name == "path":  # averaged with the way along a path by their variances across
+            seen = np.where(fast, course[:, 0], np.nan)
+            point, direction = follow(Paths.driven(table, lanes), table, at, seen, speed, leads)
+            there, free = np.isfinite(point), usual[at][..., 1] ** 2
+            share = np.where(there, free / (free + PATH_SIGMA_M**2), 0.0)
+            position = position + share * np.where(there, point - position, 0.0)
+            course = course + share * np.where(there, direction - course, 0.0)
+            course, known = course / np.abs(course), np.asarray(there.any(axis=1))
+        error, judged = np.full(later.shape, np.nan, dtype=complex), np.ones(later.shape, dtype=complex)
+        error[at], judged[at] = position[:, -1] - later[at], course[:, -1]
+        scale = own_scale(table, np.where(observed, error, np.nan), judged, usual[:, :, -1], ticks)
+        sigma = usual[at][:, :-1] * scale[at][:, None, None]
+        forecasts[name] = Forecast(position[:, :-1], course[:, :-1], sigma)
+    return Predictions(table, lead_s, row, tick, forecasts, smooth.constants_s[at], known)
 
 
-class _Present(NamedTuple):
-    """Where agents are present in a table: row (N,) and tick (N,)."""
+MOTIONS = ("moving", "standing")
+"""Whether an agent is faster than `STANDSTILL_MPS` when it is predicted."""
 
-    table: MotionTable
-    row: NDArray[np.intp]
-    tick: NDArray[np.intp]
-
-    def of(self, column: NDArray[Any]) -> NDArray[Any]:
-        """Take the values (N, ...) of a column (A, T, ...)."""
-        return column[self.row, self.tick]
+CHI2_95 = 5.991
+"""95 % quantile of chi-squared with two degrees of freedom."""
 
 
-class _Way(NamedTuple):
-    """Predicted positions and courses (N, H)."""
+def measure_predictions(predictions: Predictions) -> list[dict[str, Any]]:
+    """Return the `figures` of a document of `schemas/prediction-1.json`, by kind of agent and motion.
 
-    position_m: Complex
-    course: Complex
+    Compared with the trajectories of their agents are ticks at which an agent was observed, with positions at which it was
+    observed too. Agents that the scenario says never move are left out: it keeps one pose for each, so that nothing can be off.
+    ADE is the mean distance over all leads up to one, FDE the distance at it (Pellegrini et al., ICCV 2009). NEES is the mean
+    squared error over the squared sigma for each axis, 1 when sigmas are honest.
+    """
+    table, row, tick = predictions.table, predictions.row, predictions.tick
+    # Where agents were (N, H) at the predicted times, and whether they were observed then and at the prediction.
+    truth = np.full((len(row), len(predictions.lead_s)), np.nan, dtype=complex)
+    seen = np.zeros(truth.shape, dtype=bool)
+    for h, lead in enumerate(predictions.lead_s):
+        position, observed = table.later(round(lead / table.tick_s))
+        truth[:, h], seen[:, h] = position[row, tick], observed[row, tick]
+    category = np.array([a.category for a in table.agents], dtype=object)[row]
+    is_ego = np.array([a.id == EGO for a in table.agents], dtype=bool)[row]
+    mobile = ~np.array([a.static for a in table.agents], dtype=bool)[row]
+    moving = np.abs(table.velocity_mps[row, tick]) >= STANDSTILL_MPS
+    kinds: list[tuple[str, Any]] = [("all", ~is_ego), *((c, ~is_ego & (category == c)) for c in CATEGORIES)]
+    out = []
+    for name, chosen in [*kinds, ("ego", is_ego), ("on a path", predictions.on_path)]:
+        for motion, there in zip(MOTIONS, (moving, ~moving)):
+            rows, methods = np.flatnonzero(chosen & mobile & there), {}
+            for method, forecast in predictions.forecasts.items():
+                error = (truth[rows] - forecast.position_m[rows]) * forecast.course[rows].conj()
+                figures = _figures(predictions, error, forecast, rows, seen[rows])
+                if figures:
+                    methods[method] = figures
+            if methods:
+                out.append({"agents": name, "motion": motion, "methods": methods})
+    return out
 
 
-def _turn_on(present: _Present, velocity: Complex, turn: Array, lead_s: Array) -> _Way:
-    """Move on with velocities (N,) that turn at rates (N,)."""
-    speed = np.abs(velocity)
-    course = np.exp(1j * present.of(present.table.yaw_rad))
-    fast = speed > MIN_COURSE_MPS
-    course[fast] = velocity[fast] / speed[fast]
-    position = present.of(present.table.position_m)[:, None] + displacement(velocity[:, None], turn[:, None], lead_s)
-    return _Way(position, course[:, None] * np.exp(1j * turn[:, None] * lead_s))
+def _figures(
+    predictions: Predictions,
+    error: NDArray[np.complex128],
+    forecast: Forecast,
+    rows: NDArray[np.intp],
+    seen: NDArray[np.bool_],
+) -> list[dict[str, Any]]:
+    """Compute the figures of errors (K, H) in the frames of the predicted courses; one entry for each lead with any."""
+    out = []
+    distance, lead_s = np.abs(error), predictions.lead_s
+    whole = np.isclose(lead_s, np.rint(lead_s)) | (np.arange(len(lead_s)) == len(lead_s) - 1)
+    for h in np.flatnonzero(whole).tolist():  # whole seconds and the horizon
+        there = seen[:, h]
+        if not there.any():
+            continue
+        sigma = forecast.sigma_m[rows[there], h]
+        off = np.stack([error[there, h].real, error[there, h].imag], axis=-1)
+        known = (sigma > 0).all(axis=1)
+        squared = ((off[known] / sigma[known]) ** 2).sum(axis=1)
+        upto = seen[there, : h + 1]
+        ade_m, fde_m = distance[there, : h + 1][upto].mean(), distance[there, h].mean()
+        nees, within = (squared.mean() / 2, (squared < CHI2_95).mean()) if known.any() else (None, None)
+        agents = len(np.unique(predictions.row[rows[there]]))
+        figures = {"ade_m": ade_m, "fde_m": fde_m, "nees": nees, "within_95": within}
+        out.append({
+            "lead_s": round(float(lead_s[h]), 3), "ticks": int(there.sum()), "agents": agents,
+            **{key: None if value is None else rounded(float(value), 4) for key, value in figures.items()},
+        })  # fmt: skip
+    return out
 
 
-def _drawn_to_paths(
-    present: _Present, way: _Way, speed_mps: Array, paths: Paths, lead_s: Array
-) -> tuple[_Way, NDArray[np.bool_]]:
-    """Average a way with that along a path by their variances across; and tell where a path is known (N,)."""
-    table = present.table
-    kinds = np.array([kind_of(a.category) for a in table.agents], dtype=np.intp)
-    seekers = Seekers(
-        present.of(table.position_m),
-        np.where(speed_mps > MIN_COURSE_MPS, way.course[:, 0], np.nan),
-        table.t_s[present.tick],
-        present.row,
-        kinds[present.row],
+VERSION = 1
+
+_DIGITS = 3
+
+
+def prediction_document(
+    scenario: Scenario, predictions: Predictions, *, with_positions: bool = False
+) -> dict[str, Any]:
+    """Return the document of `schemas/prediction-1.json`; the predicted positions only where asked for."""
+    table, agents, positions = predictions.table, [], []
+    for agent in table.agents:
+        rows = predictions.rows_of(agent.id)
+        # The time constants that its whole past chose; null without predictions, or for infinity.
+        chosen = predictions.constants_s[rows[-1]] if len(rows) else np.full(2, np.inf)
+        velocity_s, turn_s = (float(c) if np.isfinite(c) else None for c in chosen)
+        agents.append({
+            "id": agent.id, "category": agent.category, "ticks": len(rows), "velocity_constant_s": velocity_s,
+            "turn_constant_s": turn_s,
+        })  # fmt: skip
+        methods = {}
+        for name, forecast in predictions.forecasts.items() if with_positions else ():  # a row a tick, a column a lead
+            position, sigma = forecast.position_m[rows], forecast.sigma_m[rows]
+            columns = {
+                "x_m": position.real, "y_m": position.imag, "course_rad": np.angle(forecast.course[rows]),
+                "sigma_along_m": sigma[:, :, 0], "sigma_across_m": sigma[:, :, 1],
+            }  # fmt: skip
+            methods[name] = {key: np.round(values, _DIGITS).tolist() for key, values in columns.items()}
+        t_s = np.round(table.t_s[predictions.tick[rows]], _DIGITS).tolist()
+        positions.append({"id": agent.id, "t_s": t_s, "methods": methods})
+    document = {
+        "prediction_version": VERSION, "scenario": scenario.name, "scenario_sha256": scenario.digest,
+        "tick_s": table.tick_s, "lead_s": [round(float(lead), _DIGITS) for lead in predictions.lead_s],
+        "methods": {name: METHODS[name] for name in predictions.forecasts}, "agents": agents,
+        "figures": measure_predictions(predictions),
+    }  # fmt: skip
+    return {**document, "predictions": positions} if with_positions else document
+
+
+def format_figures(document: dict[str, Any]) -> str:
+    """Format the figures of a document: a line for each kind of agent, motion and method."""
+    lead_s = sorted({f["lead_s"] for entry in document["figures"] for m in entry["methods"].values() for f in m})
+    if not lead_s:
+        return "nothing to compare with: no agent is observed for a second or longer"
+    heads = [f"{name} {lead:g} s" for name in ("ADE", "FDE") for lead in lead_s]
+    cells = [["errors in m", "method", *heads, "NEES", "in 95 %", "ticks"]]
+    for entry in document["figures"]:
+        name = f"{entry['agents']}, {entry['motion']}"
+        for method, figures in entry["methods"].items():
+            at = {f["lead_s"]: f for f in figures}
+            errors = [f"{at[s][key]:.2f}" if s in at else "-" for key in ("ade_m", "fde_m") for s in lead_s]
+            last = figures[-1]
+            honest = ["-" if last[key] is None else f"{last[key]:.2f}" for key in ("nees", "within_95")]
+            cells.append([name, method, *errors, *honest, str(last["ticks"])])
+            name = ""
+    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
+    return "\n".join(
+        "  ".join([*(c.ljust(w) for c, w in zip(row[:2], widths)), *(c.rjust(w) for c, w in zip(row[2:], widths[2:]))])
+        for row in cells
     )
-    point, heading = follow(paths, locate(paths, seekers), speed_mps, lead_s)
-    known = np.isfinite(point)
-    free_variance = present.of(usual_sigma(table, lead_s))[..., 1] ** 2
-    share = np.where(known, free_variance / (free_variance + PATH_SIGMA_M**2), 0.0)
-    position = way.position_m + share * np.where(known, point - way.position_m, 0.0)
-    course = way.course + share * np.where(known, heading - way.course, 0.0)
-    return _Way(position, course / np.abs(course)), np.asarray(known.any(axis=1))
-
-
-def _with_sigma(present: _Present, way: _Way, lead_s: Array) -> Forecast:
-    """Add standard deviations to a way whose last lead is `PROOF_S`."""
-    table, shape = present.table, present.table.position_m.shape
-    ticks = round(PROOF_S / table.tick_s)
-    usual = usual_sigma(table, np.append(lead_s, PROOF_S))
-    later, observed = table.later(ticks)
-    error, course = np.full(shape, np.nan, dtype=complex), np.ones(shape, dtype=complex)
-    error[present.row, present.tick] = way.position_m[:, -1] - present.of(later)
-    course[present.row, present.tick] = way.course[:, -1]
-    scale = own_scale(table, np.where(observed, error, np.nan), course, usual[:, :, -1], ticks)
-    sigma = present.of(usual)[:, :-1] * present.of(scale)[:, None, None]
-    return Forecast(way.position_m[:, :-1], way.course[:, :-1], sigma)

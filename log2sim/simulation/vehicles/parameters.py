@@ -26,16 +26,14 @@ MAX_JERK_MPS3 = 60.0
 class VehicleProportions(NamedTuple):
     """Proportions and limits of the vehicles of a category."""
 
-    # wheelbase, rear_axle: as shares of the length; the rear axle behind the box center.
-    wheelbase: float
-    rear_axle: float
+    wheelbase: float  # as a share of the length
+    rear_axle: float  # likewise, behind the box center
     max_steer_rad: float
     max_throttle_mps2: float
     max_brake_mps2: float
     cg_to_rear: float  # of the wheelbase: the share of the weight on the front axle
     cg_height: float  # of the height
-    # front_stiffness_1prad, rear_stiffness_1prad: cornering stiffness over load and friction.
-    front_stiffness_1prad: float
+    front_stiffness_1prad: float  # cornering stiffness over load and friction
     rear_stiffness_1prad: float
     friction: float
 
@@ -104,10 +102,9 @@ def parameters_for(agents: Sequence[Agent], *, published: bool = False) -> Vehic
     Yaw inertia over mass is the product of the distances from the center of gravity to the axles, which holds for the
     published vehicles within 10 %.
     """
-    kind = np.array([_PROPORTIONS[a.category] for a in agents], dtype=np.float64).reshape(
-        -1, len(VehicleProportions._fields)
-    )
-    share = dict(zip(VehicleProportions._fields, kind.T))
+    names = VehicleProportions._fields
+    kind = np.array([_PROPORTIONS[a.category] for a in agents], dtype=np.float64).reshape(-1, len(names))
+    share = dict(zip(names, kind.T))
     length_m, _, height_m = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3).T
     wheelbase_m = share["wheelbase"] * length_m
     cg_to_rear_m = share["cg_to_rear"] * wheelbase_m
@@ -134,21 +131,12 @@ def published_parameters(vehicle: int, *, rear_axle_offset_m: float) -> VehicleP
     """Return the parameters (1,) of a published vehicle, with the actuator lags of all others."""
     v = PUBLISHED[vehicle]
     values = {
-        "wheelbase_m": v.cg_to_front_m + v.cg_to_rear_m,
-        "rear_axle_offset_m": rear_axle_offset_m,
-        "max_steer_rad": v.max_steer_rad,
-        "max_steer_rate_radps": PUBLISHED_STEER_RATE_RADPS,
-        "steer_lag_s": STEER_LAG_S,
-        "max_throttle_mps2": PUBLISHED_MAX_ACCEL_MPS2,
-        "max_brake_mps2": PUBLISHED_MAX_ACCEL_MPS2,
-        "max_jerk_mps3": MAX_JERK_MPS3,
-        "pedal_lag_s": PEDAL_LAG_S,
-        "cg_to_rear_m": v.cg_to_rear_m,
-        "cg_height_m": v.cg_height_m,
-        "gyration_m2": v.inertia_kgm2 / v.mass_kg,
-        "front_stiffness_1prad": PUBLISHED_STIFFNESS_1PRAD,
-        "rear_stiffness_1prad": PUBLISHED_STIFFNESS_1PRAD,
-        "friction": PUBLISHED_FRICTION,
-        "understeer_s2pm2": 0.0,  # the axles' stiffness is the same
-    }
+        "wheelbase_m": v.cg_to_front_m + v.cg_to_rear_m, "rear_axle_offset_m": rear_axle_offset_m,
+        "max_steer_rad": v.max_steer_rad, "max_steer_rate_radps": PUBLISHED_STEER_RATE_RADPS,
+        "steer_lag_s": STEER_LAG_S, "max_throttle_mps2": PUBLISHED_MAX_ACCEL_MPS2,
+        "max_brake_mps2": PUBLISHED_MAX_ACCEL_MPS2, "max_jerk_mps3": MAX_JERK_MPS3, "pedal_lag_s": PEDAL_LAG_S,
+        "cg_to_rear_m": v.cg_to_rear_m, "cg_height_m": v.cg_height_m, "gyration_m2": v.inertia_kgm2 / v.mass_kg,
+        "front_stiffness_1prad": PUBLISHED_STIFFNESS_1PRAD, "rear_stiffness_1prad": PUBLISHED_STIFFNESS_1PRAD,
+        "friction": PUBLISHED_FRICTION, "understeer_s2pm2": 0.0,  # the axles' stiffness is the same
+    }  # fmt: skip
     return VehicleParameters(**{k: np.array([value], dtype=np.float64) for k, value in values.items()})

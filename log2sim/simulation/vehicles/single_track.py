@@ -3,8 +3,6 @@
 Slip angles relax at a rate of about 200 / v per second, so equations with 1 / v are stiff at walking pace and singular
 at standstill. Here they are multiplied by the speed, and each step solves for the slips at its end: at standstill the
 equation of the slips becomes "no slip", which is the kinematic bicycle, and no threshold speed is needed.
-
-As in `single_track`, each step solves for the slips at its end, in a form that stays regular at standstill.
 """
 
 from __future__ import annotations
@@ -32,10 +30,8 @@ from log2sim.simulation.vehicles.vehicle import (
 )
 
 MAX_INNER_STEP_S = 0.01  # longest step of the integrator; the error is of second order
-# Of the singly diagonally implicit Runge-Kutta method of two stages that is L-stable and of second order (Alexander,
-# 1977).
+# Of the singly diagonally implicit Runge-Kutta method of two stages, L-stable and of second order (Alexander, 1977).
 GAMMA = 1 - math.sqrt(0.5)
-
 STAGE_WEIGHT = (1 - GAMMA) / GAMMA
 
 MAX_LOAD_TRANSFER_SHARE = 0.9  # largest share of an axle's load that acceleration and braking may transfer
@@ -83,11 +79,10 @@ def step_single_track(
 class Chassis:
     """Lateral acceleration of the axles per lateral force and mass: of the rear by the rear, of either by the other, of the front."""
 
-    # rear, cross, front: (A,)
-    rear: Array
+    rear: Array  # all (A,)
     cross: Array
     front: Array
-    cg_to_front_m: Array  # (A,)
+    cg_to_front_m: Array
 
     @classmethod
     def of(cls, p: VehicleParameters) -> Chassis:
@@ -99,13 +94,11 @@ class Chassis:
 
 @dataclass(frozen=True, eq=False)
 class StepInput:
-    """Inputs of one step of the linear model."""
+    """Inputs of one step of the linear model, all (A,)."""
 
-    # speed0_mps, speed1_mps: (A,) at the begin and the end.
-    speed0_mps: Array
+    speed0_mps: Array  # at the begin and the end
     speed1_mps: Array
-    distance_m: Array  # (A,)
-    # steer0_rad, mean_steer_rad, steer1_rad: (A,)
+    distance_m: Array
     steer0_rad: Array
     mean_steer_rad: Array
     steer1_rad: Array
@@ -203,9 +196,7 @@ def step_dynamic(
     p, chassis = parameters, Chassis.of(parameters)
     count, h = inner_steps(dt_s)
     actuators, target, lag_s, max_rate = actuation(state, controls, p)
-    grip = ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
-    body = state
-    bend = np.tan(state.steer_rad)
+    body, bend, grip = state, np.tan(state.steer_rad), ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
     for _ in range(count):
         bend0 = bend
         actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
@@ -218,13 +209,11 @@ def step_dynamic(
 
 @dataclass(frozen=True, eq=False)
 class DriveInput:
-    """Inputs of one step of the saturating model."""
+    """Inputs of one step of the saturating model, all (A,)."""
 
-    # pedal_mps2, gear: (A,)
     pedal_mps2: Array
     gear: Array
-    # bend0, mean_bend, bend1: (A,) tangent of the steering angle at the begin, on average and at the end.
-    bend0: Array
+    bend0: Array  # tangent of the steering angle at the begin, on average and at the end
     mean_bend: Array
     bend1: Array
 

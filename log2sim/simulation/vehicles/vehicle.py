@@ -8,6 +8,7 @@ the heading.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -52,9 +53,9 @@ class VehicleState(Columns):
     speed_mps: Array  # (A,) negative in reverse
     steer_rad: Array  # (A,)
     pedal_mps2: Array  # (A,) throttle (positive) or brake (negative), in either gear
-    # lateral_mps, yaw_rate_radps: (A,) velocity of the rear axle to the left and yaw rate: states of the models with
-    # slip only.
-    lateral_mps: Array
+    lateral_mps: (
+        Array  # (A,) velocity of the rear axle to the left; likewise `yaw_rate_radps`, of models with slip only
+    )
     yaw_rate_radps: Array
 
 
@@ -65,6 +66,10 @@ class VehicleControls(Columns):
     pedal_mps2: Array  # (A,) positive throttle, negative brake
     steer_rad: Array  # (A,)
     reverse: NDArray[np.bool_]  # (A,) the gear, which engages at standstill
+
+
+VehicleStep = Callable[["VehicleState", "VehicleControls", "VehicleParameters", float], "VehicleState"]
+"""Moves vehicles for so many s with constant controls; no argument is changed."""
 
 
 class Actuators(NamedTuple):
@@ -78,10 +83,10 @@ class Actuators(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VehicleParameters(Columns):
-    """Size and limits of vehicles, all positive."""
+    """Size and limits of vehicles, all positive and (A,)."""
 
-    wheelbase_m: Array  # (A,)
-    rear_axle_offset_m: Array  # (A,) from the rear axle forward to the box center
+    wheelbase_m: Array
+    rear_axle_offset_m: Array  # from the rear axle forward to the box center
     max_steer_rad: Array
     max_steer_rate_radps: Array
     steer_lag_s: Array
@@ -89,16 +94,13 @@ class VehicleParameters(Columns):
     max_brake_mps2: Array
     max_jerk_mps3: Array
     pedal_lag_s: Array
-    # cg_to_rear_m, cg_height_m: (A,) place of the center of gravity.
-    cg_to_rear_m: Array
+    cg_to_rear_m: Array  # place of the center of gravity
     cg_height_m: Array
-    gyration_m2: Array  # (A,) yaw inertia over mass
-    # front_stiffness_1prad, rear_stiffness_1prad: (A,) cornering stiffness over the friction limit.
-    front_stiffness_1prad: Array
+    gyration_m2: Array  # yaw inertia over mass
+    front_stiffness_1prad: Array  # cornering stiffness over the friction limit
     rear_stiffness_1prad: Array
-    friction: Array  # (A,)
-    # (A,) for the controller: the share by which lateral acceleration widens the curve, 0 without slip.
-    understeer_s2pm2: Array
+    friction: Array
+    understeer_s2pm2: Array  # for the controller: by how much lateral acceleration widens the curve, 0 without slip
 
     @cached_property
     def max_curvature_1pm(self) -> Array:
@@ -154,18 +156,19 @@ def step_bicycle(
         actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
         gear = engaged_gear(speed, controls.reverse)
         pace, distance = advance_speed(np.abs(speed), mean_pedal, h)
-        x, y, yaw = along_arc(x, y, yaw, gear * distance, np.tan(mean_steer) / parameters.wheelbase_m)
-        speed = gear * pace
+        turn = gear * distance * (np.tan(mean_steer) / parameters.wheelbase_m)
+        chord = gear * distance * sinc(turn / 2)
+        cos, sin = cos_sin(yaw + turn / 2)
+        x, y, yaw, speed = x + chord * cos, y + chord * sin, yaw + turn, gear * pace
     pedal, steer = actuators
     return VehicleState(x, y, yaw, speed, steer, pedal, state.lateral_mps, state.yaw_rate_radps)
 
 
 def step_point(state: PointState, controls: PointControls, dt_s: float) -> PointState:
     """Move points by `dt_s` with constant acceleration, limited in magnitude; exact."""
-    ax, ay = controls.accel_x_mps2, controls.accel_y_mps2
-    size = np.hypot(ax, ay)
+    size = np.hypot(controls.accel_x_mps2, controls.accel_y_mps2)
     scale = np.where(size > POINT_MAX_ACCEL_MPS2, POINT_MAX_ACCEL_MPS2 / np.where(size > 0, size, 1.0), 1.0)
-    ax, ay = ax * scale, ay * scale
+    ax, ay = controls.accel_x_mps2 * scale, controls.accel_y_mps2 * scale
     return PointState(
         state.x_m + (state.velocity_x_mps + ax * dt_s / 2) * dt_s,
         state.y_m + (state.velocity_y_mps + ay * dt_s / 2) * dt_s,
@@ -184,14 +187,6 @@ def rows(first: Array | float, second: Array) -> Array:
     both = np.empty((2, len(second)))
     both[0], both[1] = first, second
     return both
-
-
-def along_arc(x: Array, y: Array, yaw: Array, distance: Array, curvature: Array) -> tuple[Array, Array, Array]:
-    """Return position and yaw at the end of an arc of signed length `distance`."""
-    turn = distance * curvature
-    chord = distance * sinc(turn / 2)
-    cos, sin = cos_sin(yaw + turn / 2)
-    return x + chord * cos, y + chord * sin, yaw + turn
 
 
 def engaged_gear(speed: Array, reverse: NDArray[np.bool_]) -> Array:
@@ -236,5 +231,4 @@ def sinc(angle: Array) -> Array:
     """sin(angle) / angle, 1 at zero."""
     half = angle / 2 + TINY
     t = np.tan(half)
-    result: Array = t / (half * (1 + t * t))
-    return result
+    return np.asarray(t / (half * (1 + t * t)))
