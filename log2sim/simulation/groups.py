@@ -17,11 +17,19 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array, cos_sin, wrap_angle
-from log2sim.simulation import follower, policy
+from log2sim.simulation import policy
 from log2sim.simulation.corridors import SPACING_M, PathTable
-from log2sim.simulation.reference import GRID_S, Reference
+from log2sim.simulation.reference import (
+    GRID_S,
+    ControllerMemory,
+    Reference,
+    control_step,
+    follow_points,
+    follow_vehicles,
+    start_vehicles,
+)
 from log2sim.simulation.vehicles import vehicle
-from log2sim.simulation.vehicles.model_choice import set_slip_states
+from log2sim.simulation.vehicles.single_track import set_slip_states
 
 STORE_S = 0.05  # spacing of stored states, about 20 Hz
 MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10 ms
@@ -144,7 +152,7 @@ class AgentGroup(ABC):
 
     def advance(self, dt_s: float) -> None:
         """Move the living agents by one step; within a long step controls are renewed."""
-        held_s = follower.control_step(dt_s)
+        held_s = control_step(dt_s)
         for part in range(round(dt_s / held_s)):
             if part:
                 self.look_up(self.now_s + held_s)
@@ -183,7 +191,7 @@ class VehicleGroup(AgentGroup):
 
     driver = "pid"
     state: vehicle.VehicleState
-    memory: follower.ControllerMemory
+    memory: ControllerMemory
     commands: vehicle.VehicleControls
     living: vehicle.VehicleParameters
 
@@ -198,18 +206,18 @@ class VehicleGroup(AgentGroup):
     ) -> None:
         super().__init__(agents, references, first, last)
         self.parameters, self.move, count = parameters, move, len(agents)
-        state, memory = vehicle.VehicleState.zeros(count), follower.ControllerMemory.fresh(count)
+        state, memory = vehicle.VehicleState.zeros(count), ControllerMemory.fresh(count)
         commands = vehicle.VehicleControls(np.zeros(count), np.zeros(count), np.zeros(count, bool))
         self.keep(state=state, memory=memory, commands=commands, living=parameters)
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
         slots = self._slots(index)
-        state = follower.start_vehicles(self._exact(index, t_s), self.living.take(slots))
+        state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
             state = set_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
         self.state.put(slots, state)
-        self.memory.put(slots, follower.ControllerMemory.fresh(len(slots)))
+        self.memory.put(slots, ControllerMemory.fresh(len(slots)))
         placed = self.state.take(slots)
         self.commands.put(slots, vehicle.VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
 
@@ -225,7 +233,7 @@ class VehicleGroup(AgentGroup):
         return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel, c.pedal_mps2, c.steer_rad, gear)
 
     def _step(self, dt_s: float) -> None:
-        self.commands, self.memory = follower.follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
+        self.commands, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
         self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
@@ -272,7 +280,7 @@ class PedestrianGroup(AgentGroup):
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), unknown, unknown, unknown, unknown)
 
     def _step(self, dt_s: float) -> None:
-        self.commands = follower.follow_points(self.row, self.state)
+        self.commands = follow_points(self.row, self.state)
         self.state = self.move(self.state, self.commands, dt_s)
 
 

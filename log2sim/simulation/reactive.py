@@ -20,8 +20,7 @@ from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGrou
 from log2sim.simulation.metrics.collisions import BoxTracks, contacts
 from log2sim.simulation.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
 from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
-from log2sim.simulation.vehicles.parameters import WHEELED
-from log2sim.simulation.vehicles.vehicle import Columns
+from log2sim.simulation.vehicles.vehicle import WHEELED, Columns
 
 EXPONENT = 4.0
 MIN_GAP_M = 0.1  # shorter gaps, and overlaps, count as this one

@@ -18,7 +18,6 @@ from log2sim.files import plugins
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
 from log2sim.simulation.corridors import PathTable, scenario_times_of_distance
-from log2sim.simulation.follower import control_step
 from log2sim.simulation.groups import (
     ONE,
     AgentGroup,
@@ -43,11 +42,19 @@ from log2sim.simulation.reactive import (
     ReactiveVehicleGroup,
     Traffic,
 )
-from log2sim.simulation.reference import GRID_S, log_reference, point_reference, vehicle_reference_of
+from log2sim.simulation.reference import GRID_S, control_step, log_reference, point_reference, vehicle_reference_of
 from log2sim.simulation.result import AgentReplay, Commands, Replay
-from log2sim.simulation.vehicles.model_choice import AUTO, ModelChoice, choose_model, slipping_reference, understeer
-from log2sim.simulation.vehicles.parameters import STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
-from log2sim.simulation.vehicles.vehicle import VehicleControls, VehicleParameters, VehicleState, VehicleStep
+from log2sim.simulation.vehicles.single_track import AUTO, ModelChoice, choose_model, slipping_reference, understeer
+from log2sim.simulation.vehicles.vehicle import (
+    STEER_LAG_S,
+    WHEELED,
+    VehicleControls,
+    VehicleParameters,
+    VehicleState,
+    VehicleStep,
+    parameters_for,
+    rear_axle_offset,
+)
 
 if TYPE_CHECKING:
     from log2sim.simulation.carla.simulator import CarlaSimulator

@@ -26,14 +26,12 @@ from log2sim.simulation.expected_motion import (
     observation_interval_s,
     observed_spans,
 )
-from log2sim.simulation.follower import ControllerMemory, follow_vehicles
 from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.prediction.motion_table import TICK_S, Complex, table_of, tabulate
-from log2sim.simulation.reference import Reference, vehicle_reference_of
+from log2sim.simulation.reference import ControllerMemory, Reference, follow_vehicles, vehicle_reference_of
 from log2sim.simulation.result import CollisionWarning, Moment, Replay, Warnings, to_scenario
-from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for
-from log2sim.simulation.vehicles.vehicle import VehicleState
+from log2sim.simulation.vehicles.vehicle import WHEELED, VehicleState, parameters_for
 
 MAX_LISTED = 5
 

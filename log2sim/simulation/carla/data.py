@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
-from log2sim.simulation.follower import GAINS
-from log2sim.simulation.reference import vehicle_limits, vehicle_reference
-from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
+from log2sim.simulation.reference import GAINS, vehicle_limits, vehicle_reference
+from log2sim.simulation.vehicles.vehicle import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
 Size = tuple[float, float, float]
 

@@ -107,14 +107,9 @@ class CarlaActor:
     def transform(self, x: float, y: float, z: float, yaw: float) -> Any:
         """Return the actor's transform for which its box is centered at x, y and stands at z."""
         cos, sin = math.cos(yaw), math.sin(yaw)
-        return self.carla.Transform(
-            self.carla.Location(
-                x=x - self._box_x * cos + self._box_y * sin,
-                y=y - self._box_x * sin - self._box_y * cos,
-                z=z - self._bottom,
-            ),
-            self.carla.Rotation(pitch=0.0, yaw=wrapped_deg(yaw), roll=0.0),
-        )
+        at_x, at_y = x - self._box_x * cos + self._box_y * sin, y - self._box_x * sin - self._box_y * cos
+        place = self.carla.Location(x=at_x, y=at_y, z=z - self._bottom)
+        return self.carla.Transform(place, self.carla.Rotation(pitch=0.0, yaw=wrapped_deg(yaw), roll=0.0))
 
     def pose(self) -> tuple[float, float, float, float, float]:
         """Return box center x, y, lowest face z, yaw in rad and speed along it, after the last tick."""
@@ -128,13 +123,9 @@ class CarlaActor:
         speed = velocity.x * cos + velocity.y * sin
         return x, y, at.z + self._bottom, yaw, speed if abs(speed) >= STANDSTILL_MPS else 0.0
 
-    def steer_angle(self, curvature: float) -> float:
-        """Return the angle of the front wheels in rad for a curvature."""
-        return math.atan(self.wheelbase_m * curvature)
-
     def show_steering(self, curvature: float) -> None:
         """Turn the front wheels visually, which CARLA allows while physics is off."""
-        angle_deg = math.degrees(self.steer_angle(curvature))
+        angle_deg = math.degrees(math.atan(self.wheelbase_m * curvature))
         if abs(angle_deg - self._shown_deg) > SHOWN_DEG:  # every call is one to the server
             self._shown_deg = angle_deg
             for wheel in self._front:
@@ -148,7 +139,7 @@ class CarlaActor:
         with speed.
         """
         (share,) = self._steering.at(abs(speed) * KMH_PER_MPS, "share")
-        steer = self.steer_angle(curvature) / (self.max_steer_rad * max(share, 0.1))
+        steer = math.atan(self.wheelbase_m * curvature) / (self.max_steer_rad * max(share, 0.1))
         rolls_back = reverse if speed == 0 else speed < 0
         return self.carla.VehicleControl(
             throttle=clamp(pedal_mps2 / self.agent["max_throttle_mps2"], 0.0, 1.0),
@@ -159,7 +150,7 @@ class CarlaActor:
 
 
 class VehicleController:
-    """PID with feed-forward for one vehicle, the scalar form of `log2sim.simulation.follower`; gains come with the data."""
+    """PID with feed-forward for one vehicle, the scalar form of `log2sim.simulation.reference`; gains come with the data."""
 
     def __init__(
         self, gains: SimpleNamespace, max_throttle_mps2: float, max_brake_mps2: float, max_curvature_1pm: float
@@ -253,9 +244,8 @@ class CarlaSession:
                 blueprint.set_attribute(name, value)
         x, y, z, yaw = place
         for height in SPAWN_HEIGHTS_M:
-            above = self.carla.Transform(
-                self.carla.Location(x, y, z + height), self.carla.Rotation(yaw=wrapped_deg(yaw))
-            )
+            turn = self.carla.Rotation(yaw=wrapped_deg(yaw))
+            above = self.carla.Transform(self.carla.Location(x, y, z + height), turn)
             handle = self.world.try_spawn_actor(blueprint, above)
             if handle is not None:
                 break
@@ -285,9 +275,8 @@ class CarlaSession:
         """Put the spectator behind and above a place."""
         x, y, z, yaw = place
         at = self.carla.Location(x - 9.0 * math.cos(yaw), y - 9.0 * math.sin(yaw), z + 5.0)
-        self.world.get_spectator().set_transform(
-            self.carla.Transform(at, self.carla.Rotation(pitch=-20.0, yaw=wrapped_deg(yaw)))
-        )
+        turn = self.carla.Rotation(pitch=-20.0, yaw=wrapped_deg(yaw))
+        self.world.get_spectator().set_transform(self.carla.Transform(at, turn))
 
 
 class ScenarioPlayer:
@@ -370,9 +359,8 @@ class ScenarioPlayer:
             self.drift_m.setdefault(name, []).append(math.hypot(x - logged[0], y - logged[1]))
         if actor.is_walker:
             logged_x, logged_y, *_ = self.logged[name].place(now_s)
-            yield self.walk(
-                actor, vx + (logged_x - x) / self.gains.point_s, vy + (logged_y - y) / self.gains.point_s, yaw
-            )
+            catch_up = (logged_x - x) / self.gains.point_s, (logged_y - y) / self.gains.point_s
+            yield self.walk(actor, vx + catch_up[0], vy + catch_up[1], yaw)
         else:  # the reference of the rear axle, with acceleration and curvature ahead by the lags of the actuators
             wanted_x, wanted_y, _, wanted_yaw = trajectory.place(now_s)
             axle = point_behind(wanted_x, wanted_y, wanted_yaw, actor.axle_m)
@@ -390,9 +378,8 @@ class ScenarioPlayer:
         """Return the command that lets a walker walk with a velocity, or stand with a heading."""
         speed = math.hypot(vx, vy)
         way = (vx / speed, vy / speed) if speed > STANDSTILL_MPS else (math.cos(yaw), math.sin(yaw))
-        control = self.carla.WalkerControl(
-            self.carla.Vector3D(*way, 0.0), speed if speed > STANDSTILL_MPS else 0.0, False
-        )
+        pace = speed if speed > STANDSTILL_MPS else 0.0
+        control = self.carla.WalkerControl(self.carla.Vector3D(*way, 0.0), pace, False)
         return self.carla.command.ApplyWalkerControl(actor.handle.id, control)
 
     def _velocity(self, agent: dict[str, Any], t_s: float) -> tuple[float, float]:
@@ -408,9 +395,8 @@ class ScenarioPlayer:
 
     def _jumps(self, agent: dict[str, Any], t_s: float) -> bool:
         """Whether its trajectory has a discontinuity within the tick that begins at a time."""
-        return any(
-            t_s + MARGIN_S < jump_s <= t_s + self.session.dt_s + MARGIN_S for jump_s in agent["discontinuities_s"]
-        )
+        end_s = t_s + self.session.dt_s
+        return any(t_s + MARGIN_S < jump_s <= end_s + MARGIN_S for jump_s in agent["discontinuities_s"])
 
     def grounded(self, agent: dict[str, Any], place: BoxPose, *, falls: bool = False) -> BoxPose:
         """Return the place at the height of the nearest road; without a road near, as it is, or an error if it `falls` then."""
@@ -546,34 +532,24 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--map", metavar="TOWN", help="load this town first")
-    road = Path(__file__).with_name("road.xodr")
+    road, add = Path(__file__).with_name("road.xodr"), parser.add_argument
     where.add_argument(
-        "--opendrive",
-        type=Path,
-        nargs="?",
-        const=road,
-        metavar="FILE.xodr",
+        "--opendrive", type=Path, nargs="?", const=road, metavar="FILE.xodr",
         help="make a world of this road network first (default: the one exported)",
-    )
-    parser.add_argument(
-        "--mode", choices=("exact", "pid"), help="as in the scenario, or driven along it (default: as exported)"
-    )
-    parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=2000)
-    parser.add_argument(
-        "--timeout", type=float, default=60.0, metavar="S", help="how long the server may take, e.g. to load a world"
-    )
-    parser.add_argument("--dt", type=float, default=0.05, metavar="S", help="length of a tick, at most 0.1")
-    parser.add_argument(
-        "--physics", action="store_true", help="with exact: leave physics on, so that velocities are seen"
-    )
-    parser.add_argument(
-        "--ground", choices=("log", "map"), help="heights from the scenario (log; exact) or the nearest road (map; pid)"
-    )
-    parser.add_argument("--follow", default="ego", metavar="ID", help="agent that the spectator follows, or 'none'")
-    parser.add_argument("--pace", type=float, default=1.0, help="1 is real time, 0 as fast as the server can")
-    parser.add_argument("--table", action="store_true", help="print the table of assets and end")
-    parser.add_argument("--data", type=Path, default=Path(__file__).with_name("scenario_carla.json"), metavar="FILE")
+    )  # fmt: skip
+    add("--mode", choices=("exact", "pid"), help="as in the scenario, or driven along it (default: as exported)")
+    add("--host", default="127.0.0.1")
+    add("--port", type=int, default=2000)
+    patience = "how long the server may take, e.g. to load a world"
+    add("--timeout", type=float, default=60.0, metavar="S", help=patience)
+    add("--dt", type=float, default=0.05, metavar="S", help="length of a tick, at most 0.1")
+    add("--physics", action="store_true", help="with exact: leave physics on, so that velocities are seen")
+    heights = "heights from the scenario (log; exact) or the nearest road (map; pid)"
+    add("--ground", choices=("log", "map"), help=heights)
+    add("--follow", default="ego", metavar="ID", help="agent that the spectator follows, or 'none'")
+    add("--pace", type=float, default=1.0, help="1 is real time, 0 as fast as the server can")
+    add("--table", action="store_true", help="print the table of assets and end")
+    add("--data", type=Path, default=Path(__file__).with_name("scenario_carla.json"), metavar="FILE")
     parsed = parser.parse_args(words)
     if not 0 < parsed.dt <= 0.1:
         parser.error(

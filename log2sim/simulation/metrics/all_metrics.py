@@ -21,7 +21,7 @@ from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, BoxTracks, c
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
 from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.result import AgentReplay, Replay
-from log2sim.simulation.vehicles.parameters import WHEELED
+from log2sim.simulation.vehicles.vehicle import WHEELED
 from log2sim.simulation.warnings import describe_warnings
 
 SEARCH_S = 1.0
@@ -321,9 +321,8 @@ def replay_metrics(
         figures = ego_figures(agents[driven], driven, replayed, t_s, path)
         gap = figures["min_gap"]
         ego["ego"] = {**figures, "min_gap": None if gap is None else {**gap, "agent": ids[gap["agent"]]}}
-    out: dict[
-        str, Any
-    ] = {}  # errors averaged over all followers, every stored sample counting alike; 0 without followers
+    # Errors averaged over all followers, every stored sample counting alike; 0 without followers.
+    out: dict[str, Any] = {}
     for key, samples in (
         ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
     ):  # fmt: skip
