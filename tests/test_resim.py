@@ -351,6 +351,19 @@ def test_what_cannot_be_simulated_is_said_and_nothing_written(recorded: tuple[Lo
     assert not any(tmp_path.iterdir())
 
 
+def test_what_was_not_recorded_is_told(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
+    log, truth = recorded
+    short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:3]) for k, s in log.streams.items()})
+    w, ego = truth.others[0].waypoints, truth.ego
+    assert ego is not None
+    far = replace(truth.others[0], id="far", waypoints=replace(w, x_m=w.x_m + 500))
+    aside = replace(ego, waypoints=replace(ego.waypoints, y_m=ego.waypoints.y_m + 8))
+    source, now = (replace(truth, agents=agents) for agents in ((*truth.agents, far), (aside, *truth.others)))
+    notes = resimulate(short, source, now, tmp_path / "out")
+    assert "far" in notes[0] and "no point" in notes[0]
+    assert "ego is 8.0 m from where anything was recorded" in notes[1]
+
+
 def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], world: World) -> None:
     log, truth = recorded
     (name,) = log.lidars
@@ -376,13 +389,18 @@ def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], worl
         replay(truth, ego=lambda observation: observation.sweep(name), dt_s=0.05)  # type: ignore[arg-type,return-value]
 
 
-def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scenario]) -> None:
-    """Two legs of 0.1 m, 0.3 m apart, 10 m ahead: their picture is sampled again by rays between those that saw them."""
+@pytest.mark.parametrize("below", [1, 3])
+def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scenario], below: int) -> None:
+    """Two legs of 0.1 m, 0.3 m apart, 10 m ahead: their picture is sampled again by rays between those that saw them.
+
+    Below the horizon lines may be three times as far apart.
+    """
     half = np.array([0.3, 0.3, 0.9])
     step = np.deg2rad(0.2)
+    lines = np.append(np.arange(-33, 0, below), np.arange(31))
 
     def fan(shift: float) -> np.ndarray:
-        a, e = np.meshgrid((np.arange(-20, 21) + shift) * step, (np.arange(-30, 31) + shift) * step)
+        a, e = np.meshgrid((np.arange(-20, 21) + shift) * step, (lines + shift * np.gradient(lines)) * step)
         return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1).reshape(-1, 3)
 
     def on_legs(at: np.ndarray) -> np.ndarray:
@@ -399,7 +417,7 @@ def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scen
     away[lost], ends[lost] = np.nan, False
     seen = sighting(
         0.0, np.array([-10.0, 0, 0]), ray, range_m=away, on=ends, intensity=np.ones(len(ray), np.float32), half_m=half,
-        step_rad=step, line_rad=np.arange(-33, 34) * step,
+        step_rad=step, line_rad=np.append(lines, 31) * step,
     )  # fmt: skip
     assert seen is not None
     w = recorded[1].others[0].waypoints.take([0])
