@@ -157,9 +157,9 @@ def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
                 "0, 0, 1 in the last row"
             )
     for name in (*cameras, *log.lidars):
-        for problem in problems_of(log, name):
-            if problem.is_impossible:
-                raise LogError(problem.message)
+        for message, is_impossible in problems_of(log, name):
+            if is_impossible:
+                raise LogError(message)
 
 
 def _check_pose_times(log: Log, cameras: tuple[str, ...]) -> None:
