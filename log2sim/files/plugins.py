@@ -104,7 +104,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "log2sim": "log2sim.logs.native.reader:READER",
         "kitti": "log2sim.logs.kitti.drives:READER",
         "kitti-tracking": "log2sim.logs.kitti.drives:TRACKING_READER",
-        "kitti-object": "log2sim.logs.kitti.object:READER",
+        "kitti-object": "log2sim.logs.kitti.drives:OBJECT_READER",
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",
         "waymo-parquet": "log2sim.logs.waymo.parquet_reader:READER",

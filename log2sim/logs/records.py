@@ -229,7 +229,8 @@ TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
 INTENSITY_FIELDS = ("intensity", "reflectivity", "reflectance")
 PCD_TYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 # Times of points relative to the stamp of their sweep, ns, and how strong returns are; None when the file does not tell.
-Offset, Intensity = NDArray[np.int64] | None, NDArray[Any] | None
+Offset = NDArray[np.int64] | None
+Intensity = NDArray[Any] | None
 
 
 def parse_pcd(data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:
