@@ -199,7 +199,7 @@ def _kind_of(part: Any) -> str:
 def _columns(table: Any) -> Columns:
     if _kind_of(table) != "Frame" or not isinstance(table.state, dict):
         raise ValueError(f"holds a {_kind_of(table)}, expected a DataFrame")
-    manager = table.state.get("_mgr", table.state.get("_data"))
+    manager: Any = table.state.get("_mgr", table.state.get("_data"))
     if _kind_of(manager) != "Blocks":
         raise ValueError("its DataFrame has no blocks")
     # Values and column positions of each block, as written since and before pandas 1.3.
