@@ -80,6 +80,21 @@ def test_links_are_followed_only_when_asked_for_and_loops_end(many_formats: Path
         assert ids(root) == [("log2sim", "other/a"), ("log2sim", "other/deeper/b")]
 
 
+def test_scenarios_are_found_once_and_those_of_a_batch_by_the_names_of_their_logs(tmp_path: Path) -> None:
+    for place in ("alone/a/scenario.json", "alone/a.json", "alone/scenario.json", "made/logs/a/scenario.json"):
+        touch(tmp_path / place)
+        (tmp_path / place).write_text('{"scenario_version": 1}')
+    touch(tmp_path / "made" / "batch.json", tmp_path / "made" / "replay.json")
+    (tmp_path / "alone" / "link.json").symlink_to(tmp_path / "alone" / "a.json")
+    found = {root: [log.id for log in find_logs(tmp_path / root, format="scenario")] for root in ("alone", "made")}
+    assert found == {"alone": ["a.json", "scenario.json", "a"], "made": ["a"]}
+    (alone,) = find_logs(tmp_path / "alone" / "a.json", format="scenario")
+    assert (alone.id, alone.path) == ("a.json", tmp_path / "alone" / "a.json")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LogError, match="holds no scenario"):
+        find_logs(tmp_path / "empty", format="scenario")
+
+
 def test_a_batch_of_other_settings_is_refused_and_overwritten(tmp_path: Path) -> None:
     def wanted(**changes: Any) -> BatchSettings:
         return BatchSettings.create(tmp_path / "root", "auto", False, Config.load(**changes))
@@ -189,6 +204,18 @@ def test_a_batch_runs_repeats_resumes_and_is_evaluated(
     assert good.cross_track_max_m == replayed.metrics["cross_track_max_m"] > 0
     (bad,) = (out / "logs").glob("group_bad-*")
     assert names(bad) == ["error.txt", "row.json"]
+
+    ran = run("batch", out, "--out", tmp_path / "replays", "--format", "scenario")
+    assert ran.code == 0, ran.err
+    assert "2 scenarios below" in ran.out
+    assert ran.out.rstrip().endswith("scenarios an hour")
+    assert names(tmp_path / "replays" / "logs" / "good") == ["replay.json", "row.json"]
+    files = [folder / "logs" / "good" / "replay.json" for folder in (out, tmp_path / "replays")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    again = BatchFolder.load(tmp_path / "replays").read_row("good")
+    same = ("agents", "static", "doubtful", "duration_s", "cross_track_max_m", "new_collisions")
+    assert again is not None
+    assert [getattr(again, name) for name in same] == [getattr(good, name) for name in same]
 
     before = (out / "logs" / "good" / "row.json").stat().st_mtime_ns
     (root / "group" / "bad" / "log.json").write_bytes((tiny_folder / "log.json").read_bytes())

@@ -180,9 +180,7 @@ def test_the_workers_of_a_scheduler_run_a_batch_and_go_on_for_others(
         assert client.submit(sum, [1, 2]).result(timeout=LIMIT_S) == 3
 
 
-def test_the_workers_of_a_scheduler_find_situations_and_drive_a_policy_as_processes_do(
-    tmp_path: Path, scheduler: str
-) -> None:
+def test_the_workers_of_a_scheduler_find_situations_drive_a_policy_and_replay(tmp_path: Path, scheduler: str) -> None:
     pytest.importorskip("duckdb")
     for seed in range(4):
         traffic(seed, count=8, duration_s=12.0).scenario.save(tmp_path / "found" / f"{seed}" / "scenario.json")
@@ -199,3 +197,6 @@ def test_the_workers_of_a_scheduler_find_situations_and_drive_a_policy_as_proces
         about.append(json.loads((tmp_path / name / "test.json").read_text()))
     assert about[0]["failures"] > 0
     assert about[0] == about[1]
+    ran = run("batch", tmp_path / "found", "-o", tmp_path / "replays", "--format", "scenario", "--scheduler", scheduler)
+    assert ran.code == 0, ran.err
+    assert len(list((tmp_path / "replays").glob("logs/*/replay.json"))) == 4

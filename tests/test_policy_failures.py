@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from statistics import NormalDist
 
@@ -11,11 +12,11 @@ import pytest
 from benchmarks.tag_worlds import traffic
 from command_line import run
 
-from log2sim.datatypes import EGO, Scenario
+from log2sim.datatypes import EGO, Agent, MapFeatures, Marking, Scenario, Signal, Waypoints
 from log2sim.errors import ConfigError
 from log2sim.scenarios.failure import LIMITS, Outcome, judge_run, report_page, search, with_ego
 from log2sim.scenarios.index import open_index
-from log2sim.scenarios.logical import Base, choose_base, fit
+from log2sim.scenarios.logical import Base, Logical, choose_base, fit
 from log2sim.scenarios.query import ask
 from log2sim.simulation.metrics.all_metrics import parse_limits
 from log2sim.simulation.policy import Controls
@@ -117,6 +118,45 @@ def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
     assert "<b> in" not in page
     assert "of my own" in page
     assert page.count('class="failed"') + page.count("class=failed") >= 2
+
+
+@pytest.mark.parametrize("lanes", [True, False])
+@pytest.mark.parametrize(("red_from_s", "expected_s"), [(3.0, 2.4), (5.0, 0.4), (6.0, -0.6), (None, None)])
+def test_who_passes_the_stop_line_of_a_red_light_breaks_a_rule(red_from_s, expected_s, lanes) -> None:
+    """At 10 m/s its front is at the line at 5.4 s; the light stands across the junction, and another faces the road that crosses."""
+    t = np.linspace(0.0, 14.0, 141)
+    n = len(t)
+    w = Waypoints(t, 10.0 * (t - 5.62), *np.zeros((3, n)), np.full(n, 10.0), np.ones(n, bool), np.zeros(n))
+    line = Marking("s", "stop_line", np.array([[0.0, -1.75, 0.0], [0.0, 1.75, 0.0]]), 0.4, "white")
+    times, states = (
+        (np.array([0.0, red_from_s]), np.array(["yellow", "red"])) if red_from_s else (t[:1], np.array(["green"]))
+    )
+    lights = (Signal("a", np.array([20.0, 3.0, 4.0]), np.pi, times, states),
+              Signal("b", np.array([8.0, 6.0, 4.0]), np.pi / 2, t[:1], np.array(["red"])))  # fmt: skip
+    features = MapFeatures(markings=(line,)) if lanes else MapFeatures()
+    if not lanes:  # nothing painted: it is to stop 3 m before the light
+        lights = tuple(replace(s, position_m=s.position_m - np.array([17.0, 0, 0])) for s in lights)
+    world = Scenario("light", 0, 14.0, (Agent(EGO, "car", (4.4, 1.8, 1.5), w),), signals=lights, map_features=features)
+    row = {
+        "tag": "lane_change",
+        "agent": EGO,
+        "start_s": 5.0,
+        "t_s": 6.0,
+        "end_s": 7.0,
+        "agent.speed_mps": 10.0,
+        "file": "",
+    }
+    base, logical = Base.of(world, row), Logical(("agent.speed_mps",), np.full((5, 1), 10.0))
+    usual = np.array([10.0])
+    drives = judge_run(base, logical, lambda seen: Controls(0.0, 0.0), {"max_red_s": 0.0}, "scenario", usual)
+    brakes = judge_run(base, logical, lambda seen: Controls(-6.0, 0.0), {"max_red_s": 0.0}, "scenario", usual)
+    assert "max_red_s" not in brakes.values  # who stands before it has passed nothing
+    assert brakes.margin > 0
+    if expected_s is None:
+        assert "max_red_s" not in drives.values
+    else:
+        assert drives.values["max_red_s"] == pytest.approx(expected_s, abs=0.11)
+        assert drives.margin == pytest.approx(-drives.values["max_red_s"])
 
 
 @pytest.mark.parametrize(

@@ -231,6 +231,13 @@ def test_an_occlusion_is_stitched_and_not_beyond_what_is_allowed() -> None:
     assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.15})) == 2
 
 
+@pytest.mark.parametrize(("later", "count"), [("cyclist", 1), ("pedestrian", 1), ("car", 2)])
+def test_a_rider_who_comes_out_of_an_occlusion_may_be_taken_for_a_pedestrian(later: str, count: int) -> None:
+    found, t_ns = record({"a": line(0, 0, 2, 0)}, 60, hidden={"a": (15, 28)}, category="cyclist")
+    found[28:] = record({"a": line(0, 0, 2, 0)}, 60, category=later)[0][28:]
+    assert len(track(found, t_ns, **OPTIONS)) == count
+
+
 def test_what_comes_out_of_an_occlusion_elsewhere_is_somebody_else() -> None:
     def jumping(t: float) -> tuple[float, float]:
         return (8 * t, 0.0) if t < 3.5 else (8 * t, 12.0)

@@ -11,17 +11,19 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.files import plugins
 from log2sim.files.inputs import follows_links
 from log2sim.logs.opening import Reader, find_reader
+from log2sim.scenarios.index import SCENARIO_FILE, find_scenarios
 
 MAX_LEVELS = 8  # below the root; data sets have up to four (split, date, drive, sensor)
 MAX_FOLDERS = 500_000  # that are looked into, so that a wrong root such as "/" ends
+SCENARIO = "scenario"  # in place of a log format: scenario files, which are there already and are only replayed
 
 
 @dataclass(frozen=True)
 class FoundLog:
-    """A log that can be opened."""
+    """A log that can be opened, or a scenario file."""
 
     id: str  # path of the log below the root, with the sequence where one folder holds several; unique within a format
-    path: Path  # what `open_log` takes
+    path: Path  # what `open_log` or `Scenario.load` takes
     format: str
     sequence: str
 
@@ -31,7 +33,8 @@ def find_logs(
 ) -> list[FoundLog]:
     """Find all logs at and below a folder, in the order of their ids.
 
-    `root`: a folder, or the file of one log. `format`: name of the only format that is looked for, or "auto".
+    `root`: a folder, or the file of one log. `format`: name of the only format that is looked for, "auto", or "scenario" for
+    scenario files: of a batch those of its logs, elsewhere all that begin as one.
     `leave_out`: folder that is not looked into. `max_folders`: that are looked into before the search is given up.
     Raises `LogError` when the root is missing, or there is no log. Raises `ConfigError` for an unknown format, or more
     folders than can be searched.
@@ -41,6 +44,17 @@ def find_logs(
     """
     if not root.exists():
         raise LogError(f"{root}: no such folder; give a folder with logs")
+    if format == SCENARIO:
+        inside = root / "logs" if (root / "batch.json").is_file() else root.parent if root.is_file() else root
+        paths = (
+            [root]
+            if root.is_file()
+            else [p for p in map(inside.joinpath, find_scenarios(inside)) if follows_links() or not p.is_symlink()]
+        )
+        if not paths:
+            raise LogError(f"{root}: holds no scenario")
+        ids = [p.relative_to(inside).as_posix().removesuffix(f"/{SCENARIO_FILE}") for p in paths]
+        return [FoundLog(_text(id), p, SCENARIO, "") for id, p in zip(ids, paths)]
     names = plugins.names("log") if format == "auto" else [format]
     readers: dict[str, Reader] = {name: plugins.load("log", name) for name in names}
     if root.is_file():

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from log2sim.batch.discovery import FoundLog
 from log2sim.config import Config
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import first_problem, read_json, replaced, write_json
 from log2sim.files.outputs import claim, is_left_over, is_temporary, remove, replaced_folder
@@ -114,13 +115,11 @@ class Row(BaseModel):
 IDENTITY = ("name", "log", "format", "sequence")
 
 
-def done_row(job: Job, report: dict[str, Any], spent: dict[str, Any]) -> Row:
-    """Return the row of a log that was reconstructed, with what it took: `seconds`, `cpu_s` and `peak_memory_mib`."""
-    agents, unreadable = report["agents"], sum(stream["count"] for stream in report["unreadable"].values())
+def done_row(job: Job, scenario: Scenario, figures: dict[str, Any]) -> Row:
+    """Return the row of a log that is done: what its scenario holds, and other figures."""
     return Row(
-        **_identity(job), status="done", ticks=report["ticks"], duration_s=round(report["duration_s"], 6),
-        agents=agents["total"], static=agents["static"], doubtful=len(agents["doubtful"]), faults=len(report["faults"]),
-        unreadable=unreadable, **spent,
+        **_identity(job), status="done", duration_s=round(scenario.duration_s, 6), agents=len(scenario.others),
+        static=sum(a.static for a in scenario.others), doubtful=len(scenario.doubtful), **figures,
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from log2sim.batch.discovery import find_logs
+from log2sim.batch.discovery import SCENARIO, find_logs
 from log2sim.batch.folder import (
     REPLAY_FILE,
     REPORT_FILE,
@@ -35,6 +35,7 @@ from log2sim.batch.folder import (
     write_parquet,
 )
 from log2sim.config import Config
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError, Log2SimError, MissingExtra
 from log2sim.files.documents import write_json
 from log2sim.files.inputs import following_links, follows_links
@@ -228,8 +229,8 @@ def plan_batch(
 ) -> Batch:
     """Find the logs below a folder, and begin their batch in another or go on with it.
 
-    `config`: settings of all runs. `format`: format of the logs, or "auto". `overwrite`: whether to start over, without the
-    results of earlier runs. `cache`: whether detections in pictures are taken from the caches of the workers, and kept there.
+    `config`: settings of all runs. `format`: format of the logs, "auto", or "scenario" for scenario files, which are only replayed.
+    `overwrite`: whether to start over, without the results of earlier runs. `cache`: whether detections in pictures are taken from the caches of the workers, and kept there.
     `replay`: whether each scenario is replayed, too. Raises `LogError` where there is no log, and `ConfigError` for an output
     folder that holds the logs, something else, or a batch of other settings, and for detectors that could search no log, and
     `MissingExtra` where a detector, or the batch itself, needs what is not installed.
@@ -239,7 +240,7 @@ def plan_batch(
     if out.resolve() in (root.resolve(), *root.resolve().parents):
         raise ConfigError(f"{out}: holds the logs; choose another folder for the results")
     logs = find_logs(root, format=format, leave_out=out)
-    wanted = BatchSettings.create(root, format, follows_links(), config, replay=replay)
+    wanted = BatchSettings.create(root, format, follows_links(), config, replay=replay or format == SCENARIO)
     folder = BatchFolder.start(out, wanted, overwrite=overwrite)
     jobs = make_jobs(logs, out, folder.settings.token, cache=cache)
     rows = {job.name: folder.read_row(job.name) for job in jobs}
@@ -285,8 +286,8 @@ def reconstruct_all(
 ) -> list[Row]:
     """Reconstruct all logs below a folder, several at once, or go on with that; see `plan_batch` and `run_batch`.
 
-    `root`, `out`: folder with logs, and folder for the results. `jobs`: worker processes on this machine, one for each core by
-    default. `scheduler`: address of a Dask scheduler, whose workers are used instead. Returns the rows of all logs; those that
+    `root`, `out`: folder with logs, or for the format "scenario" with scenarios, and folder for the results. `jobs`: worker
+    processes on this machine, one for each core by default. `scheduler`: address of a Dask scheduler, whose workers are used instead. Returns the rows of all logs; those that
     failed say why.
 
     Worker processes import the script that calls this, which needs `if __name__ == "__main__":` around the call.
@@ -342,7 +343,7 @@ def _run_once(
 
 
 def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
-    """Reconstruct a log and write its folder.
+    """Reconstruct a log, or load a scenario, and replay it where that is wanted; write its folder.
 
     Returns the row of the log, and whether another run may succeed: it failed by something else than what is wrong with it
     or with the settings. Raises `ConfigError` where the folder of the batch is not visible, or of another version.
@@ -356,18 +357,29 @@ def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
 
     try:
         with following_links(folder.settings.follow_links), replaced_folder(target, overwrite=True) as unfinished:
-            log = open_log(job.path, format=job.format, sequence=job.sequence)
-            result = reconstruct(log, config, cache=job.cache, jobs=1)
-            result.scenario.save(unfinished / SCENARIO_FILE)
-            write_json(unfinished / REPORT_FILE, result.report)
-            figures = spent()
+            figures: dict[str, Any] = {}
+            if job.format == SCENARIO:
+                scenario = Scenario.load(job.path)
+            else:
+                log = open_log(job.path, format=job.format, sequence=job.sequence)
+                result = reconstruct(log, config, cache=job.cache, jobs=1)
+                scenario, report = result.scenario, result.report
+                scenario.save(unfinished / SCENARIO_FILE)
+                write_json(unfinished / REPORT_FILE, report)
+                unreadable = sum(stream["count"] for stream in report["unreadable"].values())
+                figures = {
+                    "ticks": report["ticks"],
+                    "faults": len(report["faults"]),
+                    "unreadable": unreadable,
+                    **spent(),
+                }
             if folder.settings.replay:
                 begun = time.process_time()
-                replayed = replay(result.scenario)
+                replayed = replay(scenario)
                 replayed.save(unfinished / REPLAY_FILE)
                 figures |= {key: replayed.metrics[key] for key in ("cross_track_max_m", "new_collisions")}
                 figures["replay_s"] = round(time.process_time() - begun, 4)
-            row = done_row(job, result.report, figures)
+            row = done_row(job, scenario, spent() | figures)
             write_json(unfinished / ROW_FILE, row.model_dump())
         return row.model_dump(), False
     except Log2SimError as error:

@@ -299,7 +299,7 @@ def test_(
     runs: Annotated[int, opt.option("Runs in all.", "N", min=40, max=100_000)] = 400,
     limit: Annotated[list[str] | None, opt.option(
         "A failure, too: min_ttc_s, min_pet_s, min_gap_m below; max_brake_mps2, max_jerk_mps3, max_lateral_mps2 (comfort), "
-        "max_speed_mps, max_off_path_m (rules) above.", "NAME=VALUE")] = None,
+        "max_speed_mps, max_off_path_m, max_red_s (rules; of a light that was red for longer) above.", "NAME=VALUE")] = None,
     agents: Annotated[str, opt.choose("--agents", "scenario|reactive", "Behavior of the other agent.")] = "scenario",
     latency: Annotated[str, opt.option(
         "How late the policy sees others, s: the mean, or mean and standard deviation.", "MEAN[:SIGMA]")] = "0",

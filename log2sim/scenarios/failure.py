@@ -14,8 +14,9 @@ from log2sim.datatypes import EGO, Scenario
 from log2sim.geometry import Array
 from log2sim.scenarios.hits import page
 from log2sim.scenarios.logical import Base, Logical
+from log2sim.simulation.driver_paths import LIGHT_M, stop_stations
 from log2sim.simulation.policy import Policy
-from log2sim.simulation.result import Replay
+from log2sim.simulation.result import AgentReplay, Replay
 from log2sim.simulation.runner import replay
 
 STEP_S = 0.05
@@ -100,8 +101,40 @@ LIMITS: Mapping[str, tuple[str, float]] = {
     "max_lateral_mps2": ("greatest lateral acceleration of the ego", -1.0),
     "max_speed_mps": ("greatest speed of the ego", -1.0),
     "max_off_path_m": ("farthest distance of the ego from the path that it drove in the log", -1.0),
+    "max_red_s": ("for how long a light was red when the ego passed its stop line, negative before it is red", -1.0),
 }
 """What else than a collision may be a failure, of safety, comfort or rules: below a limit, or, with -1, above it."""
+
+
+WAY_STEP_M = 0.5
+
+
+def red_light_s(ego: AgentReplay, scenario: Scenario) -> float:
+    """Return for how long a light was red, s, when the front of the ego passed where one stops at it; of several the longest.
+
+    Negative where it turned red that much later, and minus infinity where the ego passes none that turns red.
+    """
+    front = ego.x_m + 1j * ego.y_m + ego.size_m[0] / 2 * np.exp(1j * ego.yaw_rad)
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(front)))])
+    if not scenario.signals or way[-1] < WAY_STEP_M:
+        return -np.inf
+    # Beyond where it got it goes straight on, so that the place to stop at a light is not where it stopped.
+    s: Array = np.arange(0.0, way[-1] + 2 * LIGHT_M, WAY_STEP_M)
+    beyond = np.maximum(s - way[-1], 0.0) * np.exp(1j * ego.yaw_rad[-1])
+    points = np.interp(s, way, front.real) + 1j * np.interp(s, way, front.imag) + beyond
+    direction = np.exp(1j * np.interp(s, way, np.unwrap(ego.yaw_rad)))
+    stations = stop_stations(points[None], direction[None], WAY_STEP_M, scenario.map_features, scenario.signals)[:, 0]
+    longest = -np.inf
+    for signal, station in zip(scenario.signals, stations.tolist()):
+        if not station <= way[-1]:  # NaN, too
+            continue
+        t_s = ego.t_s[int(np.argmax(way >= station))]
+        red = np.isin(signal.state, ("red", "red_yellow"))
+        begins = signal.t_s[red & ~np.concatenate([[False], red[:-1]])]
+        ends = np.append(signal.t_s[~red & np.concatenate([[False], red[:-1]])], np.inf)[: len(begins)]
+        lasts = t_s - begins[ends > t_s]  # of the red that is, or else of the next
+        longest = max(longest, float(lasts.max(initial=-np.inf)))
+    return longest
 
 
 class Outcome(NamedTuple):
@@ -140,6 +173,7 @@ def judge_run(
         "max_lateral_mps2": float(comfort.get("lat_accel_max_mps2", 0.0)),
         "max_speed_mps": float(driven.speed_mps.max()),
         "max_off_path_m": float(own.get("cross_track_max_m", 0.0)),
+        "max_red_s": red_light_s(driven, base.scenario),
         **{name: np.inf if own.get(name) is None else float(own[name]) for name in ("min_ttc_s", "min_pet_s")},
     }
     margin = figures["min_gap_m"]

@@ -17,7 +17,7 @@ from log2sim.files.documents import replaced
 from log2sim.files.processes import default_jobs, map_in_processes
 
 INDEX_FILE = "tags.parquet"
-INDEX_VERSION = 2
+INDEX_VERSION = 3  # one more where tags are defined differently
 KEY = b"log2sim.tags"
 
 TEXTS = ("file", "scenario", "tag", "agent", "other", "lane")
@@ -107,20 +107,23 @@ def table_of_rows(rows: Sequence[Row]) -> Any:
     return pa.table({key: pa.array([row.get(key) for row in rows], kind) for key, kind in fields})
 
 
-def find_scenarios(folder: Path) -> Iterator[Path]:
-    """Yield scenario files below a folder: of a batch those of its logs, elsewhere all JSON files that begin as one."""
-    logs = folder / "logs"
-    for root, folders, files in os.walk(logs if (folder / "batch.json").is_file() and logs.is_dir() else folder):
+def find_scenarios(folder: Path) -> Iterator[str]:
+    """Yield the names below a folder of scenario files: of a batch those of its logs, elsewhere all JSON files that begin as one."""
+    top = os.path.join(
+        folder, ""
+    )  # strings, since a path object for each of ten thousand files takes longer than a question
+    logs = os.path.join(top, "logs")
+    for root, folders, files in os.walk(logs if (folder / "batch.json").is_file() and os.path.isdir(logs) else top):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(files):
-            path = Path(root) / name
-            if name == SCENARIO_FILE or (name.endswith(".json") and _begins_as_scenario(path)):
-                yield path
+            file = os.path.join(root, name)
+            if name == SCENARIO_FILE or (name.endswith(".json") and _begins_as_scenario(file)):
+                yield file[len(top) :]
 
 
-def _begins_as_scenario(path: Path) -> bool:
+def _begins_as_scenario(path: str) -> bool:
     try:
-        with path.open("rb") as file:
+        with open(path, "rb") as file:
             return b'"scenario_version"' in file.read(64)
     except OSError:
         return False
@@ -152,8 +155,8 @@ def open_index(
     import_arrow()
     if path.is_file():
         return Index(path.parent, table_of_rows(rows_of(Scenario.load(path), path.name)), 1)
-    found = {p: p.stat() for p in find_scenarios(path)} if path.is_dir() else {}
-    files = {str(p.relative_to(path)): [s.st_size, s.st_mtime_ns] for p, s in found.items()}
+    found = {name: os.stat(os.path.join(path, name)) for name in find_scenarios(path)} if path.is_dir() else {}
+    files = {name: [s.st_size, s.st_mtime_ns] for name, s in found.items()}
     if not files:
         raise ScenarioError(
             f"{path}: holds no scenario; expected a scenario.json, or a folder with some, such as that of log2sim batch"

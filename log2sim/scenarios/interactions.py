@@ -15,13 +15,13 @@ from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
 from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
 from log2sim.scenarios.traffic import (
+    KEEPING_MPS,
     SAME_WAY_RAD,
     SIDE_M,
     Beside,
     Index,
     Traffic,
     latched,
-    out_of_sight,
     probability_above,
     runs,
     turned,
@@ -29,7 +29,6 @@ from log2sim.scenarios.traffic import (
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import post_encroachment_times, time_to_touch
 from log2sim.simulation.prediction.motion_table import TICK_S
-from log2sim.simulation.prediction.prediction import MOVING, drift_variance
 
 FOLLOWING_S = 3.0
 """Time headway up to which a vehicle follows another (HCM 2016, percent time spent following)."""
@@ -49,9 +48,6 @@ NEAR_TTC_S, NEAR_PET_S, NEAR_DRAC_MPS2 = 1.5, 1.0, 3.35
 JOINING_RAD = np.radians(25.0)
 """Who comes into a lane with more than that turns into it; lane changes have less than 10 degrees."""
 
-KEEPING_MPS = 0.5
-"""Lateral speed of who keeps a lane: a third to a half of those in lane changes."""
-
 ONCOMING_RAD = np.radians(135.0)
 MOST_PER_TICK_M = 5.0  # by which one gets ahead of another within a tick: 50 m/s
 WINDOW = round(4.0 / TICK_S)  # ticks around a lane's edge in which a lane change is looked at
@@ -63,11 +59,12 @@ def pair_tags(traffic: Traffic) -> Iterator[Tag]:
         beside = traffic.beside(r)
         if beside is None:
             continue
+        unseen = traffic.beside_unseen(r, beside)
         for o in np.flatnonzero(np.isfinite(beside.ahead_m).any(axis=1)).tolist():
             yield from _following(traffic, beside, r, o)
             if traffic.wheeled[o] and not traffic.table.agents[o].static:
-                yield from _lane_changes(traffic, beside, r, o)
-                yield from _overtaking(traffic, beside, r, o)
+                yield from _lane_changes(traffic, unseen, r, o)
+                yield from _overtaking(traffic, unseen, r, o)
                 yield from _oncoming(traffic, beside, r, o)
             elif traffic.table.group[o] == "pedestrian":
                 yield from _stepping_out(traffic, beside, r, o)
@@ -76,7 +73,8 @@ def pair_tags(traffic: Traffic) -> Iterator[Tag]:
 
 def lane_measures(traffic: Traffic, b: Beside, r: int, o: Index, n: Index) -> dict[str, Array]:
     """Return gap, relative speed and measures of criticality (N,) of agent `r` behind others (N,) at ticks (N,)."""
-    gap, own, speed = b.gap_m[o, n], traffic.speed_mps[r, n], traffic.speed_mps[o, n] * np.cos(b.turn_rad[o, n])
+    pace = traffic.continued.speed_mps
+    gap, own, speed = b.gap_m[o, n], pace[r, n], pace[o, n] * np.cos(b.turn_rad[o, n])
     return {
         "gap_m": gap, "relative_speed_mps": -(own - speed), "ttc_s": time_to_collision(gap, own - speed),
         "time_headway_s": time_headway(gap, own), "drac_mps2": deceleration_to_avoid(gap, own - speed),
@@ -122,7 +120,8 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
 
 
 def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
-    """Find when `o` comes into the lane of `r` ahead of it, or leaves it there."""
+    """Find when `o` comes into the lane of `r` ahead of it, or leaves it there; also within `UNSEEN_S` before and after both were seen."""
+    on = traffic.continued
     known = np.isfinite(b.aside_m[o]) & (b.ahead_m[o] > 0)
     inside = b.in_lane[o]
     off = np.abs(b.aside_m[o])
@@ -142,21 +141,21 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         measures = _at(lane_measures(traffic, b, r, np.array([o]), np.array([crossing])), 0)
         span = slice(crossing - 1, crossing + WINDOW) if enters else slice(max(crossing - WINDOW, 0), crossing + 1)
         led = b.leader[span] == o
-        if min(traffic.speed_mps[r, crossing], traffic.speed_mps[o, crossing]) < MOVING_MPS or not led.any():
+        if on.speed_mps[[r, o], crossing].min() < MOVING_MPS or not led.any():
             continue
         if measures["time_headway_s"] > LEADING_S:
             continue
         # Who joins turns itself; who was there before the other turned in behind it does not.
-        turn = abs(turned(traffic.course_rad[o], begin, end))
+        turn = abs(turned(on.course_rad[o], begin, end))
         joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD and turn > JOINING_RAD
         if not joins and (turn > JOINING_RAD or not _is_change_of(traffic, b, r, o, crossing)):
             continue
-        before, after = off[begin : crossing + 1], off[crossing : end + 1]
+        before, after = np.arange(begin, crossing + 1), np.arange(crossing, end + 1)
         outer, inner = (before, after) if enters else (after, before)
-        sigma, sigma_ahead = float(b.sigma_m[o, crossing]), np.hypot(*traffic.sigma_m[[r, o], crossing])
-        sure = probability_above(np.nanmax(outer), b.half_m, sigma)
-        sure *= probability_above(-np.nanmin(inner), -b.half_m, sigma)
-        sure *= probability_above(b.ahead_m[o, crossing], 0.0, sigma_ahead)
+        beyond, within = outer[np.nanargmax(off[outer])], inner[np.nanargmin(off[inner])]
+        sure = probability_above(off[beyond], b.half_m, b.sigma_m[o, beyond])
+        sure *= probability_above(-off[within], -b.half_m, b.sigma_m[o, within])
+        sure *= probability_above(b.ahead_m[o, crossing], 0.0, np.hypot(*on.sigma_m[[r, o], crossing]))
         tag = "merging" if joins else "cut_in" if enters else "cut_out"
         yield tag_of(traffic, tag, o, (begin, crossing, end), sure, r, lateral_speed_mps=abs(lateral), duration_s=(end - begin) * TICK_S,
                      side=np.sign(-lateral if enters else lateral), **measures)  # fmt: skip
@@ -167,6 +166,10 @@ def _is_change_of(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> bool:
     found = traffic.path(r)
     if found is None:
         return False
+    seen = np.flatnonzero(np.isfinite(traffic.drift_mps[[r, o]]).all(axis=0) & np.isfinite(b.ahead_m[o]))
+    if not len(seen):
+        return False
+    n = int(seen[np.abs(seen - n).argmin()])
     arrives = found.station_m <= found.station_m[n] + b.ahead_m[o, n]  # False for NaN
     last = max(int(np.flatnonzero(arrives)[-1]), n)
     own = np.abs(traffic.drift_mps[r, n : last + 1])
@@ -178,16 +181,9 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
 
     For `UNSEEN_S` before and after both were seen their speeds are supposed to be those of then.
     """
-    reach = (traffic.table.size_m[r, 0] + traffic.table.size_m[o, 0]) / 2
-    faster = traffic.speed_mps[o] - traffic.speed_mps[r]
-    ahead, aside, slower = b.ahead_m[o].copy(), b.aside_m[o].copy(), traffic.speed_mps[r].copy()
-    same, sigma = b.same_way[o].copy(), np.hypot(traffic.sigma_m[r], traffic.sigma_m[o])
-    drift = 2.0 * MOVING["vehicle"].along_mps2 ** 2
-    for edge, rows in out_of_sight(np.isfinite(ahead)):
-        lead_s = (rows - edge) * TICK_S
-        ahead[rows], aside[rows] = ahead[edge] + faster[edge] * lead_s, aside[edge]
-        same[rows], slower[rows] = same[edge], slower[edge]
-        sigma[rows] = np.sqrt(sigma[edge] ** 2 + drift * drift_variance(np.abs(lead_s)))
+    on, reach = traffic.continued, (traffic.table.size_m[r, 0] + traffic.table.size_m[o, 0]) / 2
+    slower, faster, sigma = on.speed_mps[r], on.speed_mps[o] - on.speed_mps[r], np.hypot(on.sigma_m[r], on.sigma_m[o])
+    ahead, aside, same = b.ahead_m[o], b.aside_m[o], b.same_way[o]
     passed = latched(ahead > reach, ahead < -reach, np.ones(len(ahead), dtype=bool))
     for n in (np.flatnonzero(passed[1:] & ~passed[:-1]) + 1).tolist():
         start = int(np.flatnonzero(ahead[:n] < -reach)[-1])
@@ -200,9 +196,8 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         middle = start + int(np.argmin(np.abs(ahead[part])))
         sure = probability_above(-ahead[start], 0.0, sigma[start]) * probability_above(ahead[n], 0.0, sigma[n])
         clearance = abs(aside[middle]) - traffic.table.size_m[[r, o], 1].sum() / 2
-        relative = (ahead[n] - ahead[start]) / ((n - start) * TICK_S) if np.isnan(faster[middle]) else faster[middle]
         yield tag_of(traffic, "overtaking", o, (start, middle, n), sure, r, lateral_gap_m=clearance, side=np.sign(aside[middle]),
-                     relative_speed_mps=relative, duration_s=(n - start) * TICK_S)  # fmt: skip
+                     relative_speed_mps=faster[middle], duration_s=(n - start) * TICK_S)  # fmt: skip
 
 
 def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:

@@ -196,8 +196,9 @@ class Base:
         if not set(ids) <= set(traffic.ids):
             raise ConfigError(f"{row['file']}: has no agents {', '.join(ids)}; index it again with --fresh")
         agents = tuple(_continued(traffic, traffic.ids.index(id), begin_s, end_s) for id in ids)
+        signals = tuple(replace(signal, t_s=signal.t_s - begin_s) for signal in scenario.signals)
         cut = replace(
-            scenario, agents=agents, duration_s=end_s - begin_s, tags=None, signals=(), cameras=(), sensors=()
+            scenario, agents=agents, duration_s=end_s - begin_s, tags=None, signals=signals, cameras=(), sensors=()
         )
         moments = {row["agent"]: row["t_s"] - begin_s}
         if "other" in row:

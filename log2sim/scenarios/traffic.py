@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -47,6 +47,9 @@ GUIDED_M, FITTED_M = 8.0, 30.0
 
 BEND_SIGMA_1PM = 0.002
 """Standard deviation of the curvature there: lateral offsets are uncertain by half of it times the squared distance."""
+
+KEEPING_MPS = 0.5
+"""Lateral speed of who keeps a lane: a third to a half of those in lane changes."""
 
 LANE_CHANGE_S = 8.0
 """Longest lane change: 95 of 100 take less (Toledo and Zohar 2007)."""
@@ -195,9 +198,37 @@ class Traffic:
             heading_sigma = np.sqrt(2.0) * self.sigma_m[r, n] / FITTED_M  # of the line through its last places
             both, bend = self.sigma_m[a, n] ** 2 + self.sigma_m[r, n] ** 2, BEND_SIGMA_1PM * beyond**2 / 2
             sigma[a, n] = np.sqrt(both + (heading_sigma * beyond) ** 2 + bend**2)
+        return Beside(ahead, aside, turn, self._gap(r, ahead), sigma, self.half_lane_m(r))
+
+    def beside_unseen(self, r: int, seen: Beside) -> Beside:
+        """Return where all agents are relative to agent `r` also for `UNSEEN_S` before and after both were seen.
+
+        Speeds stay as they were; who changes lanes goes on to do so until it is amid one, all others keep theirs.
+        """
+        ahead, aside, turn, sigma = (c.copy() for c in (seen.ahead_m, seen.aside_m, seen.turn_rad, seen.sigma_m))
+        lost, width = 1.0 * np.isnan(self.place_m), 2.0 * seen.half_m
+        now, second = np.arange(self.place_m.shape[1]), round(1.0 / TICK_S)
+        along = self.speed_mps * np.cos(turn) - self.speed_mps[r]
+        for o in np.flatnonzero(np.isfinite(ahead).any(axis=1)).tolist():
+            across_mps2 = MOVING[str(self.table.group[o])].across_mps2
+            for edge, rows in out_of_sight(np.isfinite(seen.ahead_m[o])):
+                lead_s = (rows - edge) * TICK_S
+                near = np.flatnonzero(np.isfinite(seen.aside_m[o]) & (np.abs(now - edge) <= second))
+                lateral = np.polyfit(near * TICK_S, seen.aside_m[o, near], 1)[0] if len(near) > second // 2 else 0.0
+                way = (lateral if abs(lateral) > KEEPING_MPS else 0.0) * lead_s
+                ahead[o, rows] = ahead[o, edge] + along[o, edge] * lead_s
+                lane = aside[o, edge] / width
+                middles = np.floor(lane) * width - aside[o, edge], np.ceil(lane) * width - aside[o, edge]
+                aside[o, rows] = aside[o, edge] + np.clip(way, *middles)
+                turn[o, rows] = turn[o, edge]
+                drift = np.maximum(lost[o, rows] + lost[r, rows], 1.0) * drift_variance(np.abs(lead_s))
+                rate = 2.0 * (self.sigma_m[o, edge] * lead_s) ** 2  # of two places a second apart
+                sigma[o, rows] = np.sqrt(sigma[o, edge] ** 2 + rate + across_mps2**2 * drift)
+        return replace(seen, ahead_m=ahead, aside_m=aside, turn_rad=turn, gap_m=self._gap(r, ahead), sigma_m=sigma)
+
+    def _gap(self, r: int, ahead_m: Array) -> Array:
         length = self.table.size_m[:, 0]
-        gap = np.abs(ahead) - ((length + length[r]) / 2)[:, None]
-        return Beside(ahead, aside, turn, gap, sigma, self.half_lane_m(r))
+        return np.asarray(np.abs(ahead_m) - ((length + length[r]) / 2)[:, None])
 
     @cached_property
     def continued(self) -> Continued:

@@ -319,43 +319,51 @@ class Paths:
                 yield Conflict(i, j, enters, leaves, merges, patience)
 
     def stops(self, features: MapFeatures | None, signals: Sequence[Signal]) -> Iterator[Stop]:
-        """Find where drivers stop at lights: at the last stop line before one, else at a crosswalk there, else `BEFORE_LIGHT_M` before it.
-
-        Of several lights that face one place the one least aside counts.
-        """
-        painted = features.markings if features is not None and signals else ()
-        edges: dict[str, list[tuple[complex, complex]]] = {"stop_line": [], "crosswalk": []}
-        for marking in (m for m in painted if m.kind in edges):
-            corner = (marking.points_m[:, 0] + 1j * marking.points_m[:, 1]).tolist()
-            edges[marking.kind] += zip(corner, corner[1:] + (corner[:1] if marking.kind == "crosswalk" else []))
+        """Find where drivers stop at lights."""
         for m in np.flatnonzero(self.group != "pedestrian").tolist() if signals else ():
-            at = {
-                kind: [_crossed(self.points[:, m], *edge) * self.step_m[m] for edge in known]
-                for kind, known in edges.items()
-            }
-            station = np.full((len(signals), self.count), np.nan)
-            for r in range(self.count):
-                ways = [np.array([s[r] for s in at[kind]]) for kind in edges]
-                ahead = [self._stop_before(signal, m, r, ways) for signal in signals]
-                taken: list[float] = []
-                for k in sorted((k for k, found in enumerate(ahead) if found), key=lambda k: ahead[k][1]):  # type: ignore[index]
-                    where = ahead[k][0]  # type: ignore[index]
-                    if all(abs(where - other) > 1.0 for other in taken):
-                        taken.append(where)
-                        station[k, r] = where
-            yield from (Stop(m, s, where) for s, where in zip(signals, station) if np.isfinite(where).any())
+            found = stop_stations(self.points[:, m], self.direction[:, m], self.step_m[m], features, signals)
+            yield from (Stop(m, s, where) for s, where in zip(signals, found) if np.isfinite(where).any())
 
-    def _stop_before(self, signal: Signal, m: int, r: int, ways: Sequence[Array]) -> tuple[float, float] | None:
-        """Return the station at which mover m stops at a signal in rollout r, and how far aside that is; None where it is not on its way."""
-        place = complex(signal.position_m[0], signal.position_m[1])
-        nearest = float(np.abs(self.points[r, m] - place).argmin()) * self.step_m[m] - BEFORE_LIGHT_M
-        for stations in (*ways, np.array([nearest])):
-            for station in np.sort(stations[stations > 0])[::-1].tolist():
-                n = int(station / self.step_m[m])
-                found = light_ahead(signal, self.points[r, m, n], float(np.angle(self.direction[r, m, n])))
+
+def stop_stations(
+    points: Complex, direction: Complex, step_m: float, features: MapFeatures | None, signals: Sequence[Signal]
+) -> Array:
+    """Return how far along ways (R, N), `step_m` apart, it is to stop at each of S lights (S, R), m; NaN where a light is for others.
+
+    That is at the last stop line before the light, else at a crosswalk there, else `BEFORE_LIGHT_M` before it. Of several lights that
+    face one place the one least aside counts.
+    """
+    painted = features.markings if features is not None else ()
+    edges: dict[str, list[tuple[complex, complex]]] = {"stop_line": [], "crosswalk": []}
+    for marking in (m for m in painted if m.kind in edges):
+        corner = (marking.points_m[:, 0] + 1j * marking.points_m[:, 1]).tolist()
+        edges[marking.kind] += zip(corner, corner[1:] + (corner[:1] if marking.kind == "crosswalk" else []))
+    at = [
+        np.array([_crossed(points, *edge) * step_m for edge in known]).reshape(-1, len(points))
+        for known in edges.values()
+    ]
+    out = np.full((len(signals), len(points)), np.nan)
+    for r in range(len(points)):
+        ahead = []
+        for k, signal in enumerate(signals):
+            place = complex(signal.position_m[0], signal.position_m[1])
+            nearest = float(np.abs(points[r] - place).argmin()) * step_m - BEFORE_LIGHT_M
+            for station in (
+                s
+                for kind in (*(a[:, r] for a in at), np.array([nearest]))
+                for s in np.sort(kind[kind > 0])[::-1].tolist()
+            ):
+                n = int(station / step_m)
+                found = light_ahead(signal, points[r, n], float(np.angle(direction[r, n])))
                 if found is not None:
-                    return station, abs(found[1])
-        return None
+                    ahead.append((abs(found[1]), k, station))
+                    break
+        taken: list[float] = []
+        for _, k, station in sorted(ahead):
+            if all(abs(station - other) > 1.0 for other in taken):
+                taken.append(station)
+                out[k, r] = station
+    return out
 
 
 def _crossed(way: Complex, one: complex, two: complex) -> Array:

@@ -8,9 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, Measurements, Track
+from log2sim.datatypes import GROUP_OF, RELATED_GROUPS, Measurements, Track
 from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs
-from log2sim.tracking.forward import ACCELERATION_MPS2, first_velocity, measurement_noise, predict, update
+from log2sim.tracking.forward import (
+    ACCELERATION_MPS2,
+    OTHER_GROUP_COST,
+    first_velocity,
+    measurement_noise,
+    predict,
+    update,
+)
 
 # People run at up to 3 m/s in traffic; the speed is measured over this time, in which noise moves a center little.
 MAX_PEDESTRIAN_SPEED_MPS = 3.0
@@ -151,7 +158,7 @@ def stitch(
 
 
 def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of tracks of one group of which the second starts after the first ends: soon, or where it stood."""
+    """Return the pairs of tracks of one group or related ones of which the second starts after the first ends: soon, or where it stood."""
     from scipy.spatial import cKDTree
 
     order = np.argsort(ends.first_ns, kind="stable")
@@ -172,8 +179,10 @@ def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], ND
         b = np.concatenate([b, slow_start[np.concatenate([*found, []]).astype(np.intp)]])
     pairs = np.unique(a * len(starts) + b)
     a, b = pairs // len(starts), pairs % len(starts)
-    same = (ends.group[a] == ends.group[b]) & (ends.first_ns[b] > ends.last_ns[a])
-    return a[same], b[same]
+    related = np.isin(ends.group, RELATED_GROUPS)
+    alike = (ends.group[a] == ends.group[b]) | related[a] & related[b]
+    possible = alike & (ends.first_ns[b] > ends.last_ns[a])
+    return a[possible], b[possible]
 
 
 def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
@@ -186,7 +195,8 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     stationary = ends_stationary[a] & starts_stationary[b]
     last, first = ends.last[a], ends.first[b]
     offset_m = np.hypot(*(last - first)[:, :2].T)
-    same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M)
+    other_group = np.where(ends.group[a] == ends.group[b], 0.0, OTHER_GROUP_COST)
+    same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M) & (other_group == 0)
     cost = np.where(same_place, offset_m, np.inf)
     half = gap_s[:, None] / 2
     midpoint_offset_m = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
@@ -199,7 +209,10 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise)
     backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise)
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
-    squared = np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
+    squared = (
+        np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
+        + other_group[near]
+    )
     position_covariance = covariance[:, :2, :2]
     certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
     good = certain & (squared <= CHI2_4DOF_999)

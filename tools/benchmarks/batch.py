@@ -1,9 +1,11 @@
 """Rate, failures, memory and overhead of `log2sim batch` on many small logs that are written for it.
 
     python tools/bench.py batch FOLDER --logs 10000 --jobs 2
+    python tools/bench.py batch FOLDER --logs 1000 --jobs 2 --scenarios
 
 One short drive is synthesized; each log is a copy of it at another time and place, with records that are links to the same files, so that
 10,000 logs take seconds to write. All of them must give the same number of agents, but for those that are damaged on purpose.
+With --scenarios it replays scenarios of random traffic instead, eight vehicles over 20 s, a hundred of them different.
 FOLDER/logs is written once; FOLDER/out goes on where an earlier call was stopped, so remove it for a new measurement.
 """
 
@@ -16,8 +18,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.tag_worlds import traffic
 from log2sim.batch import plan_batch, run_batch
-from log2sim.batch.folder import Row, sum_up
+from log2sim.batch.discovery import SCENARIO
+from log2sim.batch.folder import SCENARIO_FILE, Row, sum_up
 from log2sim.batch.run import local_workers
 from log2sim.cli.progress import progress
 from log2sim.config import Config
@@ -48,15 +52,22 @@ STEP_NS, STEP_M = 10**12, 7.0
 SHIFTED = {"t_ns": STEP_NS, "x_m": STEP_M, "y_m": -STEP_M}
 
 
-DAMAGED = 10
+DAMAGED, DIFFERENT = 10, 100
 
 
-def main(folder: Path, logs: int = 10_000, jobs: int = 2) -> None:
+def main(folder: Path, logs: int = 10_000, jobs: int = 2, scenarios: bool = False) -> None:
     """Write the logs, of which ten have an index that is cut off, run them and print a table."""
     root = folder / "logs"
-    if not root.exists():
+    if not root.exists() and scenarios:
+        for k in range(logs):
+            (root / f"{k:06d}").mkdir(parents=True)
+            if k < DIFFERENT:
+                traffic(k, count=8, duration_s=20.0).scenario.save(root / f"{k:06d}" / SCENARIO_FILE)
+            else:
+                os.link(root / f"{k % DIFFERENT:06d}" / SCENARIO_FILE, root / f"{k:06d}" / SCENARIO_FILE)
+    elif not root.exists():
         write_logs(root, logs)
-    for name, value in measure(root, folder / "out", jobs).items():
+    for name, value in measure(root, folder / "out", jobs, SCENARIO if scenarios else "auto").items():
         print(f"{name:32}  {value}")
 
 
@@ -99,10 +110,10 @@ def _moved(name: str, text: str, steps: int) -> str:
     return str(int(text) + steps * STEP_NS) if name == "t_ns" else repr(float(text) + steps * SHIFTED[name])
 
 
-def measure(root: Path, out: Path, jobs: int) -> dict[str, str]:
+def measure(root: Path, out: Path, jobs: int, format: str) -> dict[str, str]:
     """Run the batch: what ran, how fast, and what it cost beside the logs themselves."""
     began = time.perf_counter()
-    batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": "lidar:labels"}))
+    batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": "lidar:labels"}), format=format)
     found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
     before = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
     with progress(quiet=False) as report:

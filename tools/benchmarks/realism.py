@@ -1,9 +1,10 @@
 """Realism of simulated agents as the Waymo Open Sim Agents Challenge measures it, on any scenarios with known motion.
 
-    python tools/bench.py realism SCENARIO.json ...
+    python tools/bench.py realism SCENARIO.json|SCENE.toml|LOG|KITTI_TRACKING ... [--each]
 
-From moments every 8 s all agents are simulated, of whom the second before is known. Each row is the mean over moments; the
-last says what "drivers" reaches above "idm". Components of the map are left out where a scenario has no lanes.
+Logs are taken by their labels, and so are the sequences of the KITTI tracking benchmark with `ego_motion`. From moments every 8 s all
+agents are simulated, of whom the second before is known. Each row is the mean over moments; the last says what "drivers" reaches above
+"idm"; with --each there is such a table for each scenario, too. Components of the map are left out where a scenario has no lanes.
 """
 
 from __future__ import annotations
@@ -14,20 +15,22 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import markdown
-from log2sim.datatypes import Scenario
+from benchmarks.warnings import scenarios
 from log2sim.simulation.drivers import MODELS, roll_out
 from log2sim.simulation.metrics.realism import COMPONENTS, Realism, Road, realism
 from log2sim.simulation.present import judged, moments, recorded
 
 COUNT, HORIZON_S, EVERY_S = 32, 8.0, 8.0
 
+Results = dict[str, list[Realism]]
 
-def main(scenarios: list[Path]) -> None:
+
+def main(logs: list[Path], each: bool = False) -> None:
     """Measure all models by 32 rollouts of 8 s and print the table."""
-    found: dict[str, list[Realism]] = {model: [] for model in MODELS}
+    found: Results = {model: [] for model in MODELS}
     spent, agents = dict.fromkeys(MODELS, 0.0), 0
-    for path in scenarios:
-        scenario = Scenario.load(path)
+    for name, scenario in (pair for path in logs for pair in scenarios(path)):
+        before = {model: len(results) for model, results in found.items()}
         lanes = scenario.map_features.lanes if scenario.map_features else ()
         road = Road(lanes) if lanes else None
         for now_s in moments(scenario, EVERY_S, HORIZON_S):
@@ -40,14 +43,22 @@ def main(scenarios: list[Path]) -> None:
                 drawn = roll_out(scenario, now_s, model, horizon_s=HORIZON_S, count=COUNT, rng=rng)
                 spent[model] += time.process_time() - begin
                 found[model].append(realism(log, drawn, who, now, road))
+        if each:
+            print(f"{name}\n\n{table({model: r[before[model] :] for model, r in found.items()})}\n")
+    print(table(found))
+    count = len(found[MODELS[0]])
+    times = ", ".join(f"{model} {1000 * s / max(COUNT * count, 1):.1f}" for model, s in spent.items())
+    print(f"\n{count} moments, {agents} agents; ms of processor time a rollout: {times}")
+
+
+def table(found: Results) -> str:
+    """Return the table of the means of all models."""
     columns, lines = {}, []
     for model, results in ((m, r) for m, r in found.items() if r):
         known = [[r.likelihood[name] for r in results if name in r.likelihood] for name in COMPONENTS]
         columns[model] = np.array([np.mean(values) if values else np.nan for values in known])
         whole = f"{np.mean([r.realism for r in results]):.3f}", f"{np.mean([r.min_ade_m for r in results]):.2f}"
-        ms = f"{1000 * spent[model] / (COUNT * len(results)):.1f}"
-        lines.append((model, *(f"{v:.3f}" for v in columns[model]), *whole, ms))
+        lines.append((model, *(f"{v:.3f}" for v in columns[model]), *whole))
     if columns:
-        lines.append(("drivers - idm", *(f"{v:+.3f}" for v in columns["drivers"] - columns["idm"]), "", "", ""))
-    print(markdown(("agents", *COMPONENTS, "realism", "minADE m", "ms a rollout"), lines))
-    print(f"\n{len(found[MODELS[0]])} moments, {agents} agents")
+        lines.append(("drivers - idm", *(f"{v:+.3f}" for v in columns["drivers"] - columns["idm"]), "", ""))
+    return markdown(("agents", *COMPONENTS, "realism", "minADE m"), lines)
