@@ -100,7 +100,7 @@ class FrameRow:
 
     stamp_ns: int  # of the first column of the TOP LiDAR's turn
     world_T_vehicle: Array  # (4, 4): defines the frame of points and labels, about the middle of the turn
-    images: Mapping[int, ImageTimes]
+    images: dict[int, ImageTimes]
     lasers: tuple[int, ...]  # numbers of the LiDARs with points
 
 
