@@ -415,9 +415,7 @@ class Scenario:
         )
         for signal in scenario.signals:
             if len(signal.t_s) != len(signal.state):
-                raise ScenarioError(
-                    f"signal '{signal.id}': {len(signal.t_s)} times, {len(signal.state)} states; expected equal"
-                )
+                raise ScenarioError(f"signal '{signal.id}': {len(signal.t_s)} times for {len(signal.state)} states")
             if np.any(np.diff(signal.t_s) <= 0):
                 raise ScenarioError(f"signal '{signal.id}': t_s does not increase")
         unique_ids("agent", scenario.agents)

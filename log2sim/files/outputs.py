@@ -53,7 +53,7 @@ def claim(target: Path, *, overwrite: bool) -> None:
     except BlockingIOError:
         if not overwrite:
             raise ConfigError(
-                f"{target}: another run is about to write it; wait for that, choose another name or pass --overwrite"
+                f"{target}: another run is about to write it; wait, choose another name or pass --overwrite"
             ) from None
     except OSError as error:
         raise ConfigError(f"{target}: cannot be written: {error.strerror or error}; choose another place") from None

@@ -119,16 +119,16 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "labels": "log2sim.perception.detect3d.detectors:create",
     },
     "export": {
-        "openscenario": "log2sim.export.openscenario.write:EXPORTER",
-        "carla": "log2sim.export.carla:EXPORTER",
-        "csv": "log2sim.export.csv_table:EXPORTER",
-        "scenarionet": "log2sim.export.scenarionet:EXPORTER",
-        "commonroad": "log2sim.export.commonroad:EXPORTER",
-        "lanelet2": "log2sim.export.lanelet2:EXPORTER",
-        "openlabel": "log2sim.export.openlabel:EXPORTER",
-        "osi": "log2sim.export.osi:EXPORTER",
-        "mcap": "log2sim.export.mcap:EXPORTER",
-        "rerun": "log2sim.export.rerun:EXPORTER",
+        "openscenario": "log2sim.export.openscenario.write",
+        "carla": "log2sim.export.carla",
+        "csv": "log2sim.export.csv_table",
+        "scenarionet": "log2sim.export.scenarionet",
+        "commonroad": "log2sim.export.commonroad",
+        "lanelet2": "log2sim.export.lanelet2",
+        "openlabel": "log2sim.export.openlabel",
+        "osi": "log2sim.export.osi",
+        "mcap": "log2sim.export.mcap",
+        "rerun": "log2sim.export.rerun",
     },
     "policy": {},
     "vehicle_model": {
@@ -181,8 +181,9 @@ def load(kind: str, name: str) -> Any:
 
 
 def _import(place: str) -> Any:
-    module, _, attribute = place.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    name, _, attribute = place.partition(":")
+    module = importlib.import_module(name)
+    return getattr(module, attribute) if attribute else module
 
 
 def is_built_in(kind: str, name: str) -> bool:

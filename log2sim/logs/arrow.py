@@ -323,9 +323,7 @@ def _check_sizes(rows: int, unpacked_bytes: int, limits: TableLimits) -> None:
     if not 0 <= rows <= limits.rows:
         raise ValueError(f"{rows} rows, more than the {limits.rows} that a table may have")
     if unpacked_bytes > limits.unpacked_bytes:
-        raise ValueError(
-            f"unpacks to {unpacked_bytes} bytes, more than the {limits.unpacked_bytes} that a table may have"
-        )
+        raise ValueError(f"unpacks to {unpacked_bytes} bytes, more than the {limits.unpacked_bytes} allowed")
 
 
 # Decoded rows are kept up to this size; see `ParquetRows`.

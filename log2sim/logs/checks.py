@@ -93,9 +93,7 @@ def _pinhole(camera: Camera, where: str) -> Iterator[tuple[str, bool]]:
     for field, value_px in (("fx", camera.K[0, 0]), ("fy", camera.K[1, 1])):
         widths = float(value_px) / camera.width_px
         if not MIN_FOCAL_WIDTHS <= widths <= MAX_FOCAL_WIDTHS:
-            expected = (
-                f"expected {MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the size of the images"
-            )
+            expected = f"expected {MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the image size"
             yield f"{where}: its focal length {field} is {value_px:.6g} px, {widths:.3g} image widths; {expected}", True
     limit = np.tan(np.radians(MAX_RAY_DEGREES))
     for field, axis, size_px in (("cx", 0, camera.width_px), ("cy", 1, camera.height_px)):

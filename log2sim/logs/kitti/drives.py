@@ -55,9 +55,7 @@ class KittiRawReader(FolderReader):
     """Reader of KITTI raw drives; the root is a drive, its date folder or the parent of date folders."""
 
     name = "kitti"
-    looks_for = (
-        "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
-    )
+    looks_for = "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or its parent"
 
     def find(self, path: Path) -> dict[str, Path]:
         """Find the drives at a folder by name."""
@@ -251,9 +249,7 @@ def _nominal_stamps(numbers: Iterable[int], period_ns: int = PERIOD_NS) -> NDArr
 SPLITS = ("training", "testing")
 OBJECT_PERIOD_NS = 100_000_000_000
 IMAGES = "image_2"
-SINGLE_FRAMES = (
-    "single frames: each is taken to be 100 s after the one before, and the ego to stand still; use detect and evaluate"
-)
+SINGLE_FRAMES = "single frames: taken to be 100 s apart, and the ego to stand still; use detect and evaluate"
 EGO_R_RECT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The ego has the axes of the rectified camera 0, in which labels stand upright."""
 LIDAR_HEIGHT_M = 1.73

@@ -45,9 +45,7 @@ class NuScenesReader(FolderReader):
     """Reader of nuScenes; the root holds folders of tables (v1.0-mini), or is one."""
 
     name = "nuscenes"
-    looks_for = (
-        "a folder of nuScenes tables with scene.json and sample_data.json (v1.0-mini), or the folder that holds it"
-    )
+    looks_for = "a folder of tables with scene.json and sample_data.json (v1.0-mini), or the folder that holds it"
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds tables, or is a folder of tables."""

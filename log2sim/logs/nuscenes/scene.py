@@ -46,9 +46,7 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     points = len(data) // BYTES_PER_POINT
     if len(data) % BYTES_PER_POINT:
-        raise RecordError(
-            f"{path} (stamp {t_ns}): {len(data)} bytes, expected five float32 (x, y, z, intensity, ring) a point"
-        )
+        raise RecordError(f"{path} (stamp {t_ns}): {len(data)} bytes, not 5 float32 (x, y, z, intensity, ring) a point")
     if points > MAX_SWEEP_POINTS:
         raise RecordError(f"{path} (stamp {t_ns}): {points} points, more than {MAX_SWEEP_POINTS}")
     rows = np.frombuffer(data, "<f4").reshape(-1, 5)

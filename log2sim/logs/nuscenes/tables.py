@@ -128,9 +128,7 @@ def _windows(path: Path, chunk_bytes: int) -> Iterator[tuple[bytes, int, int, in
                 cut = max(end - MAX_RECORD_BYTES, 0)
                 data, begin, offset = data[cut:], end - cut, offset + cut
     except OSError as problem:
-        raise LogError(
-            f"{path}: cannot be read: {problem.strerror}; nuScenes stores it with the other tables"
-        ) from None
+        raise LogError(f"{path}: cannot be read: {problem.strerror}; it belongs to the other tables") from None
 
 
 def _record_around(data: bytes, at: int, where: str) -> Record:

@@ -459,9 +459,7 @@ class PoseSources:
         problems = list[str]()
         keep = strictly_increasing(stamps[valid], name, problems)
         if not valid.all():
-            problems.append(
-                f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or no rotations; dropped"
-            )
+            problems.append(f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or not rigid; dropped")
         base = map_T_child[keep] @ child_T_base
         return FoundPoses(stamps[valid][keep], base, self._local_map(), source, name, (*notes, *problems))
 
@@ -476,9 +474,7 @@ class PoseSources:
         rows, stamps = rows[good][keep], stamps[good][keep]
         rotation, valid = PoseTrack(t_ns, transform(base_R, np.zeros(3))).at(stamps)
         if not (good.all() and valid.all()):
-            problems.append(
-                f"{name}: {len(good) - int(valid.sum())} of {len(good)} fixes have no position or no orientation"
-            )
+            problems.append(f"{name}: {len(good) - int(valid.sum())} of {len(good)} fixes lack position or orientation")
         rows, stamps, rotation = rows[valid], stamps[valid], rotation[valid]
         if len(rows) < MIN_POSES:
             raise NoPoses(f"{len(rows)} fixes with an orientation of {imu}")

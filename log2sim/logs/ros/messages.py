@@ -64,9 +64,7 @@ class Intrinsics(Section):
         lengths = DISTORTION_LENGTHS[self.distortion_model]
         if len(self.distortion) not in lengths:
             expected = " or ".join(map(str, lengths))
-            raise ValueError(
-                f"distortion has {len(self.distortion)} values, '{self.distortion_model}' takes {expected}"
-            )
+            raise ValueError(f"distortion has {len(self.distortion)} values; '{self.distortion_model}': {expected}")
         return self
 
 

@@ -472,9 +472,7 @@ class _Opening:
                 if info is None:
                     info, first = decode_bytes(topic, raw, self.bag.where(topic, i)), raw[12:]
                 elif raw[12:] != first:
-                    self.notes.append(
-                        f"{chosen.info}: changes at message {i}; the first calibration is used throughout"
-                    )
+                    self.notes.append(f"{chosen.info}: changes at message {i}; the first one is used throughout")
                     break
             except RecordError:
                 continue

@@ -292,5 +292,5 @@ class SqliteBag:
             self.notes.append(f"{self.path.name}: damaged after {count} messages: {one_line(problem)}")
         if odd:
             self.notes.append(
-                f"{self.path.name}: {odd} of {count} messages have no whole number as topic or stamp; left out"
+                f"{self.path.name}: {odd} of {count} messages without whole numbers as topic and stamp; left out"
             )
