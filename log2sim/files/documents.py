@@ -145,10 +145,10 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
         near = difflib.get_close_matches(str(location[-1]), known, 1)
         hint = f"; did you mean '{_key([*location[:-1], near[0]])}'?" if near else f"; known: {', '.join(known)}"
         return f"unknown key '{_key(location)}'{hint}"
-    if problem["type"] == "missing" and isinstance(location[-1], str):
-        return f"'{_key(location)}' is missing"
-    if problem["type"] == "missing":  # a list that is too short
-        location = location[:-1]
+    if problem["type"] == "missing":
+        if isinstance(location[-1], str):
+            return f"'{_key(location)}' is missing"
+        location = location[:-1]  # a list that is too short
     expected = _schema_at(schema, location)
     if isinstance(found, list | tuple) and expected.get("type") == "array":
         low, high = expected.get("minItems", 0), expected.get("maxItems")

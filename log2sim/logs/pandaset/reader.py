@@ -378,7 +378,15 @@ def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, 
             continue
         size_px = first_image_size(list(files.values()))
         mount = _mount(track, t_ns, map_T_cam, folder, notes)
-        cameras[name] = Camera(name, *size_px, _intrinsics(folder / "intrinsics.json"), "ego", mount)
+        path_K = folder / "intrinsics.json"
+        try:
+            fx, fy, cx, cy = (float(read_json(path_K)[k]) for k in ("fx", "fy", "cx", "cy"))
+        except (TypeError, KeyError, ValueError):
+            raise LogError(f"{path_K}: expected the numbers fx, fy, cx, cy") from None
+        if fx <= 0 or fy <= 0:
+            raise LogError(f"{path_K}: fx {fx:g}, fy {fy:g}, expected focal lengths above 0")
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        cameras[name] = Camera(name, *size_px, K, "ego", mount)
         numbers = np.array(list(files))
         numbers = numbers[strictly_increasing(t_ns[numbers], name, notes)]
         streams[name] = image_stream(name, t_ns[numbers], [files[int(n)] for n in numbers], size_px)
@@ -447,16 +455,6 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
             )
             raise LogError(f"{where}: {str(stamp)[:40]!a}, {expected}")
     return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64), sensor_poses
-
-
-def _intrinsics(path: Path) -> Array:
-    try:
-        fx, fy, cx, cy = (float(read_json(path)[k]) for k in ("fx", "fy", "cx", "cy"))
-    except (TypeError, KeyError, ValueError):
-        raise LogError(f"{path}: expected the numbers fx, fy, cx, cy") from None
-    if fx <= 0 or fy <= 0:
-        raise LogError(f"{path}: fx {fx:g}, fy {fy:g}, expected focal lengths above 0")
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: Path, notes: list[str]) -> Array:

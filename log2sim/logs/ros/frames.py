@@ -110,7 +110,7 @@ class FrameTree:
     def moving_ancestors(self, frame: str) -> list[str]:
         """Ancestors of a frame that it moves against, from the nearest to the root."""
         moved, found = False, []
-        for _, edge in self._path_up(frame):
+        for edge in self._path_up(frame):
             moved |= not edge.static
             if moved:
                 found.append(edge.parent)
@@ -134,7 +134,7 @@ class FrameTree:
         Others are interpolated, and held before their first and after their last stamp, as a localization that corrects an
         odometry now and then is used.
         """
-        path = [edge for _, edge in self._path_up(frame)]
+        path = self._path_up(frame)
         last = next((k for k, edge in enumerate(path) if edge.parent == fixed), None)
         if last is None:
             return None
@@ -154,26 +154,22 @@ class FrameTree:
     def _static_ancestors(self, frame: str) -> dict[str, Array]:
         """Poses ancestor_T_frame by ancestor, up to the first edge that moves."""
         found, pose = {frame: np.eye(4)}, np.eye(4)
-        for _, edge in self._path_up(frame):
+        for edge in self._path_up(frame):
             if not edge.static:
                 break
             pose = edge.parent_T_child[0] @ pose
             found[edge.parent] = pose
         return found
 
-    def _path_up(self, frame: str) -> list[tuple[str, Edge]]:
-        path: list[tuple[str, Edge]] = []
-        passed = [frame]
+    def _path_up(self, frame: str) -> list[Edge]:
+        path, passed = list[Edge](), [frame]
         while frame in self._rows:
             parents = self._rows[frame]
             if len(parents) > 1:
                 names = "' and '".join(sorted(parents)[:2])
-                raise LogError(
-                    f"{self._where}: frame '{frame}' has two parents in /tf, '{names}'; a frame may have one"
-                )
-            edge = self._edge(frame, next(iter(parents)))
-            path.append((frame, edge))
-            frame = edge.parent
+                raise LogError(f"{self._where}: frame '{frame}' has two parents in /tf, '{names}'; one is allowed")
+            path.append(self._edge(frame, next(iter(parents))))
+            frame = path[-1].parent
             if frame in passed:
                 raise LogError(f"{self._where}: the frames of /tf form a cycle: {' -> '.join([*passed, frame])}")
             passed.append(frame)
@@ -232,24 +228,23 @@ class EgoFrame:
 
 
 def choose_base(
-    tree: FrameTree, sensor_frames: list[str], pose_frames: Iterable[str], fixed_frames: tuple[str, ...], given: str
+    tree: FrameTree, sensor_frames: list[str], pose_frames: list[str], fixed_frames: tuple[str, ...], given: str
 ) -> tuple[str | None, str]:
     """Choose the vehicle's frame, that of the settings if they give one, and say why; `pose_frames` are those of odometry."""
     if given:
         return given, "the settings name it"
-    pose_frames = list(pose_frames)
-    known = tree.frames | set(pose_frames) | set(sensor_frames)
+    known = {*tree.frames, *pose_frames, *sensor_frames}
     reasons = {frame: "by its name" for frame in BASE_FRAMES if frame in known}
     reasons |= {frame: "odometry gives its poses" for frame in pose_frames if frame not in reasons}
     # One that sensors are fixed to goes before one that they are not.
     ordered = sorted(reasons, key=lambda f: all(tree.mount(f, sensor) is None for sensor in sensor_frames))
     if ordered:
         return ordered[0], reasons[ordered[0]]
-    for frame in sensor_frames:
-        root = tree.rigid_root(frame)
-        if root not in fixed_frames:
-            return root, f"all sensors are fixed to it, and no frame is named {BASE_FRAMES[0]}"
-    return None, "the sensors stand still"
+    roots = (tree.rigid_root(frame) for frame in sensor_frames)
+    root = next((root for root in roots if root not in fixed_frames), None)
+    if root is None:
+        return None, "the sensors stand still"
+    return root, f"all sensors are fixed to it, and no frame is named {BASE_FRAMES[0]}"
 
 
 def place_ego(base: str | None, settings: EgoSettings, tree: FrameTree, camera_frames: Collection[str]) -> EgoFrame:
@@ -292,11 +287,10 @@ def measure_road(
         except RecordError as problem:
             notes.append(f"{name}: {problem}")
             continue
-        ego_T_lidar = lidar.mount_T_lidar
-        points = apply(ego_T_lidar, sweep.xyz_m)
-        radius = np.hypot(points[:, 0] - ego_T_lidar[0, 3], points[:, 1] - ego_T_lidar[1, 3])
+        points = apply(lidar.mount_T_lidar, sweep.xyz_m)
+        dx, dy, dz = (points - lidar.mount_T_lidar[:3, 3]).T
+        radius, height = np.hypot(dx, dy), -dz
         around = (radius > ROAD_RADIUS_M[0]) & (radius < ROAD_RADIUS_M[1])
-        height = ego_T_lidar[2, 3] - points[:, 2]
         z = points[around & (height > MIN_SENSOR_HEIGHT_M) & (height < MAX_SENSOR_HEIGHT_M), 2]
         if len(z) < MIN_ROAD_POINTS:
             notes.append(f"{name}: {len(z)} points around and below the sensor, too few to find the road")
@@ -305,13 +299,10 @@ def measure_road(
         mode_m = z.min() + (counts.argmax() + 0.5) * ROAD_BIN_M
         ground_m = float(np.median(z[np.abs(z - mode_m) < 2 * ROAD_BIN_M]))
         side = "below" if ground_m <= 0 else "above"
-        notes.append(
-            f"the road is {abs(ground_m):.2f} m {side} the origin of the ego in the frame '{frame.base}', measured in the "
-            f"first sweep of {name} (ego.ground_z_m)"
-        )
-        return ground_m, tuple(notes)
-    notes.append(f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
-    return 0.0, tuple(notes)
+        where = f"the origin of the ego in the frame '{frame.base}'"
+        measured = f"measured in the first sweep of {name} (ego.ground_z_m)"
+        return ground_m, (*notes, f"the road is {abs(ground_m):.2f} m {side} {where}, {measured}")
+    return 0.0, (*notes, f"the height of the road in '{frame.base}' is not known; taken as 0 (ego.ground_z_m)")
 
 
 MAP_FRAMES = ("map", "world", "earth", "utm")
@@ -431,37 +422,35 @@ class PoseSources:
     def _from_odometry(self, name: str) -> FoundPoses:
         messages, stamps = self._decoded(name)
         child = next((printable(m.child_frame_id).lstrip("/") for m in messages), "")
-        child_T_base = self.tree.mount(child, self.base)
-        notes: tuple[str, ...] = ()
+        child_T_base, note = self.tree.mount(child, self.base), ""
         if child_T_base is None:
             if child:
                 raise NoPoses(f"it is of the frame '{child}', from which there is no transform to '{self.base}'")
-            notes = (f"{name}: names no child_frame_id; taken as the pose of '{self.base}'",)
+            note = f"{name}: names no child_frame_id; taken as the pose of '{self.base}'"
             child_T_base = np.eye(4)
-        return self._poses_from_messages(name, stamps, [m.pose.pose for m in messages], child_T_base, notes)
+        poses = [m.pose.pose for m in messages]
+        return self._poses_from_messages("odometry", name, stamps, poses, child_T_base, note)
 
     def _from_poses(self, name: str) -> FoundPoses:
         messages, stamps = self._decoded(name)
         covariance = self.bag.topics[name].msgtype.endswith("PoseWithCovarianceStamped")
         poses = [m.pose.pose if covariance else m.pose for m in messages]
-        notes = (f"{name}: does not say whose pose it is; taken as that of '{self.base}'",)
-        return self._poses_from_messages(name, stamps, poses, np.eye(4), notes)
+        note = f"{name}: does not say whose pose it is; taken as that of '{self.base}'"
+        return self._poses_from_messages("pose", name, stamps, poses, np.eye(4), note)
 
     def _poses_from_messages(
-        self, name: str, stamps: NDArray[np.int64], messages: list[Any], child_T_base: Array, notes: tuple[str, ...]
+        self, source: str, name: str, stamps: NDArray[np.int64], messages: list[Any], child_T_base: Array, note: str
     ) -> FoundPoses:
-        source = "odometry" if name in self.topics.get("odometry", ()) else "pose"
         poses = [pose_of(m.position, m.orientation) for m in messages]
         valid = np.array([p is not None for p in poses], dtype=bool)
         if not valid.any():
             raise NoPoses("none of its orientations is a rotation")
-        map_T_child = np.array([p for p in poses if p is not None])
-        problems = list[str]()
-        keep = strictly_increasing(stamps[valid], name, problems)
+        notes, known = [note] if note else [], np.array([p for p in poses if p is not None])
+        keep = strictly_increasing(stamps[valid], name, notes)
         if not valid.all():
-            problems.append(f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or not rigid; dropped")
-        base = map_T_child[keep] @ child_T_base
-        return FoundPoses(stamps[valid][keep], base, self._local_map(), source, name, (*notes, *problems))
+            notes.append(f"{name}: {int((~valid).sum())} of {len(valid)} poses are not finite or not rigid; dropped")
+        base = known[keep] @ child_T_base
+        return FoundPoses(stamps[valid][keep], base, self._local_map(), source, name, tuple(notes))
 
     def _from_gnss(self, name: str) -> FoundPoses:
         imu, t_ns, base_R = self._orientations(name)
@@ -526,7 +515,6 @@ def _course_notes(poses: Array, imu: str) -> tuple[str, ...]:
     off_deg = np.degrees(np.median(wrap_angle(yaw_of(poses[chosen[:-1]]) - np.arctan2(step[:, 1], step[:, 0]))))
     if abs(off_deg) <= MAX_COURSE_ERROR_DEG:
         return ()
-    return (
-        f"{imu}: its heading is {off_deg:.0f} degrees off the direction of travel; is its orientation of axes east, north, up "
-        "(REP 103)? ego.rotation_wxyz or a static transform of its frame in the settings can correct it",
-    )
+    asked = "is its orientation of axes east, north, up (REP 103)?"
+    advice = "ego.rotation_wxyz or a static transform of its frame in the settings can correct it"
+    return (f"{imu}: its heading is {off_deg:.0f} degrees off the direction of travel; {asked} {advice}",)

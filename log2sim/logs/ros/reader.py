@@ -308,9 +308,14 @@ class _Opening:
             there = f"its topics are {', '.join(topics[:MAX_LISTED])}{more}" if topics else "it has no topics"
             raise LogError(f"{bag.place}: no images with CameraInfo and no point clouds in it; {there}")
         sensor_frames = [sensor.frame for sensor in self.sensors.values()]
-        base, why = ego.choose_base(
-            self.tree, sensor_frames, self._pose_frames(), FIXED_FRAMES, settings.ego.base_frame
-        )
+        pose_frames = list[str]()  # whose poses the odometry topics give
+        for name in roles.topics.get("odometry", ()):
+            raw = next((raw for raw in self.messages[name] if raw is not None), None)
+            if raw is not None:
+                child = printable(decode_bytes(bag.topics[name], raw, name).child_frame_id).lstrip("/")
+                pose_frames += [child] if child else []
+        named = settings.ego.base_frame
+        base, why = ego.choose_base(self.tree, sensor_frames, pose_frames, FIXED_FRAMES, named)
         frame = ego.place_ego(base, settings.ego, self.tree, {c.frame for c in roles.cameras.values()})
         stamped = self._stamps()
         span_ns = min(int(s.t_ns[0]) for s in stamped.values()), max(int(s.t_ns[-1]) for s in stamped.values())
@@ -372,16 +377,6 @@ class _Opening:
                 "frames": self.tree.describe(),
             },
         )
-
-    def _pose_frames(self) -> list[str]:
-        """Frames whose poses the odometry topics give."""
-        frames = []
-        for name in self.roles.topics.get("odometry", ()):
-            raw = next((raw for raw in self.messages[name] if raw is not None), None)
-            if raw is not None:
-                message = decode_bytes(self.bag.topics[name], raw, name)
-                frames.append(printable(message.child_frame_id).lstrip("/"))
-        return [frame for frame in frames if frame]
 
     def _poses(self, base: str | None, span_ns: tuple[int, int]) -> tuple[FoundPoses | None, list[dict[str, Any]]]:
         wanted = self.settings.poses

@@ -67,7 +67,7 @@ def camera_from_info(
 
 
 def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
-    values = np.asarray(_field(info, "D"), dtype=np.float64).ravel()
+    values = _values(info, "D")
     kind = printable(info.distortion_model).strip().lower()
     if not values.any():
         return "none", ()
@@ -75,26 +75,23 @@ def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
         raise CalibrationProblem("its distortion is not finite")
     limit = 8 if kind in BROWN else 4
     if kind not in BROWN + FISHEYE or values[limit:].any():
-        raise CalibrationProblem(
-            f"its distortion model '{kind}' with {len(values)} values is not read; known: {', '.join((*BROWN[:2], FISHEYE[0]))}"
-        )
-    values = values[:limit]
-    if kind in FISHEYE:
-        return "fisheye", tuple(np.append(values, np.zeros(4 - len(values))).tolist())
-    length = next(n for n in (4, 5, 8) if n >= len(values))
-    return "brown", tuple(np.append(values, np.zeros(length - len(values))).tolist())
+        known = ", ".join((*BROWN[:2], FISHEYE[0]))
+        raise CalibrationProblem(f"its distortion model '{kind}' with {len(values)} values is not read; known: {known}")
+    length = 4 if kind in FISHEYE else next(n for n in (4, 5, 8) if n >= len(values[:limit]))
+    padded = (*values[:limit].tolist(), *[0.0] * length)
+    return "fisheye" if kind in FISHEYE else "brown", padded[:length]
 
 
 def _matrix(info: Any, name: str, shape: tuple[int, int]) -> Array:
-    values = np.asarray(_field(info, name), dtype=np.float64)
+    values = _values(info, name)
     if values.size != shape[0] * shape[1]:
         raise CalibrationProblem(f"{name} has {values.size} values, expected {shape[0] * shape[1]}")
     return values.reshape(shape)
 
 
-def _field(info: Any, name: str) -> Any:
-    """Return D, K, R or P, which ROS 2 writes in lower case."""
-    return getattr(info, name if hasattr(info, name) else name.lower())
+def _values(info: Any, name: str) -> Array:
+    """Return the numbers of D, K, R or P, which ROS 2 writes in lower case."""
+    return np.asarray(getattr(info, name if hasattr(info, name) else name.lower()), dtype=np.float64).ravel()
 
 
 # Encodings of sensor_msgs/image_encodings.hpp: channels, bytes of each, conversion of OpenCV to BGR.
