@@ -109,10 +109,15 @@ def _check_named(bag: Bag, settings: TopicSettings, file: Path | None) -> None:
     """Check that the topics of the settings exist and have messages of the right type."""
     poses = settings.poses
     kinds = ("odometry", "pose", "gnss", "tf") if poses.source in ("auto", "none") else (poses.source,)
-    required = [(f"cameras.{n}.topic", c.topic, ("camera",)) for n, c in settings.cameras.items()]
-    required += [(f"lidars.{n}.topic", s.topic, ("lidar",)) for n, s in settings.lidars.items()]
-    optional = [(f"cameras.{n}.info", c.info, ("camera info",)) for n, c in settings.cameras.items()]
-    optional += [("poses.topic", poses.topic, kinds), ("poses.imu", poses.imu, ("imu",))]
+    required: list[tuple[str, str, tuple[str, ...]]] = [
+        *((f"cameras.{n}.topic", c.topic, ("camera",)) for n, c in settings.cameras.items()),
+        *((f"lidars.{n}.topic", s.topic, ("lidar",)) for n, s in settings.lidars.items()),
+    ]
+    optional: list[tuple[str, str, tuple[str, ...]]] = [
+        *((f"cameras.{n}.info", c.info, ("camera info",)) for n, c in settings.cameras.items()),
+        ("poses.topic", poses.topic, kinds),
+        ("poses.imu", poses.imu, ("imu",)),
+    ]
     for key, name, expected in [*required, *(entry for entry in optional if entry[1])]:
         if name not in bag.topics:
             near = plugins.nearest(name, list(bag.topics))
