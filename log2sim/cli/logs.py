@@ -190,7 +190,7 @@ def validate(
 
     if path.is_dir() or is_log_file(path):
         from log2sim.logs.native.reader import READER
-        from log2sim.logs.validation import list_gaps, validate_log
+        from log2sim.logs.opening import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)
         with progress(quiet=quiet) as report_progress:
