@@ -249,9 +249,8 @@ def studio(
     layers: dict[str, Any] = {}
     with progress(quiet=quiet) as report_progress:
         if log is not None:
-            recorded = open_recorded(
-                log, loaded, sequence, round(max_mb * 1e6), opt.camera_names(cameras), report_progress
-            )
+            wanted = opt.camera_names(cameras)
+            recorded = open_recorded(log, loaded, sequence, round(max_mb * 1e6), wanted, report_progress)
             layers["recorded"] = recorded
             if shows_ground(recorded.log):
                 layers["background"] = map_of(recorded.log, loaded, report_progress)

@@ -99,9 +99,8 @@ def _run(ended: Ended) -> NoReturn:
     except Exception as error:
         format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
         if format_message is None:
-            cause: BaseException | None = (
-                error  # Ctrl-C while libraries are being imported gives an ImportError from it
-            )
+            # Ctrl-C while libraries are being imported gives an ImportError from it.
+            cause: BaseException | None = error
             while cause is not None and not isinstance(cause, KeyboardInterrupt):
                 cause = cause.__cause__ or cause.__context__
             if cause is not None:

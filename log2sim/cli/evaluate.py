@@ -133,9 +133,7 @@ def _batch_figures(
     from log2sim.evaluation.metrics.truth import load_truth
 
     if not is_batch(path):
-        raise LogError(
-            f"{path}: is a folder, but not of a batch; give a file, or the folder that `log2sim batch` wrote"
-        )
+        raise LogError(f"{path}: is a folder, but of no batch; give a file, or the folder that `log2sim batch` wrote")
     with progress(quiet=quiet) as report_progress:
         result = evaluate_batch(
             BatchFolder.load(path),
@@ -223,9 +221,8 @@ def bench(
     known = truth_at(truth or log, used, sequence, provenance=made) if truth is not None or labeled else None
     scope = ScoreScope(range, opt.split_names(categories) or None)
     with progress(quiet=quiet) as report_progress:
-        result = run(
-            opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=report_progress
-        )
+        others = tuple(detector or ())
+        result = run(opened, chosen, truth=known, scope=scope, detectors=others, progress=report_progress)
     with together():
         write_json(out / "bench.json", bench_document(result))
         write_picture(result, out / "bench.png")

@@ -137,9 +137,8 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     for step in edits:
         for name in step.names:
             if name not in known:
-                some = ", ".join(known[:MAX_LISTED]) + f" and {len(known) - MAX_LISTED} more" * (
-                    len(known) > MAX_LISTED
-                )
+                more = len(known) - MAX_LISTED
+                some = ", ".join(known[:MAX_LISTED]) + f" and {more} more" * (more > 0)
                 raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {some}")
             if (step.kind, name) in seen and not isinstance(step, Only | Remove | Add):
                 raise ConfigError(f"{step.kind}: agent '{name}' is named twice; give one value")

@@ -403,9 +403,7 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
     Where both have states the mean by their variances stands. A gap is bridged by the cubic through the places and velocities
     at its ends, the mean of a motion of white acceleration, whose variance is a^2 s^3 (T - s)^3 / (3 T^3) at time s of T.
     """
-    longer = max(
-        (agent, other), key=lambda a: (int(a.waypoints.observed.sum()), a.waypoints.t_s[-1] - a.waypoints.t_s[0])
-    )
+    longer = max((agent, other), key=lambda a: (int(a.waypoints.observed.sum()), np.ptp(a.waypoints.t_s)))
     static = agent.static and other.static
     if static:
         waypoints = _mean_of_static(agent.waypoints, other.waypoints)

@@ -68,9 +68,8 @@ def scene_messages(steps: viewers.AgentSteps, origin: Array) -> Iterator[Message
 def record_messages(record: viewers.ViewerRecord, origin: Array) -> Iterable[Message]:
     """Return the messages of one record of the log."""
     if isinstance(record, viewers.UnreadableRecord):
-        text = LogMessage(
-            timestamp=_stamp(record.t_ns), level=LogMessage.WARNING, name=record.stream, message=record.reason
-        )
+        about = {"level": LogMessage.WARNING, "name": record.stream, "message": record.reason}
+        text = LogMessage(timestamp=_stamp(record.t_ns), **about)
         return [(record.t_ns, "/log", text)]
     if isinstance(record, viewers.ThinnedSweep):
         data, real = (record.points_map - origin).astype("<f4").tobytes(), PackedElementField.FLOAT32
@@ -137,9 +136,8 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
             timestamp=stamp, type=PointsAnnotation.LINE_LIST, points=points, outline_color=color, thickness=OUTLINE_PX,
         ))  # fmt: skip
         place = Point2(x=u, y=v)
-        texts.append(
-            TextAnnotation(timestamp=stamp, position=place, text=agent.id, font_size=TEXT_PX, text_color=color)
-        )
+        label = {"text": agent.id, "font_size": TEXT_PX, "text_color": color}
+        texts.append(TextAnnotation(timestamp=stamp, position=place, **label))
     yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
 
 

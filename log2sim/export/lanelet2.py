@@ -83,13 +83,11 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
             ring, z = np.array(outline.coords)[:4], np.full(2, marking.points_m[:, 2].mean())
             if np.hypot(*(ring[1] - ring[0])) < np.hypot(*(ring[2] - ring[1])):
                 ring = np.roll(ring, -1, axis=0)
-            edges = [
-                draft.way(np.column_stack([ring[side], z]), type="pedestrian_marking") for side in ([3, 2], [0, 1])
-            ]
+            sides = (np.column_stack([ring[side], z]) for side in ([3, 2], [0, 1]))
+            edges = [draft.way(points, type="pedestrian_marking") for points in sides]
             members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
-            draft.relation(
-                members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
-            )
+            tags = {"subtype": "crosswalk", "one_way": "no", "participant:pedestrian": "yes"}
+            draft.relation(members, type="lanelet", **tags)
     xml_text.write(draft.document(), folder / "lanelet2_map.osm")
     (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
 

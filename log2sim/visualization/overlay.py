@@ -205,11 +205,9 @@ MAX_POINTS = 60_000
 TILE_IN, HEAD_IN, FOOT_IN, CAPTION_IN, SIDE_IN = 5.2, 0.4, 0.5, 0.36, 0.85
 ABOVE_REACH_M, MAX_HEIGHT_M = 60.0, 3.0
 MOTION = {
-    "in the log": "compensated in the log",
-    "no times": "not compensated: no point times",
-    "at rest": "at rest",
+    "in the log": "compensated in the log", "no times": "not compensated: no point times", "at rest": "at rest",
     "moving": "compensated by point times",
-}
+}  # fmt: skip
 DPI = 150
 
 
@@ -243,9 +241,8 @@ def draw_moment(moment: OverlayMoment, *, box_name: str = "3D label") -> Figure:
         above = k == len(moment.shots)
         # The view from above is the last tile and takes what is left of its row.
         wide_in = (columns - column if above else 1) * tile_in - 0.12
-        ax = figure.add_axes(
-            ((column * tile_in + 0.06) / width, bottom_in / height, wide_in / width, picture_in / height)
-        )
+        left_in = column * tile_in + 0.06
+        ax = figure.add_axes((left_in / width, bottom_in / height, wide_in / width, picture_in / height))
         caption = _draw_above(ax, moment, wide_in / picture_in) if above else _draw_shot(ax, moment.shots[k], moment)
         text = "\n".join(printable_label(line, 110) for line in caption)
         ax.set_title(text, fontsize=6.5, color=INK, family=FONT, parse_math=False, pad=3, loc="left")

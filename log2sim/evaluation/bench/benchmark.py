@@ -345,9 +345,8 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     ax.text(0, 1.035, printable_label(label, 90), fontsize=6.8, color=MUTED, **style)
     hidden = [p.setting for p in panel.points if p.error is None]
     if hidden:
-        ax.text(
-            0.02, 0.025, printable_label(f"no error known: {', '.join(hidden)}"), fontsize=6.8, color=MUTED, **style
-        )
+        unknown = printable_label(f"no error known: {', '.join(hidden)}")
+        ax.text(0.02, 0.025, unknown, fontsize=6.8, color=MUTED, **style)
     if not shown:
         ax.set(xticks=[], yticks=[])
         return

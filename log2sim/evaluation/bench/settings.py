@@ -179,7 +179,7 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     for name in names:
         if config.changed(detect={"name": name}).detect.in_sweeps:
             raise ConfigError(
-                f"bench: compares detectors in images, and '{name}' searches LiDAR sweeps; see log2sim detect"
+                f"bench: compares detectors in images, '{name}' searches LiDAR sweeps; see log2sim detect"
             )
     out: list[Setting] = []
     stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]

@@ -256,9 +256,8 @@ def overall(classes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     Categories whose group is among the classes count once.
     """
     members = {name: set(figures["categories"]) for name, figures in classes.items()}
-    whole = [
-        figures for name, figures in classes.items() if not any(members[name] < other for other in members.values())
-    ]
+    part = {name for name, own in members.items() if any(own < other for other in members.values())}
+    whole = [figures for name, figures in classes.items() if name not in part]
     counts: dict[str, list[int]] = {}
     for figures in whole:
         for row in (figures["figures"][0], *figures["by_range"], *(figures["by_points"] or [])):

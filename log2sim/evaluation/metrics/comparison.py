@@ -247,9 +247,9 @@ def states_of_ego(
 def _limit_range(
     table: AgentTable, ego_xy: Array | None, visible: Mask, labeled: Mask, lidar_points: Array
 ) -> StateTable:
-    away_m = (
-        np.full(table.present.shape, np.inf) if ego_xy is None else np.hypot(*np.moveaxis(table.xy_m - ego_xy, -1, 0))
-    )
+    away_m = np.full(table.present.shape, np.inf)
+    if ego_xy is not None:
+        away_m = np.hypot(*np.moveaxis(table.xy_m - ego_xy, -1, 0))
     range_m = np.where(table.present, away_m, np.nan)
     columns = table.agents, table.t_s, table.center_m, table.yaw_rad, table.speed_mps
     return StateTable(*columns, range_m, visible, labeled, lidar_points)

@@ -67,10 +67,8 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
 def _calibration_lines(found: Mapping[str, Any]) -> list[str]:
     """Say for each tenth of confidence how many ticks and agents are right."""
     ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
-    errors = [
-        f"{table['expected_calibration_error']:.3f} of {noun}" for noun, table in (("ticks", ticks), ("agents", agents))
-    ]
-    lines = [f"confidence: expected calibration error {', '.join(errors)}"]
+    of_ticks, of_agents = (table["expected_calibration_error"] for table in (ticks, agents))
+    lines = [f"confidence: expected calibration error {of_ticks:.3f} of ticks, {of_agents:.3f} of agents"]
     for a, b in zip(ticks["bins"], agents["bins"], strict=True):
         if a["count"]:
             lines.append(

@@ -413,9 +413,8 @@ def _link(
 
 def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> list[tuple[MapLane, str]]:
     """Return the lanes of a road with those that adjoin them at its start (0) or end (-1)."""
-    return [
-        (lane, name) for lane in group for name in (lane.successors if place[lane.id].end == at else lane.predecessors)
-    ]
+    ends_here = {lane.id: place[lane.id].end == at for lane in group}
+    return [(a, name) for a in group for name in (a.successors if ends_here[a.id] else a.predecessors)]
 
 
 def _shared_headings(

@@ -85,7 +85,6 @@ MARGIN_M = 5.0  # lights before the junction stand at the stop line, which may b
 LIGHT_TYPE = "1000001"  # of a traffic light with three lamps, in the catalog "OpenDRIVE" that players know
 LIGHT_HEIGHT_M, LIGHT_WIDTH_M = 0.9, 0.3  # of a signal head with three lamps of 200 mm (EN 12368)
 DIGITS = 4
-
 STEP_M = 0.5  # stations at which the nearest point of a road is looked for
 MAX_ASIDE_M = 15.0  # crosswalks farther beside a road's reference line belong to another one
 
@@ -197,9 +196,8 @@ def _require_road(road: Element, where: str) -> None:
         for node in road.iterfind(path):
             s = require_number(node.get("s"), f"{where}: {node.tag} s")
             if s <= last:
-                raise ScenarioError(
-                    f"{where}: {node.tag} at s={s:g} follows one at s={last:g}, expected stations in order"
-                )
+                wrong = f"{node.tag} at s={s:g} follows one at s={last:g}"
+                raise ScenarioError(f"{where}: {wrong}, expected stations in order")
             last = s
     sections = road.findall("lanes/laneSection")
     if not sections:

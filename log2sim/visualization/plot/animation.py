@@ -92,9 +92,8 @@ class AnimatedArtists:
             layers.show_expected(self.predicted_paths, self.ellipses, expected)
         if self.overlays.truth is not None:
             there = [(a, _pose(a, t_s)) for a in self.overlays.truth.agents]
-            self.truths.set_verts(
-                [viewport.footprints(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None]
-            )
+            true = [viewport.footprints(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None]
+            self.truths.set_verts(true)
         driven, colors = [], []
         for replayed, role in self.replayed:
             t = np.asarray(replayed.t_s)

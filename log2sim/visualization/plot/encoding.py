@@ -76,9 +76,8 @@ def write_with_av(frames: Iterator[Image], path: Path, fps: float, codec: str, c
     first = next(frames)
     height, width = (n // 2 * 2 for n in first.shape[:2])  # the codecs require even sides
     with av.open(str(path), "w", format=container, container_options=CONTAINER[codec]) as file:
-        stream: Any = file.add_stream(
-            codec, rate=Fraction(fps).limit_denominator(MAX_DENOMINATOR), options=QUALITY[codec]
-        )
+        rate = Fraction(fps).limit_denominator(MAX_DENOMINATOR)
+        stream: Any = file.add_stream(codec, rate=rate, options=QUALITY[codec])
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         context = stream.codec_context
         context.thread_count = 1  # the bytes depend on it
@@ -86,9 +85,8 @@ def write_with_av(frames: Iterator[Image], path: Path, fps: float, codec: str, c
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         for frame in itertools.chain([first], frames):
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame[:height, :width]), format="rgb24")
-            picture = picture.reformat(
-                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
-            )
+            to: Any = {"dst_colorspace": Colorspace.ITU709, "dst_color_range": ColorRange.MPEG}
+            picture = picture.reformat(format="yuv420p", **to)
             file.mux(stream.encode(picture))
         file.mux(stream.encode(None))
 

@@ -136,9 +136,8 @@ def draw_charts(
     axes: list[Axes] = []
     for k, chart in enumerate(timeline.charts):
         bottom = top - (k + 1) * (CHART_IN + CHART_GAP_IN) + CHART_GAP_IN
-        ax = layout.figure.add_axes(
-            (LEFT_IN / layout.width_in, bottom / height, width / layout.width_in, CHART_IN / height)
-        )
+        place = LEFT_IN / layout.width_in, bottom / height, width / layout.width_in, CHART_IN / height
+        ax = layout.figure.add_axes(place)
         _draw_strip(ax, chart, timeline, span_s, last=k == count - 1, moving=moving)
         axes.append(ax)
     role, spoken = timeline.role, {"pid": "PID", "policy": "a policy", "reactive": "what is ahead"}
