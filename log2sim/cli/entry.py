@@ -26,7 +26,6 @@ from log2sim.files.outputs import holding_claims
 from log2sim.files.version import __version__
 
 INTERRUPTED = 130
-
 EXIT_CODES = """\b
 Exit codes:
     0  done
@@ -38,7 +37,6 @@ Exit codes:
     6  a check of --strict failed
     7  some logs of a batch failed
   130  interrupted"""
-
 UNSET = {"help": False, "install_completion": False, "show_completion": False}
 """Flags that typer adds without a default: it would load pydantic to check them, which takes as long as all of --help."""
 

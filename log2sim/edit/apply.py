@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
-from log2sim.edit.edits import Add, Agents, Edit, Only, Remove
-from log2sim.edit.motion import MIN_PATH_MPS, chords
+from log2sim.edit.edits import MIN_PATH_MPS, Add, Agents, Edit, Only, Remove, chords
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.files.plugins import nearest
 from log2sim.simulation.metrics.all_metrics import OFF_PATH_M

@@ -107,7 +107,6 @@ MATCH_M = 0.3
 # Found points farther from every true line than this, about a third of a lane, belong to none and have no lateral
 # error.
 LATERAL_REACH_M = 1.0
-
 Line = Marking | RoadBorder
 Counts = Callable[[Array], NDArray[np.bool_]]  # which of places (N, 2) count
 

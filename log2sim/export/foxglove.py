@@ -39,7 +39,6 @@ BOX_ALPHA, PATH_ALPHA = 0.6, 0.9
 LABEL_ABOVE_M = 0.5
 PATH_PX, OUTLINE_PX, TEXT_PX = 2.0, 2.0, 12.0
 PLUMB_BOB = 5  # number of coefficients of this model; with more it is called rational
-
 Message = tuple[int, str, Any]  # time in ns, topic and message
 
 
@@ -68,8 +67,8 @@ def scene_messages(steps: viewers.AgentSteps, origin: Array) -> Iterator[Message
 def record_messages(record: viewers.ViewerRecord, origin: Array) -> Iterable[Message]:
     """Return the messages of one record of the log."""
     if isinstance(record, viewers.UnreadableRecord):
-        about = {"level": LogMessage.WARNING, "name": record.stream, "message": record.reason}
-        text = LogMessage(timestamp=_stamp(record.t_ns), **about)
+        stamp, level = _stamp(record.t_ns), LogMessage.WARNING
+        text = LogMessage(timestamp=stamp, level=level, name=record.stream, message=record.reason)
         return [(record.t_ns, "/log", text)]
     if isinstance(record, viewers.ThinnedSweep):
         data, real = (record.points_map - origin).astype("<f4").tobytes(), PackedElementField.FLOAT32
@@ -136,8 +135,8 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
             timestamp=stamp, type=PointsAnnotation.LINE_LIST, points=points, outline_color=color, thickness=OUTLINE_PX,
         ))  # fmt: skip
         place = Point2(x=u, y=v)
-        label = {"text": agent.id, "font_size": TEXT_PX, "text_color": color}
-        texts.append(TextAnnotation(timestamp=stamp, position=place, **label))
+        label, size = agent.id, TEXT_PX
+        texts.append(TextAnnotation(timestamp=stamp, position=place, text=label, font_size=size, text_color=color))
     yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
 
 

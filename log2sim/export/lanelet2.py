@@ -29,8 +29,6 @@ TYPE_OF_MARK = {
     "solid": ("line_thin", "solid"), "broken": ("line_thin", "dashed"), "curb": ("curbstone", "high"), "none": ("virtual", None),
 }  # fmt: skip
 Way = tuple[str, str]  # of a lane, "left" or "right"
-
-
 options: tuple[str, ...] = ()
 loses = (
     "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "

@@ -19,15 +19,12 @@ STEP_S = 0.1  # the lowest rate that readers of OSI traces accept, and smooth to
 MAX_IMAGE_PX = 960  # wider images are downscaled, which keeps files of several cameras small
 JPEG_QUALITY = 80
 MAX_SWEEP_POINTS = 10_000
-
 # Colors as red, green and blue in [0, 255].
 EGO_RGB = (0, 158, 115)
 RGB_OF_CATEGORY = {
     "car": (86, 180, 233), "truck": (0, 114, 178), "bus": (0, 70, 140), "motorcycle": (230, 159, 0), "cyclist": (230, 159, 0),
     "bicycle": (240, 228, 66), "pedestrian": (213, 94, 0), "other": (160, 160, 160),
 }  # fmt: skip
-
-
 # All agents at equal steps: absolute time (T,), ns, and each with its motion.
 AgentSteps = tuple[NDArray[np.int64], tuple[tuple[Agent, SampledMotion], ...]]
 

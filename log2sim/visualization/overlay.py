@@ -25,7 +25,7 @@ from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import synchronize
-from log2sim.visualization.plot.drawing import add_lines
+from log2sim.visualization.plot.layers import add_lines
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, new_figure, printable_label, save_png
 from log2sim.visualization.recording import corners_in_view, require_cameras
 
@@ -195,7 +195,6 @@ def _shot(log: Log, name: str, index: int, read_sweeps: Callable[[], tuple[Sweep
 
 # Colors of boxes by group, none of which the colors of depths have.
 COLORS = {"vehicle": "#FFFFFF", "two_wheeler": "#FF4FD8", "pedestrian": "#00E5FF", "other": "#B0B0B0"}
-
 IMAGE_BOX_COLOR = "#FFE000"
 DEPTHS = "turbo_r"
 MIN_DEPTH_M, MAX_DEPTH_M = 2.0, 100.0

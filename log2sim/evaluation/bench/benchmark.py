@@ -52,10 +52,7 @@ from log2sim.visualization.plot.style import (
 )
 
 __all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
-
-
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
-
 WITHOUT_TRUTH = "the log has no labels: these figures say how steady a setting is, not how right"
 
 

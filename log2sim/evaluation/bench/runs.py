@@ -101,8 +101,6 @@ def detect_once(
 
 REPEATS = 3  # repetitions of short stages, taking turns; the least time counts, since other processes only add to it
 MEASURE_REPEATS = 2  # repetitions of the measurement, which takes longer
-
-
 Progress = Callable[[str, int, int], None]
 
 
@@ -188,7 +186,12 @@ def run_settings(
 
     Settings take turns `REPEATS` times; the least time of each stage counts.
     """
-    (observations, before_s), measurement_score = observed, score_of_measurements(context, observed[0])
+    (observations, before_s), measurement_score = observed, Score({})
+    if context.truth is not None:
+        across = context.plan.keeps(Stage.FUSION)
+        fused = replace(observations, measurements=fuse(observations.measurements, across=across))
+        known = true_positions(context.log, context.schedule, fused, context.truth)
+        measurement_score = score_measurements(fused, known)
     scores: dict[str, Score] = {}
     spent: dict[str, list[dict[str, float]]] = {s.key: [] for s in settings}
     for repeat in range(REPEATS):
@@ -230,15 +233,6 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
         runs += run_settings(context, [setting], timed_first_pass(context, setting, grid.measure[0], report), report)
     least = min(r.stages_s["cloud"] for r in runs)
     return [replace(r, stages_s={**r.stages_s, "cloud": least}) for r in runs], observations[0]
-
-
-def score_of_measurements(context: BenchContext, observations: Observations) -> Score:
-    """Score the measured centers; empty without truth."""
-    if context.truth is None:
-        return Score({})
-    across = context.plan.keeps(Stage.FUSION)
-    fused = replace(observations, measurements=fuse(observations.measurements, across=across))
-    return score_measurements(fused, true_positions(context.log, context.schedule, fused, context.truth))
 
 
 def homography_points(context: BenchContext, observations: Observations, report: Progress) -> list[Point]:

@@ -19,7 +19,6 @@ from log2sim.plan import IMAGE_DETECTOR, choose_detector
 
 # By object: sum of its squared errors, m^2, and their number. The error is the root of the ratio of both sums.
 ErrorSums = Mapping[str, tuple[float, float]]
-
 RESAMPLES = 1000
 MIN_OBJECTS = 5
 INTERVAL = (0.05, 0.95)

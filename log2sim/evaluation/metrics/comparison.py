@@ -14,7 +14,6 @@ from log2sim.geometry import NS_PER_S, Array, PoseTrack, choose_pairs, inverse, 
 
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
 GATE_M = 2.0
 GATE_PER_LENGTH = 0.25
 
@@ -137,7 +136,6 @@ MAX_TRUTH_GAP_S = 0.25
 MAX_SIMPLIFIED_GAP_S = 1.05  # simplified trajectories omit waypoints of straight uniform motion for up to a second
 # Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself.
 MIN_TICK_S = 0.02
-
 # A truth agent is extrapolated this far beyond its first and last label, without being counted there.
 TRUTH_MARGIN_S = 0.15
 
@@ -294,7 +292,6 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
 MIN_COUNTED_S = 1.0  # a truth agent counts when its counted ticks make up at least this time
 # Of LiDARs on an object that some sensor hit. Waymo's first level of difficulty is drawn at as many.
 MIN_HIT_POINTS = 5
-
 # Why a labeled object does not count at a tick; the first that applies.
 REASONS = {
     "other_category": "of a category that was not asked for",
@@ -304,7 +301,6 @@ REASONS = {
     "hidden": "hidden according to the truth",
     "short": f"in sight for less than {MIN_COUNTED_S:g} s",
 }
-
 COUNTED, NOT_LABELED = 0, -1
 
 

@@ -139,7 +139,6 @@ MAX_LAG_S = 0.1  # a label is compared with the nearest sweep and frames within 
 SPEED_WINDOW_S = 0.25
 MAX_STATIC_REACH_M = 0.5
 MAX_STATIC_DRIFT_MPS = 0.2
-
 Progress = Callable[[int, int], None]
 
 

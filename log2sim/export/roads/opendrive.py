@@ -53,10 +53,8 @@ def edges_of(lane: MapLane) -> tuple[Array, Array]:
 
 # Lamps face the traffic that they are for; posts beside the road turn them by some degrees towards it.
 FACING_RAD = float(np.deg2rad(40.0))
-
 # A light beyond a junction is at most so far from where its lanes end: across six lanes and two sidewalks.
 REACH_M = 40.0
-
 ASIDE_M = 12.0  # it is at most so far beside the middle of a lane: three lanes and a sidewalk
 
 
@@ -80,8 +78,6 @@ def signal_lanes(signal: Signal, lanes: Sequence[MapLane]) -> list[MapLane]:
 
 
 MARGIN_M = 5.0  # lights before the junction stand at the stop line, which may be behind where the lane ends
-
-
 LIGHT_TYPE = "1000001"  # of a traffic light with three lamps, in the catalog "OpenDRIVE" that players know
 LIGHT_HEIGHT_M, LIGHT_WIDTH_M = 0.9, 0.3  # of a signal head with three lamps of 200 mm (EN 12368)
 DIGITS = 4

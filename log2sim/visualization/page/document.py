@@ -91,7 +91,6 @@ def _columns(points_m: Array) -> dict[str, list[int]]:
 # A page shows a new prediction five times a second, which looks steady and takes half as much room as one at every
 # tick.
 EVERY_TICKS = 2
-
 MAX_PREDICTIONS = 1_000_000  # of all agents together: 30 MB of a page for 3 s each
 
 

@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgba
 from log2sim.datatypes import Agent, Scenario, Signal
 from log2sim.files.documents import replaced
 from log2sim.geometry import Array
-from log2sim.visualization.plot import drawing, layers, viewport
+from log2sim.visualization.plot import layers, viewport
 from log2sim.visualization.plot.encoding import FilmFile, Image, write_gif
 from log2sim.visualization.plot.layout import SIDE_IN, TOP_IN, FigureLayout, MovingLabels
 from log2sim.visualization.plot.scene import draw_base
@@ -44,10 +44,10 @@ class AnimatedArtists:
         self.signals = layers.SignalLights(layout.ax, signals)
         self.labels = MovingLabels(layout.ax, layout.view, roles)
         self.collision_s, self.collision_xy_m = layers.new_collisions(overlays.replay)
-        self.collisions = drawing.draw_collisions(layout.ax, self.collision_xy_m, animated=True)
+        self.collisions = layers.draw_collisions(layout.ax, self.collision_xy_m, animated=True)
         driven = {a.id: a for a in overlays.replay.agents} if overlays.replay is not None else {}
         self.replayed = [(driven[r.agent.id], r) for r in roles.movers if r.agent.id in driven]
-        hidden: dict[str, Any] = {"animated": True, "zorder": drawing.BOX}
+        hidden: dict[str, Any] = {"animated": True, "zorder": layers.BOX}
         self.tails = LineCollection([], linewidths=2.0, capstyle="round", **hidden)
         self.boxes = PolyCollection([], edgecolors=PAPER, linewidths=0.7, **hidden)
         self.noses = PolyCollection([], linewidths=0, **hidden)
@@ -148,7 +148,7 @@ def write_animation(
     """Write an animation frame by frame; none is kept."""
     suffix = film.path.suffix.lower()
     layout, step_s, charts, _ = draw_base(scenario, roles, overlays, moving=True)
-    drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=TRACK_ALPHA, faint=True)
+    layers.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=TRACK_ALPHA, faint=True)
     layout.set_width_px((overlays.options.size_px or (WIDTH_PX[suffix], 0))[0])
     span = overlays.span_of(scenario)
     count, frame_s, fps = choose_frames(span, overlays.options, suffix)

@@ -29,14 +29,12 @@ QUALITY: dict[str, dict[str, str]] = {
     H264: {"crf": "20", "preset": "medium", "x264-params": "mbtree=0"},
     VP9: {"crf": "32", "b": "0", "deadline": "good", "cpu-used": "4"},
 }
-
 # The same frames give the same bytes; and the index stands at the start of an .mp4, so that browsers play it while it
 # loads.
 CONTAINER: dict[str, dict[str, str]] = {
     H264: {"fflags": "+bitexact", "movflags": "+faststart"},
     VP9: {"fflags": "+bitexact"},
 }
-
 MAX_DENOMINATOR = 1001  # of frame rates as fractions; broadcast rates such as 29.97 have it
 CLEAR = 255  # palette index of transparent pixels in a .gif; the lower ones are colors
 SWATCH_PX = 100  # width of the swatches of agent colors that the palette is chosen with

@@ -26,8 +26,6 @@ from log2sim.visualization.plot.style import ALARM, FONT, FRAME, INK, MUTED, PAP
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 
 KMH = 3.6
-
-
 # A curve of a chart: label, times and values (T,), and "thin", "muted" where it is secondary, or "ribbon" where it is the reference
 # of the thin line over it.
 Curve = tuple[str, Array, Array, str]
