@@ -185,22 +185,15 @@ def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], Non
     return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress).as_picture()
 
 
-def open_recorded(
-    path: Path,
-    scenario: Scenario,
-    sequence: str | None,
-    max_bytes: int,
-    cameras: tuple[str, ...],
-    progress: Callable[[str, int, int], None],
-) -> Recorded:
-    """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
+def open_recorded(path: Path, scenario: Scenario, sequence: str | None, *options: Any) -> Recorded:
+    """Open the log whose pictures and points are shown, with the poses that the scenario was made with; `options` of `Recorded`."""
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
     from log2sim.visualization.recording import Recorded, require_overlap
 
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
     require_overlap(log, scenario)
-    return Recorded(log, max_bytes, cameras, progress)
+    return Recorded(log, *options)
 
 
 def shows_ground(log: Log) -> bool:

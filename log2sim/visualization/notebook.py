@@ -195,11 +195,7 @@ class Picture:
 
 
 def show_log(
-    log: Log,
-    when: float | Tick | None = None,
-    *,
-    camera: str | Sequence[str] = (),
-    scenario: Scenario | None = None,
+    log: Log, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Scenario | None = None
 ) -> Picture:
     """Draw one moment of a log, as `Log.show` does; see there."""
     cameras = (camera,) if isinstance(camera, str) else tuple(camera)

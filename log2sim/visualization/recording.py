@@ -220,7 +220,19 @@ def picture_document(
     """
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
     within = {name: index for name, index in within.items() if len(index)}
-    probes = _probe(log, scenario, within, reader)
+    # The estimated bytes in a page of a picture of each camera, by width; none for cameras that cannot be read.
+    widths = sorted({int(detail.size) for detail in PICTURE_DETAILS})
+    probes: dict[str, dict[float, float]] = {}
+    for name, index in within.items():
+        sizes: dict[int, list[int]] = {width: [] for width in widths}
+        for i in index[take_evenly(len(index), PROBES)].tolist():
+            image = reader.get(name, i)
+            if image is not None:
+                shown = OUTLINE_BYTES * len(outlines_in(log, scenario, name, int(log.streams[name].t_ns[i])))
+                for width in widths:
+                    sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + shown + POSE_BYTES)
+        if sizes[widths[0]]:
+            probes[name] = {width: SAFETY * float(np.mean(found)) for width, found in sizes.items()}
     known = {name: within[name] for name in probes}
     what = "pictures", "one of each camera", ", or choose fewer cameras with --cameras"
     detail, chosen = _fit(log, scenario.t0_ns, known, probes, PICTURE_DETAILS, budget_bytes, what)
@@ -245,26 +257,6 @@ def picture_document(
         "rate_hz": detail.rate_hz,
         "bytes": sum(map(_bytes_of, entries.values())),
     }
-
-
-def _probe(
-    log: Log, scenario: Scenario, within: Mapping[str, NDArray[np.int64]], reader: RecordSource
-) -> dict[str, dict[float, float]]:
-    """Estimate the bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
-    widths = sorted({int(detail.size) for detail in PICTURE_DETAILS})
-    out: dict[str, dict[float, float]] = {}
-    for name, index in within.items():
-        sizes: dict[int, list[int]] = {width: [] for width in widths}
-        for i in index[take_evenly(len(index), PROBES)].tolist():
-            image = reader.get(name, i)
-            if image is None:
-                continue
-            outlines = OUTLINE_BYTES * len(outlines_in(log, scenario, name, int(log.streams[name].t_ns[i])))
-            for width in widths:
-                sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines + POSE_BYTES)
-        if sizes[widths[0]]:
-            out[name] = {width: SAFETY * float(np.mean(found)) for width, found in sizes.items()}
-    return out
 
 
 def _fit(

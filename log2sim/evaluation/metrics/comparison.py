@@ -178,24 +178,20 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
         # Agents of one tick may differ in the last digits of their stamps.
         _, index = np.unique(np.round(np.concatenate(times), 4), return_index=True)
         t = np.sort(np.concatenate(times)[index])
-        t = _thinned(t, ego_t_s)
+        # Those of the ego stay, and others at least `MIN_TICK_S` from these and each other.
+        wanted = np.isin(t, ego_t_s)
+        away = np.full(len(t), np.inf)
+        if wanted.any():
+            away = np.abs(t - t[wanted][nearest_index(t[wanted], t)])
+        kept, last_s = wanted.copy(), -np.inf
+        for k in np.flatnonzero(away >= MIN_TICK_S):
+            if t[k] - last_s >= MIN_TICK_S:
+                kept[k], last_s = True, t[k]
+        t = t[kept]
         t = t[(t >= max(first, begin) - TRUTH_MARGIN_S) & (t <= min(last, end) + TRUTH_MARGIN_S)]
         if len(t) > 1 and (t[-1] - t[0]) / (len(t) - 1) <= MAX_TRUTH_GAP_S:
             break
     return t
-
-
-def _thinned(t_s: Array, wanted_s: Array) -> Array:
-    """Keep of increasing instants (T,) those wanted, and others at least `MIN_TICK_S` from these and each other."""
-    wanted = np.isin(t_s, wanted_s)
-    away = np.full(len(t_s), np.inf)
-    if wanted.any():
-        away = np.abs(t_s - t_s[wanted][nearest_index(t_s[wanted], t_s)])
-    keep, last_s = wanted.copy(), -np.inf
-    for k in np.flatnonzero(away >= MIN_TICK_S):
-        if t_s[k] - last_s >= MIN_TICK_S:
-            keep[k], last_s = True, t_s[k]
-    return t_s[keep]
 
 
 def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:

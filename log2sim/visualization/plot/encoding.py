@@ -110,7 +110,14 @@ def write_with_opencv(frames: Iterator[Image], path: Path, fps: float) -> None:
             writer.write(np.ascontiguousarray(frame[:height, :width, ::-1]))
     finally:
         writer.release()
-    _replace_track_number(path)
+    # The random number by which a Matroska file names its track is replaced, so that the same frames give the same bytes. RFC 9559:
+    # TrackUID has the id 73 C5 and TagTrackUID 63 C5, both followed here by 88, a length of 8 bytes. They are written before the
+    # first cluster (1F 43 B6 75), so nothing of the film itself can be mistaken for them.
+    with path.open("r+b") as file:
+        head = file.read(4096).split(b"\x1f\x43\xb6\x75")[0]
+        for found in re.finditer(rb"[\x73\x63]\xc5\x88.{8}", head, re.DOTALL):
+            file.seek(found.end() - 8)
+            file.write((1).to_bytes(8, "big"))
 
 
 def write_gif(frames: Iterator[Image], path: Path, fps: float, colors: Sequence[str]) -> None:
@@ -172,16 +179,3 @@ def _silent_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
-
-
-def _replace_track_number(path: Path) -> None:
-    """Replace the random number by which a Matroska file names its track, so that the same frames give the same bytes.
-
-    RFC 9559: TrackUID has the id 73 C5 and TagTrackUID 63 C5, both followed here by 88, a length of 8 bytes. They are written
-    before the first cluster (1F 43 B6 75), so nothing of the film itself can be mistaken for them.
-    """
-    with path.open("r+b") as file:
-        head = file.read(4096).split(b"\x1f\x43\xb6\x75")[0]
-        for found in re.finditer(rb"[\x73\x63]\xc5\x88.{8}", head, re.DOTALL):
-            file.seek(found.end() - 8)
-            file.write((1).to_bytes(8, "big"))

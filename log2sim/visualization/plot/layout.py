@@ -176,11 +176,7 @@ class LabelRoom:
         self.view, self.taken = view, taken
 
     def place(
-        self,
-        text: str,
-        size_pt: float,
-        anchors: Iterable[Anchor],
-        fits: Callable[[Array, Array], bool] | None = None,
+        self, text: str, size_pt: float, anchors: Iterable[Anchor], fits: Callable[[Array, Array], bool] | None = None
     ) -> Array | None:
         """Reserve room for a text beside the first anchor that has it, and return its middle (2,), m; None without.
 

@@ -61,31 +61,21 @@ def timeline_of(replay: Any, roles: AgentRoles) -> AgentTimeline | None:
     agent = max(driven, key=lambda a: (a.id == "ego", float(np.max(np.abs(a.cross_track_m)))))
     role = role_of[agent.id]
     events = [e for e in replay.metrics.get("collisions", ()) if agent.id in e["agents"] and e["belongs_to"] == REPLAY]
-    return AgentTimeline(role, agent.driver, _strips(agent, role), tuple(e["t_s"] for e in events))
-
-
-def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
-    t, w = agent.t_s, role.agent.waypoints
-    out = [
-        Chart(
-            "speed", "km/h", 4.0,
-            (("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), ("replay", t, agent.speed_mps * KMH, "thin")),
-        )
-    ]  # fmt: skip
-    if agent.commands is not None:
-        commands = agent.commands
+    t, w, commands = agent.t_s, role.agent.waypoints, agent.commands
+    speeds: tuple[Curve, ...] = (
+        ("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), ("replay", t, agent.speed_mps * KMH, "thin"),
+    )  # fmt: skip
+    charts = [Chart("speed", "km/h", 4.0, speeds)]
+    if commands is not None:
         # The pedal acts along the gear's direction, which in reverse is against the heading.
-        response = agent.accel_mps2 * commands.gear
-        out += [
-            Chart("pedal", "m/s²", 1.0, (("command", t, commands.pedal_mps2, "ribbon"), ("response", t, response, "thin"))),
-            Chart(
-                "steering", "°", 2.0,
-                (("command", t, np.degrees(commands.steer_rad), "ribbon"), ("response", t, np.degrees(agent.steer_rad), "thin")),
-            ),
-        ]  # fmt: skip
+        response, steer = agent.accel_mps2 * commands.gear, np.degrees(commands.steer_rad)
+        wheel = ("command", t, steer, "ribbon"), ("response", t, np.degrees(agent.steer_rad), "thin")
+        pedal = ("command", t, commands.pedal_mps2, "ribbon"), ("response", t, response, "thin")
+        charts += [Chart("pedal", "m/s²", 1.0, pedal), Chart("steering", "°", 2.0, wheel)]
     along, across = agent.along_track_m, agent.cross_track_m
-    lines = (("along (+ ahead)", t, along, "muted"), ("across (+ left)", t, across, "thin"))
-    return (*out, Chart("tracking error", "m", 0.1, lines))
+    errors = ("along (+ ahead)", t, along, "muted"), ("across (+ left)", t, across, "thin")
+    charts.append(Chart("tracking error", "m", 0.1, errors))
+    return AgentTimeline(role, agent.driver, tuple(charts), tuple(e["t_s"] for e in events))
 
 
 @dataclass(frozen=True, eq=False)
