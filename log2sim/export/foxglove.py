@@ -125,7 +125,16 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
     stamp, topic = _stamp(t_ns), f"/camera/{name}"
     if record.map_T_cam is not None:
         yield t_ns, "/tf", _frame(t_ns, name, transform(record.map_T_cam[:3, :3], record.map_T_cam[:3, 3] - origin))
-    yield t_ns, f"{topic}/calibration", _calibration(record)
+    camera = record.camera
+    known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
+    few = len(camera.distortion) <= PLUMB_BOB
+    model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
+    coefficients = [*camera.distortion, *[0.0] * count][:count]
+    K, P = camera.K.ravel().tolist(), np.column_stack([camera.K, np.zeros(3)]).ravel().tolist()
+    yield t_ns, f"{topic}/calibration", CameraCalibration(
+        timestamp=stamp, frame_id=name, width=camera.width_px, height=camera.height_px, distortion_model=model,
+        D=coefficients, K=K, R=np.eye(3).ravel().tolist(), P=P,
+    )  # fmt: skip
     yield t_ns, f"{topic}/image", CompressedImage(timestamp=stamp, frame_id=name, data=record.jpeg, format="jpeg")
     lines, texts = [], []
     for agent, outline in record.outlines:
@@ -138,16 +147,3 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
         label, size = agent.id, TEXT_PX
         texts.append(TextAnnotation(timestamp=stamp, position=place, text=label, font_size=size, text_color=color))
     yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
-
-
-def _calibration(record: viewers.CameraFrame) -> CameraCalibration:
-    camera = record.camera
-    known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
-    few = len(camera.distortion) <= PLUMB_BOB
-    model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
-    coefficients = [*camera.distortion, *[0.0] * count][:count]
-    K, P = camera.K.ravel().tolist(), np.column_stack([camera.K, np.zeros(3)]).ravel().tolist()
-    return CameraCalibration(
-        timestamp=_stamp(record.t_ns), frame_id=camera.name, width=camera.width_px, height=camera.height_px,
-        distortion_model=model, D=coefficients, K=K, R=np.eye(3).ravel().tolist(), P=P,
-    )  # fmt: skip

@@ -34,7 +34,6 @@ from log2sim.visualization.plot.selection import NO_OPTIONS, PlotOptions, TimeRa
 from log2sim.visualization.plot.style import (
     BORDER_COLOR,
     COLLISION_MARK,
-    END_COLOR,
     FONT,
     INK,
     LANE_ARROW,
@@ -54,14 +53,6 @@ from log2sim.visualization.plot.style import (
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, is_moving, paint_of
 
 BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, DRIVEN, BOX, LABEL = range(1, 9)  # z-order, from the bottom up
-
-
-def draw_background(ax: Axes, picture: GroundMap) -> None:
-    """Draw a top-down picture below everything, lightened so that tracks stand out."""
-    pale = 0.62 * picture.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
-    rgba = np.dstack([np.rint(pale).astype(np.uint8), (picture.alpha * 0.95).astype(np.uint8)])
-    style: dict[str, Any] = {"origin": "upper", "interpolation": "antialiased", "aspect": "auto"}
-    ax.imshow(rgba, extent=picture.extent_m, zorder=BACKGROUND, **style)
 
 
 def add_polygons(ax: Axes, corners: Iterable[Array], **style: Any) -> None:
@@ -197,14 +188,6 @@ def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> Non
 
 STEP_S = 0.1  # between the points of a line: ends observe at the rate of their LiDARs
 WIDTH_PT, BESIDE_PT = 1.3, 3.4  # width of a line, and how far to the right of the track it is
-
-
-def draw_observers(ax: Axes, roles: AgentRoles, view: Viewport) -> None:
-    """Draw a line beside the tracks of movers where one end alone observed them."""
-    aside_m = BESIDE_PT * view.m_per_pt
-    for end in ENDS:
-        lines = [line for role in roles.movers for line in lines_of(role.agent, end, aside_m)]
-        add_lines(ax, lines, colors=END_COLOR[end], linewidths=WIDTH_PT, capstyle="butt", zorder=TRACK - 0.2)
 
 
 def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
@@ -378,20 +361,13 @@ def is_doubted_at(agent: Agent, t_s: float) -> bool:
     return any(start <= t_s <= end for start, end in shown_spans(agent))
 
 
-def hatch_stationary(ax: Axes, roles: AgentRoles, view: Viewport, z: float) -> None:
-    """Hatch the boxes of doubtful stationary agents, whenever the doubt holds."""
-    for agent in roles.stationary:
-        if agent.is_doubtful:
-            _hatch(ax, agent, len(agent.waypoints) // 2, view, stripe=MUTED, edge=MUTED, z=z)
-
-
 def hatch_movers(ax: Axes, roles: AgentRoles, view: Viewport, z_track: float, z_box: float) -> None:
     """Stripe the tracks of movers where they are doubtful, and hatch their last boxes if they are so at the end."""
     tracks: list[Array] = []
     for role in roles.movers:
         tracks += doubtful_parts(role.agent)
         if is_doubted_at(role.agent, float(role.agent.waypoints.t_s[-1])):
-            _hatch(ax, role.agent, -1, view, stripe=PAPER, edge=role.color, z=z_box)
+            hatch(ax, role.agent, -1, view, stripe=PAPER, edge=role.color, z=z_box)
     dashes: dict[str, Any] = {"linestyles": [(0, (1.1, 1.4))], "linewidths": 1.3, "colors": PAPER, "zorder": z_track}
     add_lines(ax, tracks, **dashes)
 
@@ -432,7 +408,7 @@ def _hatched_patch(color: str) -> Patch:
     return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
 
 
-def _hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
+def hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
     """Draw stripes and outline of the box at waypoint `k`."""
     xy_m, yaw_rad = centers_xy(agent)[k], float(agent.waypoints.yaw_rad[k])
     add_lines(ax, box_stripes(agent, xy_m, yaw_rad, view), colors=stripe, linewidths=STRIPE_PT, zorder=z)
@@ -480,13 +456,6 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
         style = {"linestyles": [DASHES]} if dashed else {"capstyle": "butt"}
         points, colors = [m.points_m[:, :2] for m in lines], [_shade(m, 1.0) for m in lines]
         add_lines(ax, points, colors=colors, linewidths=widths, zorder=LINES, **style)
-
-
-def draw_signals(ax: Axes, signals: Sequence[Signal], t_s: float) -> None:
-    """Draw traffic lights in the color of their state at a time, s."""
-    for signal in signals:
-        color = SIGNAL_COLOR[str(signal.at(t_s)[0])]
-        ax.plot(*signal.position_m[:2], "o", ms=5.0, mfc=color, mec=PAPER, mew=0.9, zorder=LABEL - 0.3)
 
 
 class SignalLights:

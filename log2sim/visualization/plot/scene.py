@@ -32,7 +32,7 @@ from log2sim.visualization.plot.layout import (
     write_title,
 )
 from log2sim.visualization.plot.selection import PlotOptions, TimeRange
-from log2sim.visualization.plot.style import END_COLOR, FONT, MUTED, style_axes
+from log2sim.visualization.plot.style import END_COLOR, FONT, MUTED, PAPER, SIGNAL_COLOR, style_axes
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import (
     MAX_UNCROWDED_MOVERS,
@@ -100,13 +100,20 @@ def draw_standing(
     ax: Axes, scenario: Scenario, roles: AgentRoles, view: Viewport, background: Any, *, signals_s: float | None
 ) -> None:
     """Draw what stands: the ground, the road with its traffic lights at a time, if any, and the agents that never move."""
-    if background is not None:
-        layers.draw_background(ax, background)
+    if background is not None:  # lightened so that tracks stand out
+        pale = 0.62 * background.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
+        rgba = np.dstack([np.rint(pale).astype(np.uint8), (background.alpha * 0.95).astype(np.uint8)])
+        how: dict[str, Any] = {"origin": "upper", "interpolation": "antialiased", "aspect": "auto"}
+        ax.imshow(rgba, extent=background.extent_m, zorder=layers.BACKGROUND, **how)
     layers.draw_road(ax, scenario, view, over_picture=background is not None)
     if signals_s is not None:
-        layers.draw_signals(ax, scenario.signals, signals_s)
+        for signal in scenario.signals:
+            color, z = SIGNAL_COLOR[str(signal.at(signals_s)[0])], layers.LABEL - 0.3
+            ax.plot(*signal.position_m[:2], "o", ms=5.0, mfc=color, mec=PAPER, mew=0.9, zorder=z)
     layers.draw_stationary(ax, roles.stationary, view)
-    layers.hatch_stationary(ax, roles, view, layers.STATIONARY + 0.1)
+    for agent in (agent for agent in roles.stationary if agent.is_doubtful):
+        middle, z = len(agent.waypoints) // 2, layers.STATIONARY + 0.1
+        layers.hatch(ax, agent, middle, view, stripe=MUTED, edge=MUTED, z=z)
 
 
 def draw_moving(
@@ -304,8 +311,10 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays = lay
     layout, step_s, _, labels = draw_base(scenario, roles, overlays)
     ax, replay = layout.ax, overlays.replay
     draw_moving(ax, roles, layout.view, step_s, truth=overlays.truth, replay=replay, ghosts=True)
-    if len(ends_of(scenario)) > 1:
-        layers.draw_observers(ax, roles, layout.view)
+    for end in ENDS if len(ends_of(scenario)) > 1 else ():  # beside the tracks of movers that one end alone observed
+        aside_m, z = layers.BESIDE_PT * layout.view.m_per_pt, layers.TRACK - 0.2
+        lines = [line for role in roles.movers for line in layers.lines_of(role.agent, end, aside_m)]
+        layers.add_lines(ax, lines, colors=END_COLOR[end], linewidths=layers.WIDTH_PT, capstyle="butt", zorder=z)
     layers.draw_warnings(ax, replay)
     if overlays.predicted is not None:
         layers.draw_predictions(ax, roles, overlays.predicted)
