@@ -21,9 +21,9 @@ from log2sim.errors import ConfigError
 from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import encoding
 from log2sim.visualization.plot.layers import Overlays
-from log2sim.visualization.plot.scene import plot_tracks, still
 from log2sim.visualization.plot.selection import PlotOptions, TimeRange, cut_replay, cut_scenario, select_shown
 from log2sim.visualization.plot.style import INK
+from log2sim.visualization.plot.tracks import plot_tracks, still
 from log2sim.visualization.plot.viewport import assign_view_roles
 
 

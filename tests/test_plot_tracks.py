@@ -22,8 +22,8 @@ from log2sim.simulation.runner import replay
 from log2sim.visualization.plot import layers, viewport
 from log2sim.visualization.plot.layers import Overlays
 from log2sim.visualization.plot.layout import FigureLayout
-from log2sim.visualization.plot.scene import plot_tracks, still
 from log2sim.visualization.plot.style import ALARM, TRACK_ALPHA
+from log2sim.visualization.plot.tracks import plot_tracks, still
 from log2sim.visualization.plot.viewport import assign_view_roles
 
 

@@ -56,8 +56,8 @@ def plot(
     """
     from log2sim.datatypes import Scenario
     from log2sim.files.documents import check_targets
-    from log2sim.visualization.plot.scene import plot_tracks, resolve_picture
     from log2sim.visualization.plot.selection import PlotOptions, parse_extent, parse_ids, parse_size
+    from log2sim.visualization.plot.tracks import plot_tracks, resolve_picture
 
     shown = parse_extent(extent), parse_ids(agents), label_static
     options = PlotOptions(parse_size(size), fps, speed, start, stop, *shown)
