@@ -28,6 +28,7 @@ from log2sim.localization.roadside import (
 from log2sim.localization.roadside_fit import (
     CommonObjects,
     Evidence,
+    Matched,
     MatchedStructure,
     ObjectTrack,
     RoadView,
@@ -180,7 +181,7 @@ def test_the_ground_alone_shows_height_and_tilt_and_no_more() -> None:
     assert not findings.verified
     assert findings.applied[[2, 3, 4]] == pytest.approx(ERROR[[2, 3, 4]], abs=0.03)
     assert not findings.applied[[0, 1, 5, 6]].any()
-    assert [fault.kind for fault in findings.faults()] == ["road_pose", "unknown_road_pose"]
+    assert [fault.kind for fault in findings.faults()] == ["road_pose", "unknown_road_pose", "unknown_road_clock"]
 
 
 def test_drift_of_the_poses_of_the_ego_adds_to_the_sigma() -> None:
@@ -288,11 +289,10 @@ FINE = np.array([0.02, 0.02, 0.03, 0.003, 0.003, 0.001, 0.01])
 
 
 def fitting(found: Estimate) -> Estimate:
-    """The estimate with structure that fits better with it."""
+    """The estimate with structure that fits better with it, and a car that both ends see drive."""
     nothing = Evidence(np.zeros((7, 7)), np.zeros(7))
-    return replace(
-        found, structure=(MatchedStructure(nothing, 900, 200, 0.3), MatchedStructure(nothing, 900, 850, 0.01))
-    )
+    structure = MatchedStructure(nothing, 900, 200, 0.3), MatchedStructure(nothing, 900, 850, 0.01)
+    return replace(found, structure=structure, objects=(None, Matched(nothing, 1, 1, 10.0, 0.1)))
 
 
 def test_an_error_is_told_if_it_is_certain_and_matters() -> None:
@@ -303,9 +303,17 @@ def test_an_error_is_told_if_it_is_certain_and_matters() -> None:
     # What could be off by more than matters is told to be so, with its sigma.
     for values, sigma, told in (
         (small, FINE / 5, []),
-        (small, 8 * FINE, ["unknown_road_pose"]),
-        (large, 8 * FINE, ["unknown_road_pose"]),
+        (small, 8 * FINE, ["unknown_road_pose", "unknown_road_clock"]),
+        (large, 8 * FINE, ["unknown_road_pose", "unknown_road_clock"]),
     ):
         findings = Findings(UNIT, fitting(estimate(values, sigma)), (None, None))
         assert [fault.kind for fault in findings.faults()] == told
         assert not findings.applied.any()
+
+
+def test_a_clock_is_told_to_be_unknown_where_nothing_that_both_ends_see_moves() -> None:
+    moving = fitting(estimate(np.zeros(7), FINE / 5))
+    stands = replace(moving, objects=(None, replace(moving.objects[1], moving=0)))  # type: ignore[type-var]
+    told = {k: Findings(UNIT, found, (None, None)).faults() for k, found in enumerate((moving, stands))}
+    assert [[fault.kind for fault in faults] for faults in told.values()] == [[], ["unknown_road_clock"]]
+    assert "a sigma of 2 ms" in told[1][0].sentence

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -160,7 +161,7 @@ def test_a_film_plays_in_a_browser(tmp_path: Path, name: str, kind: str) -> None
 
 
 def test_without_pyav_an_mp4_becomes_a_webm_which_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(encoding, "_import_av", lambda: None)
+    monkeypatch.setitem(sys.modules, "av", None)
     scene().save(tmp_path / "s.json")
     options = ("--size", "480x320", "--stop", 0.3, "--fps", 10)
     ran = run("plot", tmp_path / "s.json", "-o", tmp_path / "film.mp4", *options)

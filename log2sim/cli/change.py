@@ -95,8 +95,20 @@ def edit(
                 f"--at {place}: expected x,y[,degrees[,m/s]] or an agent and meters, such as ego+20"
             ) from None
         edits.append(kinds.Add(category, x, y, radians(deg), mps))
-    edits += [kinds.Speed(agent, factor, window) for agent, factor in _numbers("--speed", speed)]
-    edits += [kinds.Lateral(agent, meters, window) for agent, meters in _numbers("--lateral", lateral)]
+
+    def numbers(option: str, entries: Changes) -> Iterator[tuple[str, float]]:  # agent and number of each, as car-1=1.5
+        for entry in entries or ():
+            agent, _, value = entry.rpartition("=")  # an id may hold an equals sign, a number does not
+            try:
+                number = float(value)
+            except ValueError:
+                agent = ""
+            if not agent:
+                raise ConfigError(f"{option} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
+            yield agent, number
+
+    edits += [kinds.Speed(agent, factor, window) for agent, factor in numbers("--speed", speed)]
+    edits += [kinds.Lateral(agent, meters, window) for agent, meters in numbers("--lateral", lateral)]
     for entry in cut_in or ():
         if window is None:
             raise ConfigError("--cut-in: add --from, when it begins")
@@ -106,7 +118,7 @@ def edit(
         except ValueError:
             raise ConfigError(f"--cut-in {entry}: expected an agent, and meters if any, such as car-1=8") from None
     # A shift comes last: it may cut off waypoints before the start that other edits need.
-    edits += [kinds.Shift(agent, seconds) for agent, seconds in _numbers("--shift", shift)]
+    edits += [kinds.Shift(agent, seconds) for agent, seconds in numbers("--shift", shift)]
     result = run(loaded, edits)
     edited = result.scenario
     edited.save(out)
@@ -129,19 +141,6 @@ def ids_of(scenario: Scenario, entries: Iterable[str]) -> Iterator[str]:
     known = {a.id for a in scenario.agents}
     for entry in entries:
         yield from [entry] if entry in known else (name.strip() for name in entry.split(","))
-
-
-def _numbers(option: str, entries: Changes) -> Iterator[tuple[str, float]]:
-    """Yield agent and number of each entry such as "car-1=1.5"."""
-    for entry in entries or ():
-        agent, _, value = entry.rpartition("=")  # an id may hold an equals sign, a number does not
-        try:
-            number = float(value)
-        except ValueError:
-            agent = ""
-        if not agent:
-            raise ConfigError(f"{option} {entry}: expected an agent, '=' and a number, such as car-1=1.5")
-        yield agent, number
 
 
 def correct(

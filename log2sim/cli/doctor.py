@@ -11,10 +11,9 @@ import shutil
 import sys
 import tomllib
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from packaging.requirements import InvalidRequirement, Requirement
@@ -24,10 +23,6 @@ from log2sim.cli.shared import format_rows
 from log2sim.errors import ConfigError, Log2SimError, install_command
 from log2sim.files.plugins import nearest
 from log2sim.files.version import __version__
-
-if TYPE_CHECKING:
-    from log2sim.files.cache import DiskCache
-
 
 MIN_PYTHON = (3, 11)
 BROKEN_CODE = 5  # as where an extra is missing: something has to be installed
@@ -58,48 +53,16 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-@dataclass(frozen=True)
-class Package:
-    """A package that log2sim needs."""
+def examine() -> dict[str, Any]:
+    """Look at everything, for `log2sim doctor`; imports all packages that log2sim needs.
 
-    name: str
-    version: str | None  # None where it is missing
-    state: str  # "ok", "missing", "outdated", or "broken": it is there and cannot be imported
-    problem: str = ""  # what is wrong, for people; empty without a problem
-
-
-@dataclass(frozen=True)
-class Extra:
-    """An optional part of log2sim."""
-
-    name: str
-    missing: tuple[str, ...]  # packages of it that are missing or too old
-    purpose: str  # empty for extras that are for development
-    install: str  # a line for the shell that adds it
-
-
-@dataclass(frozen=True)
-class Installation:
-    """What `log2sim doctor` shows."""
-
-    log2sim: str  # versions of it, of Python and of the system with its processor
-    python: str
-    system: str
-    program: str  # the Python that runs
-    packages: tuple[Package, ...]  # those that are needed
-    extras: tuple[Extra, ...]
-    models: dict[str, str]  # by detector: "ready", or what it needs
-    cache: str  # folder of the cache, and the size of what is in it
-    cache_bytes: int
-    cores: int  # processors of the machine, and those that this process may use
-    usable_cores: int
-    threads: dict[str, str]  # variables of the environment that limit threads
-    browser: str | None  # a browser that shows the pages of `log2sim view`
-    broken: tuple[str, ...]  # what is needed and does not work, each with what to do
-
-
-def examine() -> Installation:
-    """Look at everything; imports all packages that log2sim needs."""
+    "log2sim", "python" and "system" are versions, "program" is the Python that runs. "packages", those that are needed, have a
+    "version", None where it is missing, a "state" ("ok", "missing", "outdated", or "broken": it is there and cannot be imported) and
+    a "problem" for people. "extras" have the packages that are "missing" or too old, a "purpose", empty where they are for
+    development, and a line for the shell to "install" them. "models": by detector "ready", or what it needs. "cache" is its folder.
+    "threads": variables of the environment that limit threads. "browser": one that shows the pages of `log2sim view`, or None.
+    "broken": what is needed and does not work, each with what to do.
+    """
     from log2sim.files.cache import cache_folder
 
     # What log2sim requires: from the checkout it runs from, else from the installed package.
@@ -118,53 +81,55 @@ def examine() -> Installation:
         for line in lines:
             with suppress(InvalidRequirement):
                 requirements[extra].append(Requirement(line))
-    packages = tuple(_examine_package(r) for r in requirements.pop(""))
+    packages = [_examine_package(r) for r in requirements.pop("")]
     extras = []
     for extra in sorted(requirements, key=lambda name: (name not in PURPOSES, name)):
         needed = [r for r in requirements[extra] if r.marker is None or r.marker.evaluate()]
-        missing = tuple(r.name for r in needed if not _is_met(r, version_of(r.name)))
-        extras.append(Extra(extra, missing, PURPOSES.get(extra, ""), install_command(extra)))
+        missing = [r.name for r in needed if not _is_met(r, version_of(r.name))]
+        purpose = PURPOSES.get(extra, "")
+        extras.append({"name": extra, "missing": missing, "purpose": purpose, "install": install_command(extra)})
     cache, cache_bytes = cache_folder(), 0
     for place, _, files in os.walk(cache):
         for file in files:
             with suppress(OSError):  # gone in the meantime
                 cache_bytes += os.lstat(os.path.join(place, file)).st_size
-    broken = [f"{p.name}: {p.problem}" for p in packages if p.problem]
+    broken = [f"{p['name']}: {p['problem']}" for p in packages if p["problem"]]
     if sys.version_info < MIN_PYTHON:
         wanted = ".".join(map(str, MIN_PYTHON))
         broken.insert(0, f"Python {platform.python_version()} is too old: log2sim needs {wanted}")
-    return Installation(
-        log2sim=__version__,
-        python=platform.python_version(),
-        system=f"{platform.system()} {platform.release()} {platform.machine()}",
-        program=sys.executable,
-        packages=packages,
-        extras=tuple(extras),
-        models=_find_models(cache, broken),
-        cache=str(cache),
-        cache_bytes=cache_bytes,
-        cores=os.cpu_count() or 1,
-        usable_cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        threads={name: os.environ[name] for name in THREAD_VARIABLES if os.environ.get(name)},
-        browser=next((found for name in BROWSERS if (found := shutil.which(name))), None),
-        broken=tuple(broken),
-    )
+    return {
+        "log2sim": __version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "program": sys.executable,
+        "packages": packages,
+        "extras": extras,
+        "models": _find_models(cache, broken),
+        "cache": str(cache),
+        "cache_bytes": cache_bytes,
+        "cores": os.cpu_count() or 1,
+        "usable_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "threads": {name: os.environ[name] for name in THREAD_VARIABLES if os.environ.get(name)},
+        "browser": next((found for name in BROWSERS if (found := shutil.which(name))), None),
+        "broken": broken,
+    }
 
 
-def _examine_package(requirement: Requirement) -> Package:
+def _examine_package(requirement: Requirement) -> dict[str, Any]:
     """Import a package that is needed, and compare its version with what is required."""
     name, wanted = requirement.name, f"pip install '{requirement.name}{requirement.specifier}'"
-    version = version_of(name)
+    version, state, problem = version_of(name), "ok", ""
     try:
         module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
     except Exception as error:  # whatever a broken package raises
-        if version is None:
-            return Package(name, None, "missing", f"is missing: {wanted}")
-        return Package(name, version, "broken", f"cannot be imported: {type(error).__name__}: {error}")
-    version = version or str(getattr(module, "__version__", "")) or None  # the module of another distribution
-    if version is not None and not _is_met(requirement, version):
-        return Package(name, version, "outdated", f"{version} is too old: {wanted}")
-    return Package(name, version, "ok")
+        state, problem = "missing", f"is missing: {wanted}"
+        if version is not None:
+            state, problem = "broken", f"cannot be imported: {type(error).__name__}: {error}"
+    else:
+        version = version or str(getattr(module, "__version__", "")) or None  # the module of another distribution
+        if version is not None and not _is_met(requirement, version):
+            state, problem = "outdated", f"{version} is too old: {wanted}"
+    return {"name": name, "version": version, "state": state, "problem": problem}
 
 
 def _is_met(requirement: Requirement, version: str | None) -> bool:
@@ -210,31 +175,30 @@ def doctor(as_json: opt.AsJson = False) -> None:
     log2sim doctor --json
     """
     found = examine()
-    opt.say(json.dumps(asdict(found), indent=2) if as_json else "\n".join(_describe(found)))
-    if found.broken:
-        opt.fail("; ".join(found.broken), BROKEN_CODE)
-
-
-def _describe(found: Installation) -> list[str]:
-    """Describe an installation in lines for people."""
-    limits = "".join(f", {name}={value}" for name, value in found.threads.items())
-    extras = [extra for extra in found.extras if extra.purpose]
-    absent = [extra for extra in extras if extra.missing]
-    facts = [
-        ("log2sim", found.log2sim),
-        ("Python", f"{found.python}, {found.program}"),
-        ("system", found.system),
-        ("processor", f"{found.usable_cores} of {found.cores} cores{limits}"),
-        ("cache", f"{found.cache}, {found.cache_bytes / 1e6:.0f} MB"),
-        ("browser", found.browser or "none found; open the pages of log2sim view on another machine"),
-    ]
-    lines = format_rows(facts)
-    lines += ["", "packages", *format_rows([(p.name, p.version or "-", p.state) for p in found.packages], indent=2)]
-    lines += ["", "detectors", *format_rows(list(found.models.items()), indent=2)]
-    states = [(extra.name, "missing" if extra.missing else "installed", extra.purpose) for extra in extras]
-    lines += ["", "extras", *format_rows(states, indent=2)]
-    lines += ["", "to add one:", *(f"  {extra.install}" for extra in absent)] if absent else []
-    return [*lines, "", "nothing needed is missing" if not found.broken else f"{len(found.broken)} problems"]
+    if as_json:
+        opt.say(json.dumps(found, indent=2))
+    else:
+        limits = "".join(f", {name}={value}" for name, value in found["threads"].items())
+        extras = [extra for extra in found["extras"] if extra["purpose"]]
+        absent = [f"  {extra['install']}" for extra in extras if extra["missing"]]
+        lines = format_rows([
+            ("log2sim", found["log2sim"]),
+            ("Python", f"{found['python']}, {found['program']}"),
+            ("system", found["system"]),
+            ("processor", f"{found['usable_cores']} of {found['cores']} cores{limits}"),
+            ("cache", f"{found['cache']}, {found['cache_bytes'] / 1e6:.0f} MB"),
+            ("browser", found["browser"] or "none found; open the pages of log2sim view on another machine"),
+        ])  # fmt: skip
+        packages = [(p["name"], p["version"] or "-", p["state"]) for p in found["packages"]]
+        lines += ["", "packages", *format_rows(packages, indent=2)]
+        lines += ["", "detectors", *format_rows(list(found["models"].items()), indent=2)]
+        states = [(e["name"], "missing" if e["missing"] else "installed", e["purpose"]) for e in extras]
+        lines += ["", "extras", *format_rows(states, indent=2)]
+        lines += ["", "to add one:", *absent] if absent else []
+        lines += ["", f"{len(found['broken'])} problems" if found["broken"] else "nothing needed is missing"]
+        opt.say("\n".join(lines))
+    if found["broken"]:
+        opt.fail("; ".join(found["broken"]), BROKEN_CODE)
 
 
 def config(file: opt.ConfigFile = None, settings: opt.Settings = None) -> None:
@@ -268,50 +232,36 @@ def cache(
     log2sim cache
     log2sim cache --max-mb 8192
     """
-    import json
-
     from log2sim.files.cache import DiskCache, detection_folder
 
     store = DiskCache(detection_folder())
     if max_mb is not None:
         store.set_limit(max_mb)
     removed = store.clear() if clear else None
-    if as_json:
-        opt.say(json.dumps(summarize_cache(store), indent=2))
-    elif removed is not None:
+    if removed is not None and not as_json:
         opt.say(f"{store.folder}: {opt.counted(removed, 'part')} removed")
-    else:
-        opt.say("\n".join(describe_cache(summarize_cache(store))))
-
-
-def summarize_cache(store: DiskCache) -> dict[str, Any]:
-    """Return the folder and the size of a cache, the parts of logs by detector, and what the last run took from it."""
+        return
     usage, last = store.usage(), store.last_run
-    detectors = [
+    detectors: list[dict[str, Any]] = [
         {"name": group.rpartition(".")[0], "parts": count, "bytes": size}
         for group, (count, size) in sorted(usage.items(), key=lambda item: (-item[1][0], item[0]))
     ]
     found, kept = last.get("found"), last.get("kept")
-    return {
-        "folder": str(store.folder), "max_mb": store.max_mb, "bytes": sum(size for _, size in usage.values()),
-        "parts": sum(count for count, _ in usage.values()), "detectors": detectors,
-        "last_run": {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None,
-    }  # fmt: skip
-
-
-def describe_cache(found: dict[str, Any]) -> list[str]:
-    """Describe a cache in lines for people."""
-    sizes = [f"{entry['bytes'] / 1024**2:.1f}" for entry in (found, *found["detectors"])]
+    size, parts = sum(size for _, size in usage.values()), sum(count for count, _ in usage.values())
+    last_run = {"found": found, "kept": kept} if isinstance(found, int) and isinstance(kept, int) else None
+    if as_json:
+        about = {"folder": str(store.folder), "max_mb": store.max_mb, "bytes": size, "parts": parts}
+        opt.say(json.dumps({**about, "detectors": detectors, "last_run": last_run}, indent=2))
+        return
     rows = [
-        ("folder", found["folder"]),
-        ("size", f"{sizes[0]} of at most {found['max_mb']} MB"),
-        ("parts of logs", str(found["parts"])),
-        *(("", f"{d['parts']} by {d['name']}, {size} MB") for d, size in zip(found["detectors"], sizes[1:])),
+        ("folder", str(store.folder)),
+        ("size", f"{size / 1024**2:.1f} of at most {store.max_mb} MB"),
+        ("parts of logs", str(parts)),
+        *(("", f"{d['parts']} by {d['name']}, {d['bytes'] / 1024**2:.1f} MB") for d in detectors),
     ]
-    last = found["last_run"]
-    if last is not None:
-        rows.append(("last run", f"{opt.counted(last['found'], 'tick')} known, {last['kept']} kept"))
-    return format_rows(rows)
+    if last_run is not None:
+        rows.append(("last run", f"{opt.counted(last_run['found'], 'tick')} known, {last_run['kept']} kept"))
+    opt.say("\n".join(format_rows(rows)))
 
 
 def pages() -> dict[str, str]:

@@ -99,7 +99,12 @@ def _run(ended: Ended) -> NoReturn:
     except Exception as error:
         format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
         if format_message is None:
-            if _is_interruption(error):
+            cause: BaseException | None = (
+                error  # Ctrl-C while libraries are being imported gives an ImportError from it
+            )
+            while cause is not None and not isinstance(cause, KeyboardInterrupt):
+                cause = cause.__cause__ or cause.__context__
+            if cause is not None:
                 _end(INTERRUPTED, ended)
             if debug:
                 raise
@@ -109,13 +114,6 @@ def _run(ended: Ended) -> NoReturn:
             sys.exit(2)
         fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     _end(code, ended)
-
-
-def _is_interruption(error: BaseException | None) -> bool:
-    """Return whether Ctrl-C is behind an error: libraries that are being imported then raise an ImportError from it."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _end(code: Any, ended: Ended) -> NoReturn:

@@ -97,7 +97,9 @@ def evaluate(
         if out is not None:
             write_json(out, result)
         if plot is not None:
-            _plot_reliability(result, plot)
+            from log2sim.visualization.plot.reliability import write_reliability
+
+            write_reliability(result, plot)
     opt.say(table, quiet=quiet)
     opt.report_written(out, plot, quiet=quiet)
 
@@ -120,32 +122,6 @@ def _other_map(scenario: Scenario, truth: Path) -> str | None:
     if source not in ("lidar", "camera") or not (truth.suffix == ".json" or (truth / "truth.json").is_file()):
         return None
     return f"the scenario's poses are estimated ({source}), {truth} has its own: what the two maps differ by counts as error"
-
-
-def _plot_reliability(result: dict[str, Any], path: Path) -> None:
-    """Write the diagrams of the scores of each class, or of confidences: of ticks, of agents, and of the ticks of each kind."""
-    from log2sim.visualization.plot.reliability import Reliability, write_reliability
-
-    if "classes" in result:
-        keys = ("boxes", "mean_score", "precision")
-        tables = [(name, "boxes", figures["calibration"]) for name, figures in result["classes"].items()]
-    else:
-        keys = ("count", "mean_confidence", "right")
-        found = result["correctness"]
-        tables = [("all", noun, found["calibration"][noun]) for noun in ("ticks", "agents")]
-        kinds = found["by_kind"] if len(found["by_kind"]) > 1 else {}
-        tables += [(name, "ticks", figures["calibration"]["ticks"]) for name, figures in kinds.items()]
-    diagrams = [
-        Reliability(
-            name,
-            noun,
-            table["expected_calibration_error"],
-            tuple((b[keys[0]], b[keys[1]], b[keys[2]]) for b in table["bins"] if b[keys[0]]),
-        )
-        for name, noun, table in tables
-        if table[keys[0]]
-    ]
-    write_reliability(diagrams, path)
 
 
 def _batch_figures(

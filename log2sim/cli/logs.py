@@ -28,17 +28,43 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
     """Describe a log: a line for each sensor, then the ego, labels, the map, and notes."""
     seconds = f"{log['duration_s']:.1f} s"
     lines = [f"{log['name']}: a log in the format {log['format']}, {seconds}", ""]
-    header = ("sensor", "records", "rate", "gaps", "mount", "")
-    rows = [(name, *_stream(entry), _lens(entry)) for name, entry in log["cameras"].items()]
-    rows += [(name, *_stream(entry), "LiDAR") for name, entry in log["lidars"].items()]
-    lines += [*format_rows([header, *rows]), ""]
-    facts = [("ego", _ego(log["ego"])), ("labels", _labels(log["labels"])), ("map", _map(log["map"]))]
+    rows = [("sensor", "records", "rate", "gaps", "mount", "")]
+    for name, sensor in [*log["cameras"].items(), *log["lidars"].items()]:
+        rate, gaps = sensor["rate_hz"], sensor["gaps"]
+        longest = max((gap["length_s"] for gap in gaps), default=0.0)
+        what = "LiDAR"
+        if name in log["cameras"]:
+            width, height = sensor["size_px"]
+            shutter = "" if sensor["rolling_shutter"] is None else ", rolling shutter"
+            what = f"{width} x {height} px, {sensor['field_of_view_deg']:.0f} degrees{shutter}"
+        told = f"{len(gaps)}, longest {longest:.1f} s" if gaps else "none"
+        hertz = "-" if rate is None else f"{rate:.1f} Hz"
+        rows.append((name, str(sensor["records"]), hertz, told, sensor["mount"], what))
+    lines += [*format_rows(rows), ""]
+    driven, boxes, place = "no poses", "none", "local, its place on Earth is not known"
+    if (ego := log["ego"]) is not None:
+        at = "" if ego["rate_hz"] is None else f" at {ego['rate_hz']:.1f} Hz"
+        size = " x ".join(f"{v:g}" for v in ego["size_m"])
+        way = f"{ego['distance_m']:.1f} m driven, at most {ego['top_speed_mps']:.1f} m/s"
+        driven = f"{opt.counted(ego['records'], 'pose')}{at}, {way}, {size} m"
+    if (labels := log["labels"]) is not None:
+        tracks = f"{opt.counted(labels['tracks'], 'object')}: {_counts(labels['tracks_by_category'])}"
+        boxes = f"{labels['boxes']} boxes of {tracks}"
+    latitude, longitude = log["map"]["latitude_deg"], log["map"]["longitude_deg"]
+    if latitude is not None and longitude is not None:
+        place = f"origin at {latitude:.5f}, {longitude:.5f} degrees (latitude, longitude)"
+    facts = [("ego", driven), ("labels", boxes), ("map", place)]
     for name, title in (("image_labels", "boxes in images"), ("ignored_regions", "ignored regions")):
         if log[name]:
             counts = {s: n if isinstance(n, int) else sum(n.values()) for s, n in log[name].items()}
             facts.append((title, ", ".join(f"{sensor} {count}" for sensor, count in counts.items())))
     facts += [(key, str(value)) for key, value in log["details"].items() if isinstance(value, str | int | float)]
-    return [*lines, *format_rows(facts), *_topics(log["details"]), *_notes(log["notes"], verbose=verbose)]
+    lines += format_rows(facts)
+    topics = log["details"].get("topics")
+    if isinstance(topics, list) and topics:  # of a ROS recording, with what each was taken for
+        taken = [(str(t["topic"]), str(t["messages"]), str(t["role"] or "-"), str(t["reason"])) for t in topics]
+        lines += ["", *format_rows([("topic", "messages", "role", ""), *taken])]
+    return [*lines, *_notes(log["notes"], verbose=verbose)]
 
 
 def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]:
@@ -46,6 +72,14 @@ def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]
     agents, lanes, ego = scenario["agents"], scenario["lanes"], scenario["ego"]
     total = opt.counted(agents["count"], "agent") + (" and the ego" if ego is not None else "")
     inferred = "" if lanes["in_file"] or not lanes["count"] else ", inferred from paths now"
+    kept, keeping = "none" if ego is None else "in no lane", scenario["ego_in_lane"]
+    if ego is not None and keeping is not None:
+        kept = f"in a lane {keeping['in_lane']:.0%} of the time"
+        if "aside_m" in keeping:
+            aside = keeping["aside_m"]["mean"]
+            kept += f", {abs(aside):.2f} m {'left' if aside > 0 else 'right'} of the middle on average"
+        else:
+            kept += ", none of them between markings"
     facts = [
         ("agents", f"{agents['count']}: {_counts(agents['categories'])}" if agents["count"] else "none"),
         ("moving", str(agents["moving"])),
@@ -55,67 +89,10 @@ def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]
         ("borders", _counts(scenario["borders"]) or "none"),
         ("lanes", f"{lanes['count']}, {opt.counted(lanes['junctions'], 'junction')}{inferred}"),
         ("lights", opt.counted(scenario["signals"], "traffic light")),
-        ("ego", _lane_keeping(ego, scenario["ego_in_lane"])),
+        ("ego", kept),
     ]
     lines = [f"{scenario['name']}: a scenario with {total} over {scenario['duration_s']:.1f} s", ""]
     return [*lines, *format_rows(facts), *_notes(scenario["notes"], verbose=verbose)]
-
-
-def _stream(sensor: Document) -> tuple[str, str, str, str]:
-    """Return records, rate, gaps and mount of a sensor."""
-    rate, gaps = sensor["rate_hz"], sensor["gaps"]
-    longest = max((gap["length_s"] for gap in gaps), default=0.0)
-    told = f"{len(gaps)}, longest {longest:.1f} s" if gaps else "none"
-    return str(sensor["records"]), "-" if rate is None else f"{rate:.1f} Hz", told, sensor["mount"]
-
-
-def _lens(camera: Document) -> str:
-    width, height = camera["size_px"]
-    shutter = "" if camera["rolling_shutter"] is None else ", rolling shutter"
-    return f"{width} x {height} px, {camera['field_of_view_deg']:.0f} degrees{shutter}"
-
-
-def _ego(ego: Document | None) -> str:
-    if ego is None:
-        return "no poses"
-    rate = "" if ego["rate_hz"] is None else f" at {ego['rate_hz']:.1f} Hz"
-    length, width, height = ego["size_m"]
-    way = f"{ego['distance_m']:.1f} m driven, at most {ego['top_speed_mps']:.1f} m/s"
-    return f"{opt.counted(ego['records'], 'pose')}{rate}, {way}, {length:g} x {width:g} x {height:g} m"
-
-
-def _labels(labels: Document | None) -> str:
-    if labels is None:
-        return "none"
-    tracks = f"{opt.counted(labels['tracks'], 'object')}: {_counts(labels['tracks_by_category'])}"
-    return f"{labels['boxes']} boxes of {tracks}"
-
-
-def _map(frame: Document) -> str:
-    if frame["latitude_deg"] is None or frame["longitude_deg"] is None:
-        return "local, its place on Earth is not known"
-    return f"origin at {frame['latitude_deg']:.5f}, {frame['longitude_deg']:.5f} degrees (latitude, longitude)"
-
-
-def _topics(details: Document) -> list[str]:
-    """Return a table of the topics of a ROS recording, with what each was taken for."""
-    topics = details.get("topics")
-    if not isinstance(topics, list) or not topics:
-        return []
-    rows = [(str(t["topic"]), str(t["messages"]), str(t["role"] or "-"), str(t["reason"])) for t in topics]
-    return ["", *format_rows([("topic", "messages", "role", ""), *rows])]
-
-
-def _lane_keeping(ego: Document | None, keeping: Document | None) -> str:
-    if ego is None:
-        return "none"
-    if keeping is None:
-        return "in no lane"
-    text = f"in a lane {keeping['in_lane']:.0%} of the time"
-    if "aside_m" not in keeping:
-        return f"{text}, none of them between markings"
-    aside = keeping["aside_m"]["mean"]
-    return f"{text}, {abs(aside):.2f} m {'left' if aside > 0 else 'right'} of the middle on average"
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -372,26 +349,15 @@ def map(
     from log2sim.files.documents import check_targets
     from log2sim.logs.opening import open_log
     from log2sim.perception.records import RecordSource
+    from log2sim.road import map_files
     from log2sim.road.builder import map_ground
-    from log2sim.road.map_files import (
-        HEIGHT_STEP_M,
-        LAYERS,
-        Layer,
-        check_name,
-        geokeys_of,
-        known_cells,
-        lowest_m,
-        world_file_of,
-        write_map,
-        write_world_file,
-    )
 
-    check_name(out)
-    world = world_file_of(out)
+    map_files.check_name(out)
+    world = map_files.world_file_of(out)
     check_targets(out, world, overwrite=overwrite)
-    if layer not in LAYERS:
-        raise ConfigError(f"--layer: '{layer}' is none of {', '.join(LAYERS)}")
-    chosen, settings = cast(Layer, layer), Config.load(map={"cell_m": cell}).map
+    if layer not in map_files.LAYERS:
+        raise ConfigError(f"--layer: '{layer}' is none of {', '.join(map_files.LAYERS)}")
+    chosen, settings = cast(map_files.Layer, layer), Config.load(map={"cell_m": cell}).map
     opened = open_log(log, format=format, sequence=sequence)
     if chosen == "color" and not opened.cameras:
         raise ConfigError(f"{opened.name}: the log has no camera; take --layer intensity or --layer height")
@@ -402,20 +368,18 @@ def map(
     records = RecordSource(opened)
     with progress(quiet=quiet) as report_progress:
         whole = map_ground(opened, loaded, settings, records, report_progress)
-    ground = whole.around(known_cells(whole, chosen))
+    ground = whole.around(map_files.known_cells(whole, chosen))
     with together():
-        write_map(ground, out, chosen, opened.map, overwrite=overwrite)
+        map_files.write_map(ground, out, chosen, opened.map, overwrite=overwrite)
         if world is not None:
-            write_world_file(ground, world, opened.map, overwrite=overwrite)
-    notes = [
-        *ground.notes,
-        *(f"{name}: {u['count']} records could not be read" for name, u in records.summary().items()),
-    ]
-    problem = geokeys_of(opened.map).problem
+            map_files.write_world_file(ground, world, opened.map, overwrite=overwrite)
+    unread = [f"{name}: {u['count']} records could not be read" for name, u in records.summary().items()]
+    notes = [*ground.notes, *unread]
+    problem = map_files.geokeys_of(opened.map).problem
     notes += [f"no place on Earth: {problem}"] if problem else []
     if chosen == "height" and out.suffix.lower() == ".png":
         notes.append(
-            f"heights in {out.name}: value 1 is {lowest_m(ground):.2f} m, {HEIGHT_STEP_M:g} m a step, 0 is unknown"
+            f"heights in {out.name}: value 1 is {map_files.lowest_m(ground):.2f} m, {map_files.HEIGHT_STEP_M:g} m a step, 0 is unknown"
         )
     opt.say_all("note", notes, quiet=quiet)
     rows, columns = ground.alpha.shape

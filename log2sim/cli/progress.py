@@ -31,7 +31,19 @@ def progress(*, quiet: bool) -> Iterator[Report]:
         with _bars() as report_progress:
             yield report_progress
     else:
-        yield _lines()
+        last, current = [time.monotonic()], [""]
+
+        def report_line(stage: str, done: int, total: int) -> None:
+            if stage in ON_TERMINALS:
+                return
+            now = time.monotonic()
+            begins, current[0] = stage != current[0], stage
+            if (done == total if total else begins) or now - last[0] >= LINE_EVERY_S:
+                last[0] = now
+                count = f": {done} of {total}" if total else ""
+                sys.stderr.write(f"{describe_stage(stage)}{count}\n")
+
+        yield report_line
 
 
 class Bars:
@@ -68,52 +80,21 @@ class Bars:
 
 @contextmanager
 def _bars() -> Iterator[Report]:
+    from rich import progress as rich
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
     from rich.text import Text
 
-    class Count(ProgressColumn):
+    class Count(rich.ProgressColumn):
         """How many of how many, where that is known."""
 
-        def render(self, task: Task) -> Text:
+        def render(self, task: rich.Task) -> Text:
             return Text("" if task.total is None else f"{task.completed:.0f} of {task.total:.0f}")
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=20),
-        Count(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    left = rich.TextColumn("{task.description}"), rich.BarColumn(bar_width=20)
+    columns = (*left, Count(), rich.TimeElapsedColumn(), rich.TimeRemainingColumn())
     # What is printed meanwhile goes where it was meant to go, not to this console.
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as display:
+    with rich.Progress(
+        *columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False
+    ) as display:
         yield Bars(display)
-
-
-def _lines() -> Report:
-    last, current = [time.monotonic()], [""]
-
-    def report_progress(stage: str, done: int, total: int) -> None:
-        if stage in ON_TERMINALS:
-            return
-        now = time.monotonic()
-        begins, current[0] = stage != current[0], stage
-        if done == total if total else begins:
-            wanted = True
-        else:
-            wanted = now - last[0] >= LINE_EVERY_S
-        if wanted:
-            last[0] = now
-            count = f": {done} of {total}" if total else ""
-            sys.stderr.write(f"{describe_stage(stage)}{count}\n")
-
-    return report_progress

@@ -19,9 +19,6 @@ from log2sim.files.outputs import together
 from log2sim.visualization.progress import OPENING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from log2sim.batch.folder import Row
     from log2sim.datatypes import Scenario
     from log2sim.datatypes.findings import Finding
     from log2sim.report import Result
@@ -29,12 +26,8 @@ if TYPE_CHECKING:
 
 # Stages without which something is missing in a scenario; the others save time.
 LOOKED_FOR = (
-    "image decoding",
-    "detection in LiDAR sweeps",
-    "markings and lanes",
-    "colors of vehicles",
-    "traffic lights",
-)
+    "image decoding", "detection in LiDAR sweeps", "markings and lanes", "colors of vehicles", "traffic lights",
+)  # fmt: skip
 
 
 def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
@@ -45,11 +38,22 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
     scenario, seconds = result.scenario, result.report["seconds"]
     ids = count_agents(agent.id for agent in scenario.agents)
     speed = f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    # What was found beside the agents; nothing of what was not found or not looked for.
+    features = scenario.map_features
+    counts = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
+    counts.append((len(scenario.signals), "traffic light"))
+    road = ", ".join(opt.counted(count, name) for count, name in counts if count)
+    # What was not looked for, by reason, and what of the road was not found.
+    left_out: dict[str, list[str]] = {}
+    for stage in scenario.stages:
+        if stage["stage"] in LOOKED_FOR and not stage["kept"]:
+            left_out.setdefault(str(stage["reason"]), []).append(str(stage["stage"]))
+    missing = [f"{', '.join(stages)}: {reason}" for reason, stages in left_out.items()]
     rows = [
         ("agents", count_categories(scenario.others) or "none"),
         *(("doubtful", line) for line in doubt_lines(scenario, result.findings, verbose=verbose) or ["none"]),
-        ("road", ", ".join(described(scenario)) or "no lanes, markings or traffic lights"),
-        *(("missing", line) for line in missing_lines(scenario)),
+        ("road", road or "no lanes, markings or traffic lights"),
+        *(("missing", line) for line in (*missing, *(() if features is None else features.notes))),
     ]
     if verbose:
         stages = [f"{'with' if s['kept'] else 'no'} {s['stage']}: {s['reason']}" for s in scenario.stages]
@@ -64,14 +68,6 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
         *table,
         f"  {'next':<{len('doubtful')}}  {next_line}",
     ]
-
-
-def described(scenario: Scenario) -> list[str]:
-    """Count what was found beside the agents; nothing of what was not found or not looked for."""
-    features = scenario.map_features
-    counts = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
-    counts.append((len(scenario.signals), "traffic light"))
-    return [opt.counted(count, name) for count, name in counts if count]
 
 
 def doubt_lines(scenario: Scenario, findings: Sequence[Finding], *, verbose: bool = False) -> list[str]:
@@ -94,17 +90,6 @@ def doubt_lines(scenario: Scenario, findings: Sequence[Finding], *, verbose: boo
         *([quarantined] if gone else []),
         *([f"perhaps since sensors are off (see the notes): try {' '.join(sorted(options))}"] if options else []),
     ]
-
-
-def missing_lines(scenario: Scenario) -> list[str]:
-    """Say what a scenario lacks and why: what was not looked for, by reason, and what of the road was not found."""
-    left_out: dict[str, list[str]] = {}
-    for stage in scenario.stages:
-        if stage["stage"] in LOOKED_FOR and not stage["kept"]:
-            left_out.setdefault(str(stage["reason"]), []).append(str(stage["stage"]))
-    features = scenario.map_features
-    notes = () if features is None else features.notes
-    return [*(f"{', '.join(stages)}: {reason}" for reason, stages in left_out.items()), *notes]
 
 
 def pose_reasons(poses: dict[str, Any]) -> list[str]:
@@ -203,7 +188,16 @@ def reconstruct(
         opt.say_all("warning", corrected.unmatched, quiet=quiet)
     with together():
         if topdown is not None:
-            _write_topdown(result, topdown, overwrite=overwrite)
+            from log2sim.cli.show import CELL_M
+            from log2sim.config import MapConfig
+            from log2sim.perception.records import RecordSource
+            from log2sim.road.builder import map_ground
+            from log2sim.road.map_files import write_map
+
+            records = RecordSource(result.log)
+            ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), records)
+            write_map(ground.around(ground.coverage), topdown, overwrite=overwrite)
+            result.report["unreadable"] = {**records.summary(), **result.report["unreadable"]}
         if report is not None:
             write_json(report, result.report)
         result.scenario.save(out)
@@ -217,20 +211,6 @@ def reconstruct(
     view = shlex.join(["log2sim", "view", str(out), "--log", str(log), *sequences, "-o", page])
     for line in summarize_run(result, view, out, verbose=verbose):
         opt.say(line, quiet=quiet)
-
-
-def _write_topdown(result: Result, path: Path, *, overwrite: bool) -> None:
-    """Write the bird's-eye image of a run, and note in its report which records could not be read for it."""
-    from log2sim.cli.show import CELL_M
-    from log2sim.config import MapConfig
-    from log2sim.perception.records import RecordSource
-    from log2sim.road.builder import map_ground
-    from log2sim.road.map_files import write_map
-
-    records = RecordSource(result.log)
-    ground = map_ground(result.log, result.scenario, MapConfig(cell_m=CELL_M), records)
-    write_map(ground.around(ground.coverage), path, overwrite=overwrite)
-    result.report["unreadable"] = {**records.summary(), **result.report["unreadable"]}
 
 
 MAX_NAMED = 5
@@ -274,6 +254,7 @@ def batch(
     """
     from log2sim.batch import plan_batch, run_batch
     from log2sim.batch.discovery import SCENARIO
+    from log2sim.batch.folder import sum_up
     from log2sim.batch.run import connect
 
     opt.require_own_workers(jobs, scheduler)
@@ -286,32 +267,21 @@ def batch(
     begun = time.perf_counter()
     with progress(quiet=quiet) as report_progress:
         rows = run_batch(planned, lambda: connect(jobs, scheduler), progress=partial(report_progress, f"{kind}s"))
-    for line in _failure_lines(rows):
-        opt.say(line, quiet=quiet)
+    failed = [row for row in rows if not row.is_done]
+    for row in failed[:MAX_NAMED]:
+        reason = row.error.splitlines()[0] if row.error else row.error_kind
+        opt.say(f"failed: {row.log}: {reason}", quiet=quiet)
+    if len(failed) > MAX_NAMED:
+        opt.say(f"and {len(failed) - MAX_NAMED} more", quiet=quiet)
     now = sum(row.is_done and row.name not in planned.done for row in rows)
     rate = f"; {now / (time.perf_counter() - begun) * 3600:,.0f} {kind}s an hour" if now else ""
-    opt.say(f"{out / 'table.html'}: {_summary(rows, kind)}{rate}", quiet=quiet)
-    failed = sum(not row.is_done for row in rows)
-    if failed:
-        raise LogsFailed(f"{failed} of {opt.counted(len(rows), kind)} failed; {out / 'table.html'} says why")
-
-
-def _summary(rows: Sequence[Row], kind: str) -> str:
-    from log2sim.batch.folder import sum_up
-
-    sums = sum_up(rows)
-    off_m = [row.cross_track_max_m for row in rows if row.cross_track_max_m is not None]
+    sums, off_m = sum_up(rows), [row.cross_track_max_m for row in rows if row.cross_track_max_m is not None]
     collisions = opt.counted(sum(row.new_collisions or 0 for row in rows), "new collision")
     replayed = f"; replayed at most {max(off_m):.3f} m off the paths, {collisions}" if off_m else ""
-    return (
-        f"{sums['done']:.0f} of {opt.counted(len(rows), kind)} done, {sums['agents']:.0f} agents ({sums['static']:.0f} static, "
-        f"{sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s{replayed}"
+    opt.say(
+        f"{out / 'table.html'}: {sums['done']:.0f} of {opt.counted(len(rows), kind)} done, {sums['agents']:.0f} agents "
+        f"({sums['static']:.0f} static, {sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s{replayed}{rate}",
+        quiet=quiet,
     )
-
-
-def _failure_lines(rows: Sequence[Row]) -> list[str]:
-    """Say why the first logs failed."""
-    failed = [row for row in rows if not row.is_done]
-    lines = [f"failed: {row.log}: {row.error.splitlines()[0] if row.error else row.error_kind}" for row in failed]
-    more = len(lines) - MAX_NAMED
-    return [*lines[:MAX_NAMED], *([f"and {more} more"] if more > 0 else [])]
+    if failed:
+        raise LogsFailed(f"{len(failed)} of {opt.counted(len(rows), kind)} failed; {out / 'table.html'} says why")

@@ -201,15 +201,10 @@ def add_command(app: typer.Typer, command: Callable[..., None]) -> None:
     # A paragraph that begins with \b keeps its lines.
     epilog = "\n".join(["\b", f"Example{'s' * (len(lines) > 1)}:", *(f"  {line}" for line in lines)]) if lines else None
     add = app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=epilog, context_settings=settings)
-    add(add_shared_options(command))
-
-
-def add_shared_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with options that `log2sim.cli.entry` reads before it runs any command."""
 
     @functools.wraps(command)
     def run(*args: Any, debug: bool = False, follow_links: bool = False, **options: Any) -> None:
-        command(*args, **options)
+        command(*args, **options)  # `log2sim.cli.entry` reads the others before it runs any command
 
     signature = inspect.signature(command, eval_str=True)
     shared = (("debug", Debug), ("follow_links", FollowLinks))
@@ -217,4 +212,4 @@ def add_shared_options(command: Callable[..., None]) -> Callable[..., None]:
     parameters = [*signature.parameters.values(), *added]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
-    return run
+    add(run)

@@ -121,8 +121,20 @@ def view(
     layers: dict[str, Any] = {
         "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
         "truth": load_placed_truth(truth, loaded, sequence) if truth is not None else None,
-        "metrics": [] if metrics is None else [_metrics(metrics)],
+        "metrics": [],
     }
+    if metrics is not None:
+        from log2sim.evaluation.metrics.table import format_table, format_verdict
+        from log2sim.files.documents import read_json
+
+        measured = read_json(metrics, LogError)
+        try:
+            table = f"{format_verdict(measured)}\n\n{format_table(measured)}"
+            layers["metrics"] = [(f"Metrics against {measured['truth']}", table)]
+        except (KeyError, TypeError, AttributeError, ValueError):
+            raise LogError(
+                f"{metrics}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"
+            ) from None
     with progress(quiet=quiet) as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
@@ -140,23 +152,6 @@ def view(
     for note in notes:
         opt.say(note, quiet=quiet)
     opt.say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}", quiet=quiet)
-
-
-def _metrics(path: Path) -> tuple[str, str]:
-    """Return title and table of a metrics file.
-
-    Raises `LogError` when it is none.
-    """
-    from log2sim.evaluation.metrics.table import format_table, format_verdict
-    from log2sim.files.documents import read_json
-
-    document = read_json(path, LogError)
-    try:
-        return f"Metrics against {document['truth']}", f"{format_verdict(document)}\n\n{format_table(document)}"
-    except (KeyError, TypeError, AttributeError, ValueError):
-        raise LogError(
-            f"{path}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"
-        ) from None
 
 
 CELL_M = 0.06  # edge of a cell, m: pictures on paper and screens show no more of a hundred meters

@@ -254,6 +254,11 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         "of yaw: the vehicle sees too little of what it sees",
         ROAD_POSE,
     ),
+    "unknown_road_clock": Kind(
+        "both ends see too little that moves to know the clock of a roadside unit to 20 ms",
+        "its clock is known no better than to a sigma of {delay_sigma_ms:.0f} ms against the ego's: both ends see too little that moves",
+        ROAD_POSE,
+    ),
     "wrong_road_pose": Kind(
         "the vehicle saw through what a roadside unit sees, and no pose near its own makes both fit",
         "its pose cannot be trusted: the vehicle saw through {through_share:.0%} of the upright surfaces that it sees, and no pose "

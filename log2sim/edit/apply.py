@@ -13,7 +13,6 @@ from log2sim.edit.edits import Add, Agents, Edit, Only, Remove
 from log2sim.edit.motion import MIN_PATH_MPS, chords
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.files.plugins import nearest
-from log2sim.geometry import Array
 from log2sim.simulation.metrics.all_metrics import OFF_PATH_M
 from log2sim.simulation.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
 from log2sim.simulation.runner import replay
@@ -23,6 +22,7 @@ CURVATURE_LIMITS_1PM = {"vehicle": MAX_CURVATURE_1PM, "two_wheeler": MAX_TWO_WHE
 STEP_S = 0.05
 SAME_CONTACT_S = 0.5
 RELATIVE_TOLERANCE = 1 + 1e-6
+MAX_LISTED = 12  # ids in a message
 
 
 def _collisions(before: Scenario, after: Scenario, changed: Set[str]) -> Iterator[str]:
@@ -55,56 +55,48 @@ def _undrivable(before: Scenario, after: Scenario, changed: Sequence[Agent]) -> 
     moving = tuple(a for a in changed if not a.static and GROUP_OF[a.category] != "pedestrian")
     if not moving:
         return
-    off_path = _off_path(replace(after, agents=moving))
+
+    def off_path_of(scenario: Scenario) -> dict[str, float]:  # with the largest distance across it, m
+        figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]
+        across = {name: entry.get("cross_track_max_m") for name, entry in figures.items()}
+        return {name: float(value) for name, value in across.items() if value is not None and value > OFF_PATH_M}
+
+    off_path = off_path_of(replace(after, agents=moving))
     same = tuple(a for a in before.agents if a.id in off_path and not a.static)
-    known = _off_path(replace(before, agents=same)) if same else {}
+    known = off_path_of(replace(before, agents=same)) if same else {}
     for agent in moving:
         across_m = off_path.get(agent.id, 0.0)
         if across_m > known.get(agent.id, 0.0):
             yield f"agent '{agent.id}': its vehicle model leaves the path by {across_m:.2f} m, limit {OFF_PATH_M:g} m"
 
 
-def _off_path(scenario: Scenario) -> dict[str, float]:
-    """Return the agents of a replay that leave their path, with the largest distance across it, m."""
-    figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]
-    across = {name: entry.get("cross_track_max_m") for name, entry in figures.items()}
-    return {name: float(value) for name, value in across.items() if value is not None and value > OFF_PATH_M}
-
-
 def _infeasible(before: Agent | None, after: Agent) -> Iterator[str]:
     """Yield acceleration and curvature beyond their limits and beyond those of the source."""
     curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
-    for what, peak_of, limit, unit in (
-        ("acceleration", peak_acceleration, MAX_ACCEL_MPS2, "m/s2"),
-        ("curvature", peak_curvature, curvature_limit, "1/m"),
-    ):
-        peak, t_s = peak_of(after)
-        known = 0.0 if before is None else peak_of(before)[0]
-        if peak > max(limit, known) * RELATIVE_TOLERANCE:
+    known = {} if before is None else _peaks(before)
+    for what, (peak, t_s) in _peaks(after).items():
+        limit, unit = (MAX_ACCEL_MPS2, "m/s2") if what == "acceleration" else (curvature_limit, "1/m")
+        if peak > max(limit, known.get(what, (0.0, 0.0))[0]) * RELATIVE_TOLERANCE:
             yield f"agent '{after.id}': {what} {peak:.3g} {unit} at {t_s:.2f} s, limit {limit:g} {unit}"
 
 
-def peak_acceleration(agent: Agent) -> tuple[float, float]:
-    """Return the largest acceleration in m/s2, longitudinal and lateral combined, between two waypoints, and its time."""
+def _peaks(agent: Agent) -> dict[str, tuple[float, float]]:
+    """Return the largest acceleration, m/s2, longitudinal and lateral combined, and curvature, 1/m, between two waypoints, with their times.
+
+    The curvature is 0 where the agent stands.
+    """
     w = agent.waypoints
-    span, speed = np.diff(w.t_s), (w.speed_mps[1:] + w.speed_mps[:-1]) / 2
-    _, turn = chords(w)
-    return _peak(w.t_s, np.hypot(np.diff(w.speed_mps), speed * turn) / span)
-
-
-def peak_curvature(agent: Agent) -> tuple[float, float]:
-    """Return the largest curvature in 1/m between two waypoints, 0 where the agent stands, and its time."""
-    w = agent.waypoints
-    chord, turn = chords(w)
-    moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
-    return _peak(w.t_s, np.divide(np.abs(turn), np.abs(chord), out=np.zeros(len(turn)), where=moves))
-
-
-def _peak(t_s: Array, values: Array) -> tuple[float, float]:
-    if len(values) == 0:
-        return 0.0, float(t_s[0])
-    k = int(np.argmax(values >= values.max() / RELATIVE_TOLERANCE))  # the first of those that are equal up to rounding
-    return float(values[k]), float(t_s[k] + t_s[k + 1]) / 2
+    if len(w) < 2:
+        return dict.fromkeys(("acceleration", "curvature"), (0.0, float(w.t_s[0])))
+    span, speed, (chord, turn) = np.diff(w.t_s), (w.speed_mps[1:] + w.speed_mps[:-1]) / 2, chords(w)
+    moves = np.abs(chord) > MIN_PATH_MPS * span
+    columns = {
+        "acceleration": np.hypot(np.diff(w.speed_mps), speed * turn) / span,
+        "curvature": np.divide(np.abs(turn), np.abs(chord), out=np.zeros(len(turn)), where=moves),
+    }
+    # The first of those that are equal up to rounding.
+    at = {what: int(np.argmax(values >= values.max() / RELATIVE_TOLERANCE)) for what, values in columns.items()}
+    return {what: (float(columns[what][k]), float(w.t_s[k] + w.t_s[k + 1]) / 2) for what, k in at.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +137,10 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     for step in edits:
         for name in step.names:
             if name not in known:
-                raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {_some(known)}")
+                some = ", ".join(known[:MAX_LISTED]) + f" and {len(known) - MAX_LISTED} more" * (
+                    len(known) > MAX_LISTED
+                )
+                raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {some}")
             if (step.kind, name) in seen and not isinstance(step, Only | Remove | Add):
                 raise ConfigError(f"{step.kind}: agent '{name}' is named twice; give one value")
             seen.add((step.kind, name))
@@ -179,8 +174,3 @@ def find_problems(source: Scenario, changed: Scenario, agents: Sequence[Agent]) 
     infeasible = [line for a in agents for line in _infeasible(known.get(a.id), a)]
     undrivable = () if infeasible else _undrivable(source, changed, agents)
     return (*_collisions(source, changed, {a.id for a in agents}), *infeasible, *undrivable)
-
-
-def _some(ids: Sequence[str], most: int = 12) -> str:
-    rest = len(ids) - most
-    return ", ".join(ids[:most]) + (f" and {rest} more" if rest > 0 else "")

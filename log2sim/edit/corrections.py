@@ -13,16 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.datatypes import (
-    EGO,
-    TYPICAL_SIZE_M,
-    Agent,
-    MapFeatures,
-    Marking,
-    RoadBorder,
-    Scenario,
-    Waypoints,
-)
+from log2sim.datatypes import EGO, TYPICAL_SIZE_M, Agent, MapFeatures, Marking, RoadBorder, Scenario, Waypoints
 from log2sim.datatypes.agent import STANDSTILL_MPS, hermite, hermite_slope
 from log2sim.datatypes.map_features import BORDER_KINDS
 from log2sim.edit.edits import ground_at, new_id
@@ -146,13 +137,26 @@ class _Draft:
         if outside := self._outside(entry):
             return outside
         if kind == "draw":
-            self._draw(entry)
+            points = np.array(entry["points_m"], dtype=np.float64) + self.shift
+            name = new_id("drawn", {item.id for item in self._items})
+            if entry["feature"] in BORDER_KINDS:
+                border = RoadBorder(name, entry["feature"], points)
+                self.features = replace(self.features, borders=(*self.features.borders, border))
+            else:
+                marking = Marking(name, entry["feature"], points, float(entry.get("width_m", PAINT_WIDTH_M)))
+                self.features = replace(self.features, markings=(*self.features.markings, marking))
             return ""
         if kind == "erase":
             return self._erase(np.array(entry["at"]) + self.shift)
         if kind == "add":
-            agent = self._added(entry)
-            self.agents[agent.id] = agent
+            # On the ground that the agents nearest to its poses stand on where these have no height.
+            category, poses = entry["category"], self._poses(entry)
+            size = entry.get("size_m") or TYPICAL_SIZE_M[category]
+            x, y = (np.array([p[k] for p in poses]) for k in ("x_m", "y_m"))
+            ground = ground_at(self.agents.values(), x, y) if self.agents else np.zeros(len(poses))
+            poses = [{"z_m": z + size[2] / 2, **p} for p, z in zip(poses, ground)]
+            name = new_id(category, {*self.agents, *self.deleted})
+            self.agents[name] = added(category, size, poses, name)
             return ""
         agent_id = self._find(number, entry["agent"])
         if agent_id is None:
@@ -174,11 +178,12 @@ class _Draft:
                 return f"{what} within {MAX_AWAY_M:g} m of {self._place(entry['other'])}"
             self.agents[agent_id] = settled(merge_agents(agent, self.agents.pop(other_id)), kind)
         elif kind == "split":
-            t_s = self._time_s(entry["t_ns"])
-            first, second = split(agent, t_s)
-            self.agents[agent_id] = settled(first, kind)
+            w, t_s = agent.waypoints, self._time_s(entry["t_ns"])
+            if not w.t_s[0] < t_s <= w.t_s[-1]:
+                raise ConfigError(f"split: {agent.id} has no waypoints on both sides of {t_s:.2f} s")
+            self.agents[agent_id] = settled(replace(agent, waypoints=w.take(w.t_s < t_s)), kind)
             name = new_id(agent.category, {*self.agents, *self.deleted})
-            self.agents[name] = settled(replace(second, id=name), kind)
+            self.agents[name] = settled(replace(agent, id=name, waypoints=w.take(w.t_s >= t_s)), kind)
         elif kind == "confirm":
             self.agents[agent_id] = replace(agent, confidence=1.0, doubts=(), quarantined=False)
         elif kind == "move":
@@ -190,7 +195,20 @@ class _Draft:
             self.agents[agent_id] = settled(moved(before, poses, float(entry.get("over_s", CORRELATION_S))), kind)
             self.moves[agent_id] = self.agents[agent_id], before, poses
         else:
-            self.agents[agent_id] = settled(_changed(agent, kind, entry), kind)
+            w = agent.waypoints
+            if kind == "category":
+                agent = replace(agent, category=entry["category"])
+            elif kind == "size":
+                length, width, height = map(float, entry["size_m"])
+                raised = replace(w, z_m=w.z_m + (height - agent.size_m[2]) / 2)  # the wheels stay on the ground
+                agent = replace(agent, size_m=(length, width, height), waypoints=raised)
+            elif kind == "flip":
+                turned = replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=-w.speed_mps)
+                agent = replace(agent, waypoints=turned)
+            else:
+                color = {"rgb": list(entry["rgb"]), "name": entry["name"], "confidence": 1.0}
+                agent = replace(agent, color=color)
+            self.agents[agent_id] = settled(agent, kind)
         return ""
 
     def _outside(self, entry: Mapping[str, Any]) -> str:
@@ -228,15 +246,6 @@ class _Draft:
     def _time_s(self, t_ns: int) -> float:
         return (t_ns - self.scenario.t0_ns) / NS_PER_S
 
-    def _added(self, entry: Mapping[str, Any]) -> Agent:
-        """Make a new agent, on the ground that the agents nearest to its poses stand on where these have no height."""
-        category, poses = entry["category"], self._poses(entry)
-        size = entry.get("size_m") or TYPICAL_SIZE_M[category]
-        x, y = (np.array([p[k] for p in poses]) for k in ("x_m", "y_m"))
-        ground = ground_at(self.agents.values(), x, y) if self.agents else np.zeros(len(poses))
-        poses = [{"z_m": z + size[2] / 2, **p} for p, z in zip(poses, ground)]
-        return added(category, size, poses, new_id(category, {*self.agents, *self.deleted}))
-
     def _poses(self, entry: Mapping[str, Any]) -> list[dict[str, float]]:
         """Return key poses in time and map of the scenario, in the order of time."""
         shift = dict(zip(("x_m", "y_m", "z_m"), self.shift))
@@ -246,21 +255,14 @@ class _Draft:
         ]
         return list({p["t_s"]: p for p in sorted(poses, key=lambda p: p["t_s"])}.values())
 
-    def _draw(self, entry: Mapping[str, Any]) -> None:
-        points = np.array(entry["points_m"], dtype=np.float64) + self.shift
-        items: list[Marking | RoadBorder] = [*self.features.markings, *self.features.borders]
-        name = new_id("drawn", {item.id for item in items})
-        if entry["feature"] in BORDER_KINDS:
-            border = RoadBorder(name, entry["feature"], points)
-            self.features = replace(self.features, borders=(*self.features.borders, border))
-        else:
-            marking = Marking(name, entry["feature"], points, float(entry.get("width_m", PAINT_WIDTH_M)))
-            self.features = replace(self.features, markings=(*self.features.markings, marking))
+    @property
+    def _items(self) -> list[Marking | RoadBorder]:
+        return [*self.features.markings, *self.features.borders]
 
     def _erase(self, at: Array) -> str:
-        items: list[Marking | RoadBorder] = [*self.features.markings, *self.features.borders]
         import shapely
 
+        items = self._items
         far = [shapely.LineString(item.points_m[:, :2]).distance(shapely.Point(at[:2])) for item in items]
         if not far or min(far) > MAX_AWAY_M:
             return f"no marking or border within {MAX_AWAY_M:g} m of ({at[0]:.1f}, {at[1]:.1f}) m"
@@ -294,30 +296,6 @@ def nearest_agent(agents: Sequence[Agent], t_s: float, x_m: float, y_m: float) -
 def settled(agent: Agent, kind: str) -> Agent:
     """Return the agent without the doubts that a kind of correction settles."""
     return replace(agent, doubts=tuple(d for d in agent.doubts if d.kind not in SETTLED.get(kind, ())))
-
-
-def _changed(agent: Agent, kind: str, entry: Mapping[str, Any]) -> Agent:
-    """Return the agent with another category, size, front or color."""
-    w = agent.waypoints
-    if kind == "category":
-        return replace(agent, category=entry["category"])
-    if kind == "size":
-        length, width, height = map(float, entry["size_m"])
-        # The wheels stay on the ground.
-        raised = replace(w, z_m=w.z_m + (height - agent.size_m[2]) / 2)
-        return replace(agent, size_m=(length, width, height), waypoints=raised)
-    if kind == "flip":
-        return replace(agent, waypoints=replace(w, yaw_rad=wrap_angle(w.yaw_rad + np.pi), speed_mps=-w.speed_mps))
-    return replace(agent, color={"rgb": list(entry["rgb"]), "name": entry["name"], "confidence": 1.0})
-
-
-def split(agent: Agent, t_s: float) -> tuple[Agent, Agent]:
-    """Return the agent before a time, and the other object that it is from then on."""
-    w = agent.waypoints
-    first, second = w.t_s < t_s, w.t_s >= t_s
-    if not first.any() or not second.any():
-        raise ConfigError(f"split: {agent.id} has no waypoints on both sides of {t_s:.2f} s")
-    return tuple(replace(agent, waypoints=w.take(part)) for part in (first, second))  # type: ignore[return-value]
 
 
 def moved(agent: Agent, poses: Sequence[Mapping[str, float]], over_s: float = CORRELATION_S) -> Agent:
@@ -432,8 +410,11 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
     if static:
         waypoints = _mean_of_static(agent.waypoints, other.waypoints)
     else:
-        first, last = sorted((_in_steps(agent), _in_steps(other)), key=lambda a: float(a.waypoints.t_s[0]))
-        waypoints = _joined(first, last)
+        stepped = []  # with steps of a tenth of a second, so that the two can be averaged
+        for a in (agent, other):
+            t_s = insert_steps(a.waypoints, float(a.waypoints.t_s[0]), float(a.waypoints.t_s[-1]))
+            stepped.append(replace(a, waypoints=resampled(a, t_s)) if len(t_s) > 1 else a)
+        waypoints = _joined(*sorted(stepped, key=lambda a: float(a.waypoints.t_s[0])))
     doubts = tuple(dict.fromkeys(d for a in (agent, other) for d in a.doubts))
     seen = {
         side: (*agent.observed_by.get(side, ()), *other.observed_by.get(side, ()))
@@ -446,26 +427,17 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
     )  # fmt: skip
 
 
-def _in_steps(agent: Agent) -> Agent:
-    """Return the agent with steps of a tenth of a second, so that two can be averaged."""
-    w = agent.waypoints
-    return replace(
-        agent, waypoints=resampled(agent, insert_steps(w, float(w.t_s[0]), float(w.t_s[-1]))) if len(w) > 1 else w
-    )
-
-
 def _mean_of_static(a: Waypoints, b: Waypoints) -> Waypoints:
     """Return one place that never changes, over the times of both."""
     weight = np.array([1 / max(float(w.sigma_xy_m.min()), 1e-3) ** 2 for w in (a, b)])
+    precision = weight[0] + weight[1]
     weight = weight / weight.sum()
     turn = float(wrap_angle(b.yaw_rad[:1] - a.yaw_rad[0])[0])
     long = a if len(a) > 1 or len(b) == 1 else b
     t_s = np.unique(np.concatenate([a.t_s, b.t_s])) if len(a) > 1 and len(b) > 1 else long.t_s
     place = {k: np.full(len(t_s), weight @ [getattr(w, k)[0] for w in (a, b)]) for k in ("x_m", "y_m", "z_m")}
     known = [np.interp(t_s, w.t_s, w.observed.astype(np.float64), left=0.0, right=0.0) > 0.5 for w in (a, b)]
-    sigma = (
-        1 / np.sqrt(1 / max(float(a.sigma_xy_m.min()), 1e-3) ** 2 + 1 / max(float(b.sigma_xy_m.min()), 1e-3) ** 2)
-    ) * np.ones(len(t_s))
+    sigma = np.full(len(t_s), 1 / np.sqrt(precision))
     yaw = np.full(len(t_s), float(wrap_angle(a.yaw_rad[:1] + weight[1] * turn)[0]))
     return Waypoints(
         t_s=t_s, **place, yaw_rad=yaw, speed_mps=np.zeros(len(t_s)), observed=known[0] | known[1], sigma_xy_m=sigma

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Finding, Span, Waypoints, retime_spans
+from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Waypoints, retime_spans
 from log2sim.edit import motion
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
@@ -40,7 +40,7 @@ class Edit:
     @property
     def names(self) -> tuple[str, ...]:
         """Ids of the agents that the edit names."""
-        raise NotImplementedError
+        return ()
 
     def applied(self, agents: Agents) -> Agents:
         """Return the agents after the edit; `agents` must include the named ones."""
@@ -48,8 +48,8 @@ class Edit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of the edit in a scenario's provenance."""
-        values = asdict(self)  # type: ignore[call-overload]
-        return {"kind": self.kind, **{k: v for k, v in values.items() if v is not None}}
+        values = asdict(self).items()  # type: ignore[call-overload]
+        return {"kind": self.kind} | {k: list(v) if isinstance(v, tuple) else v for k, v in values if v is not None}
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,6 @@ class Only(Edit):
         """Keep the named agents."""
         return {k: a for k, a in agents.items() if k in self.agents}
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry of the edit in a scenario's provenance."""
-        return {"kind": self.kind, "agents": list(self.agents)}
-
 
 @dataclass(frozen=True)
 class _AgentEdit(Edit):
@@ -81,7 +77,6 @@ class _AgentEdit(Edit):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Id of the agent, as a tuple of one."""
         return (self.agent,)
 
 
@@ -102,11 +97,6 @@ class DropDoubtful(Edit):
 
     kind: ClassVar[str] = "drop_doubtful"
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """No ids: which agents it removes is decided by their doubts and confidence."""
-        return ()
-
     def applied(self, agents: Agents) -> Agents:
         """Return the agents that are not doubtful, and the ego."""
         return {k: a for k, a in agents.items() if k == EGO or not a.is_doubtful}
@@ -117,22 +107,16 @@ class _WaypointEdit(_AgentEdit):
     """A change to the waypoints of one agent; what sensors saw of it is dropped, since it is unknown at the new positions."""
 
     def applied(self, agents: Agents) -> Agents:
-        """Replace the waypoints of the agent."""
         agent = agents[self.agent]
-        waypoints = replace(self.moved(agent), visible=None, lidar_points=None)
-        moved = replace(agent, waypoints=waypoints, doubts=self.doubts(agent), observed_by=self.observed_by(agent))
+        waypoints, retime = self.moved(agent)
+        moved = replace(agent, waypoints=replace(waypoints, visible=None, lidar_points=None))
+        if retime is not None:
+            doubts, seen = motion.retimed_doubts(agent.doubts, retime), agent.observed_by
+            moved = replace(moved, doubts=doubts, observed_by=retime_spans(seen, retime, begin_s=0.0))
         return {**agents, self.agent: moved}
 
-    def doubts(self, agent: Agent) -> tuple[Finding, ...]:
-        """Return the doubts of the agent after the edit: the same ones, unless it moves in time."""
-        return agent.doubts
-
-    def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
-        """Return when each end measured the agent after the edit: at the same times, unless it moves in time."""
-        return agent.observed_by
-
-    def moved(self, agent: Agent) -> Waypoints:
-        """Return the waypoints of the agent after the edit."""
+    def moved(self, agent: Agent) -> tuple[Waypoints, Callable[[float], float] | None]:
+        """Return the waypoints of the agent after the edit, and the change of times, None where it moves in space alone."""
         raise NotImplementedError
 
 
@@ -173,29 +157,16 @@ class Speed(_WaypointEdit):
         """Check the factor."""
         _require(self, self.factor, 0.01, 100.0, "")
 
-    def moved(self, agent: Agent) -> Waypoints:
+    def moved(self, agent: Agent) -> tuple[Waypoints, Callable[[float], float]]:
         """Return the waypoints at scaled times."""
         if agent.static:
             raise ConfigError(f"speed: agent '{agent.id}' is static and has no speed to change; leave it out")
         if self.window is not None:
-            return motion.sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[0]
-        return motion.sped_up(agent.waypoints, self.factor)
-
-    def doubts(self, agent: Agent) -> tuple[Finding, ...]:
-        """Return the doubts at scaled times."""
-        return motion.retimed_doubts(agent.doubts, self._retime(agent))
-
-    def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
-        """Return the spans at scaled times."""
-        return retime_spans(agent.observed_by, self._retime(agent))
-
-    def _retime(self, agent: Agent) -> Callable[[float], float]:
-        """Return the change of times."""
-        if self.window is not None:
-            new_s = motion.sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))[1]
-            return lambda t_s: float(new_s(np.array([t_s]))[0])
-        begin_s = float(agent.waypoints.t_s[0])
-        return lambda t_s: begin_s + (t_s - begin_s) / self.factor
+            w, new_s = motion.sped_up_between(agent, self.factor, *self.window.of(agent, self.kind))
+            return w, lambda t_s: float(new_s(np.array([t_s]))[0])
+        w, begin_s = agent.waypoints, float(agent.waypoints.t_s[0])
+        sped_up = replace(w, t_s=w.t_s[0] + (w.t_s - w.t_s[0]) / self.factor, speed_mps=w.speed_mps * self.factor)
+        return sped_up, lambda t_s: begin_s + (t_s - begin_s) / self.factor
 
 
 @dataclass(frozen=True)
@@ -210,7 +181,7 @@ class Lateral(_WaypointEdit):
         """Check the distance."""
         _require(self, self.meters, -100.0, 100.0, " m")
 
-    def moved(self, agent: Agent) -> Waypoints:
+    def moved(self, agent: Agent) -> tuple[Waypoints, None]:
         """Return the waypoints of the parallel path."""
         w = agent.waypoints
         fails = motion.parallel_fails(w, self.meters)
@@ -225,8 +196,8 @@ class Lateral(_WaypointEdit):
                 f"cannot be shifted to that side by {abs(self.meters):g} m; choose less than {radius_m[k]:.2f} m"
             )
         if self.window is not None:
-            return motion.lane_changed(agent, self.meters, *self.window.of(agent, self.kind))
-        return motion.shifted_left(w, self.meters)
+            return motion.lane_changed(agent, self.meters, *self.window.of(agent, self.kind)), None
+        return motion.shifted_left(w, self.meters), None
 
 
 @dataclass(frozen=True)
@@ -353,7 +324,7 @@ class Shift(_WaypointEdit):
         """Check the time."""
         _require(self, self.seconds, -1e5, 1e5, " s")
 
-    def moved(self, agent: Agent) -> Waypoints:
+    def moved(self, agent: Agent) -> tuple[Waypoints, Callable[[float], float]]:
         """Return the waypoints at shifted times."""
         w = motion.shifted_in_time(agent, self.seconds)
         if len(w) == 0:
@@ -362,15 +333,7 @@ class Shift(_WaypointEdit):
                 f"shift: nothing is left of agent '{agent.id}', which is there until {end_s:g} s, when it comes "
                 f"{-self.seconds:g} s earlier; choose less, or remove the agent"
             )
-        return w
-
-    def doubts(self, agent: Agent) -> tuple[Finding, ...]:
-        """Return the doubts at shifted times."""
-        return motion.doubts_shifted(agent, self.seconds)
-
-    def observed_by(self, agent: Agent) -> Mapping[str, tuple[Span, ...]]:
-        """Return the spans at shifted times, cut at the scenario's start."""
-        return retime_spans(agent.observed_by, lambda t_s: t_s + self.seconds, begin_s=0.0)
+        return w, lambda t_s: t_s + self.seconds
 
 
 def _require(edit: _WaypointEdit, value: float, low: float, high: float, unit: str) -> None:

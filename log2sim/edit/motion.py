@@ -33,27 +33,19 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
     return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.columns().items()})
 
 
-def doubts_shifted(agent: Agent, seconds: float) -> tuple[Finding, ...]:
-    """Return the doubts of an agent that comes `seconds` later; none that held only before the scenario's start t = 0."""
-    moved = retimed_doubts(agent.doubts, lambda t_s: t_s + seconds)
-    cut = (replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0)) for d in moved)
-    return tuple(d for d in cut if d.end_s is None or d.end_s >= 0.0)
-
-
 def retimed_doubts(doubts: Sequence[Finding], change: Callable[[float], float]) -> tuple[Finding, ...]:
-    """Move the spans of doubts; a sentence of a file that names a time, which stays that of the source, says so."""
-    moved = (doubt.retimed(change) for doubt in doubts)
-    return tuple(
-        replace(d, text=f"{d.text}, {OLD_TIME}")
-        if d.text is not None and _NAMES_A_TIME.search(d.text) and OLD_TIME not in d.text
-        else d
-        for d in moved
-    )
+    """Move the spans of doubts, without what then is before the scenario's start t = 0.
 
-
-def sped_up(w: Waypoints, factor: float) -> Waypoints:
-    """Return waypoints passed `factor` times as fast from the first one on: the same places at other times."""
-    return replace(w, t_s=w.t_s[0] + (w.t_s - w.t_s[0]) / factor, speed_mps=w.speed_mps * factor)
+    A sentence of a file that names a time, which stays that of the source, says so.
+    """
+    moved = []
+    for d in (doubt.retimed(change) for doubt in doubts):
+        if d.end_s is not None and d.end_s < 0.0:
+            continue
+        d = replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0))
+        told = d.text is not None and _NAMES_A_TIME.search(d.text) and OLD_TIME not in d.text
+        moved.append(replace(d, text=f"{d.text}, {OLD_TIME}") if told else d)
+    return tuple(moved)
 
 
 def shifted_left(w: Waypoints, meters: float) -> Waypoints:

@@ -119,7 +119,6 @@ class RoadSamples:
     xy_m: Array  # (S, 2)
     length_m: Array  # (S,) that each stands for
     line: NDArray[np.int64]  # (S,) index of its line
-
     heading_rad: Array  # (S,)
 
     @classmethod
@@ -201,15 +200,25 @@ MIN_STOP_LINE_SHARE, MIN_OVERLAP, MIN_ARROW_OVERLAP = 0.5, 0.5, 0.2
 
 def shape_figures(found: Sequence[Marking], true: Sequence[Marking], area: Area) -> dict[str, Any]:
     """Count by kind how many are true, and how many are found or false; `partly_seen` ones count neither way."""
+
+    def geometry(marking: Marking) -> BaseGeometry:
+        xy = marking.points_m[:, :2]
+        line = marking.kind == "stop_line" or len(xy) < 3
+        return shapely.LineString(xy) if line else shapely.make_valid(shapely.Polygon(xy))
+
+    def mostly(inside: Counts, shape: BaseGeometry) -> bool:  # whether at least half of the corners lie within
+        corners: Array = shapely.get_coordinates(shape)
+        return bool(len(corners)) and bool(inside(corners).mean() >= 0.5)
+
     out = {}
     for name, kind in (("stop_lines", "stop_line"), ("crosswalks", "crosswalk"), ("others", "other")):
-        ours = [_geometry(m) for m in found if m.kind == kind]
-        theirs = [_geometry(m) for m in true if m.kind == kind]
+        ours = [geometry(m) for m in found if m.kind == kind]
+        theirs = [geometry(m) for m in true if m.kind == kind]
         same = np.array([[_alike(kind, a, b) for b in theirs] for a in ours]).reshape(len(ours), len(theirs))
         rows, columns = linear_sum_assignment(-same)
         matched = same[rows, columns] > 0
-        seen = np.array([_mostly(area.expects, g) for g in theirs], dtype=bool)
-        near = np.array([_mostly(area.counts, g) for g in ours], dtype=bool)
+        seen = np.array([mostly(area.expects, g) for g in theirs], dtype=bool)
+        near = np.array([mostly(area.counts, g) for g in ours], dtype=bool)
         right = np.zeros(len(ours), dtype=bool)
         right[rows[matched]] = True
         hit = np.zeros(len(theirs), dtype=bool)
@@ -223,13 +232,6 @@ def shape_figures(found: Sequence[Marking], true: Sequence[Marking], area: Area)
     return out
 
 
-def _geometry(marking: Marking) -> BaseGeometry:
-    xy = marking.points_m[:, :2]
-    if marking.kind == "stop_line" or len(xy) < 3:
-        return shapely.LineString(xy)
-    return shapely.make_valid(shapely.Polygon(xy))
-
-
 def _alike(kind: str, a: BaseGeometry, b: BaseGeometry) -> float:
     """How much two of a kind are the same, 0 where they are not."""
     if kind == "stop_line":
@@ -241,13 +243,6 @@ def _alike(kind: str, a: BaseGeometry, b: BaseGeometry) -> float:
     union = a.union(b).area
     overlap = a.intersection(b).area / union if union > 0 else 0.0
     return float(overlap) if overlap >= (MIN_OVERLAP if kind == "crosswalk" else MIN_ARROW_OVERLAP) else 0.0
-
-
-def _mostly(inside: Any, geometry: BaseGeometry) -> bool:
-    """Whether at least half of the corners lie within."""
-    corners: Array = shapely.get_coordinates(geometry)
-    marks: NDArray[np.bool_] = inside(corners)
-    return bool(marks.mean() >= 0.5) if len(corners) else False
 
 
 CENTER_MATCH_M = 0.5
@@ -333,6 +328,8 @@ def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str
     colored = [a for a in true if a.color is not None and GROUP_OF.get(a.category) == "vehicle"]
     if not colored:
         return None
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
     confused: Counter[str] = Counter()
     distance, named, right, with_color = [], 0, 0, 0
     matched = [(agent.color, found[agent.id].color) for agent in colored if agent.id in found]
@@ -340,7 +337,8 @@ def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str
         if color is None or true_color is None:
             continue
         with_color += 1
-        distance.append(_difference(color["rgb"], true_color["rgb"]))
+        lab = (rgb2lab(np.array(c["rgb"], dtype=np.float64)[None, None] / 255) for c in (color, true_color))
+        distance.append(float(deltaE_ciede2000(*lab)[0, 0]))
         if true_color["name"] in COLOR_NAMES:
             named += 1
             right += color["name"] == true_color["name"]
@@ -352,13 +350,6 @@ def color_figures(true: Sequence[Agent], found: Mapping[str, Agent]) -> dict[str
         "ciede2000_median": float(np.median(distance)) if distance else None,
         "confused": dict(sorted(confused.items())),
     }  # fmt: skip
-
-
-def _difference(a: Any, b: Any) -> float:
-    from skimage.color import deltaE_ciede2000, rgb2lab
-
-    first, second = (rgb2lab(np.array(rgb, dtype=np.float64)[None, None] / 255) for rgb in (a, b))
-    return float(deltaE_ciede2000(first, second)[0, 0])
 
 
 MAX_DISTANCE_M = 3.0  # between a found and a true signal head; those of one approach stand farther apart
@@ -406,18 +397,15 @@ def map_figures(scenario: Scenario, truth: Scenario) -> dict[str, Any] | None:
     moved = truth.aligned_to(scenario)
     ours, theirs = scenario.map_features, moved.map_features or MapFeatures()
     area = Area.of(scenario, moved, truth.shift_to(scenario))
+    our_lines, true_lines = ([m for m in side.markings if m.is_lane_line] for side in (ours, theirs))
     return {
         "within_m": WITHIN_M if area.near is not None else None,
         "where_seen": area.seen is not None,
-        "lane_lines": line_figures(_lines(ours), _lines(theirs), area),
+        "lane_lines": line_figures(our_lines, true_lines, area),
         "borders": line_figures(ours.borders, theirs.borders, area),
         **shape_figures(ours.markings, theirs.markings, area),
         "lanes": {**lane_figures(ours.lanes, theirs.lanes, area), **path_figures(ours.lanes, moved, area)},
     }
-
-
-def _lines(features: MapFeatures) -> list[Any]:
-    return [marking for marking in features.markings if marking.is_lane_line]
 
 
 def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -446,42 +434,35 @@ def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def map_lines(result: Mapping[str, Any]) -> list[str]:
     """Format the figures of map features, colors and traffic lights in detail; nothing where there are none."""
-    lines = list[str]()
-    for line in _detailed_lines(result):
-        lines += textwrap.wrap(line, 100, subsequent_indent=" " * 12)
-    return ["", *lines] if lines else []
-
-
-def _detailed_lines(result: Mapping[str, Any]) -> list[str]:
     out = []
     figures = result.get("map_features")
     if figures is not None:
-        out.append(f"lane lines: {_line_text(figures['lane_lines'])}")
         kinds = figures["lane_lines"]["kind_accuracy"]
-        if kinds is not None:
-            out[-1] += f", kind right {whole_percent(kinds)}"
-        out.append(f"borders:    {_line_text(figures['borders'])}")
+        right = "" if kinds is None else f", kind right {whole_percent(kinds)}"
+        out += [
+            f"lane lines: {_line_text(figures['lane_lines'])}{right}",
+            f"borders:    {_line_text(figures['borders'])}",
+        ]
         counted = [f"{_count(figures[key])} {name}" for key, name in _SHAPES if _any(figures[key])]
-        if counted:
-            out.append(f"markings:   {', '.join(counted)}")
+        out += [f"markings:   {', '.join(counted)}"] if counted else []
         lanes = figures["lanes"]
         out.append(
             f"lanes:      precision {cell(lanes['precision'], 2)}, recall {cell(lanes['recall'], 2)}, center off by "
             f"{_meters(lanes['center_median_m'])} (median), {whole_percent(lanes['inside'])} of true paths inside"
         )
-    colors = result.get("colors")
+    colors, signals = result.get("colors"), result.get("signals")
     if colors is not None:
         out.append(
             f"colors:     {colors['right']} of {colors['named']} names right, {colors['with_color']} of "
             f"{colors['vehicles']} vehicles have one, CIEDE2000 {cell(colors['ciede2000_median'], 1)} (median)"
         )
-    signals = result.get("signals")
     if signals is not None:
         out.append(
             f"signals:    {signals['found']} of {signals['true']} found, {signals['false']} false, off by "
             f"{_meters(signals['position_median_m'])} (median), state right {whole_percent(signals['state_right'])} of the time"
         )
-    return out
+    lines = [part for line in out for part in textwrap.wrap(line, 100, subsequent_indent=" " * 12)]
+    return ["", *lines] if lines else []
 
 
 _SHAPES = (("stop_lines", "stop lines"), ("crosswalks", "crosswalks"), ("others", "other markings"))

@@ -54,8 +54,16 @@ def require_exportable(scenario: Scenario) -> None:
     ids = [a.id for a in scenario.agents]
     twice = sorted({name for name in ids if ids.count(name) > 1})
     wrong += [f"agent '{name}': the id occurs twice; ids must be unique" for name in twice]
-    if not wrong:
-        wrong = _too_far_apart(scenario)
+    if not wrong:  # too far from the center of all for float32
+        xyz = [np.column_stack([a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m]) for a in scenario.agents]
+        every = np.concatenate(xyz)
+        middle = (every.min(axis=0) + every.max(axis=0)) / 2
+        for agent, points in zip(scenario.agents, xyz):
+            if (far_m := float(np.abs(points - middle).max())) > MAX_EXTENT_M:
+                wrong.append(
+                    f"agent '{agent.id}': is {far_m / 1000:.0f} km from the middle of the scenario, expected at most"
+                    f" {MAX_EXTENT_M / 1000:.0f} km: it would jitter in players that compute in float32; export parts of the scenario"
+                )
     if wrong:
         raise ScenarioError(f"scenario '{scenario.name}' cannot be exported:\n  " + "\n  ".join(wrong))
 
@@ -202,16 +210,3 @@ def _back_to_front(agent: Agent) -> Iterator[str]:
             f"goes backward on {wrong:.1f} of {moved:.1f} m while its speed says forward; if its box is"
             " labeled back to front, turn yaw_rad by half a turn, and if it reverses, make speed_mps negative"
         )
-
-
-def _too_far_apart(scenario: Scenario) -> list[str]:
-    """Describe agents too far from the center of all for float32."""
-    xyz = [np.column_stack([a.waypoints.x_m, a.waypoints.y_m, a.waypoints.z_m]) for a in scenario.agents]
-    every = np.concatenate(xyz)
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2
-    far: NDArray[np.float64] = np.array([np.abs(points - middle).max() for points in xyz])
-    return [
-        f"agent '{scenario.agents[k].id}': is {far[k] / 1000:.0f} km from the middle of the scenario, expected at most"
-        f" {MAX_EXTENT_M / 1000:.0f} km: it would jitter in players that compute in float32; export parts of the scenario"
-        for k in np.flatnonzero(far > MAX_EXTENT_M)
-    ]  # fmt: skip

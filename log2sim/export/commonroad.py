@@ -1,6 +1,6 @@
-"""Export to CommonRoad: lanes as lanelets, agents as obstacles, and the ego's task as planning problem.
+"""Export to CommonRoad 2020a: lanes as lanelets, agents as obstacles, and the ego's task as planning problem.
 
-Written without CommonRoad's own library: each year's release has other modules, all releases pin a protobuf version
+`ZAM_<name>-1_1_T-1.xml`, and `agents.csv` with the agent behind each of its numbers. Written without CommonRoad's own library: each year's release has other modules, all releases pin a protobuf version
 that conflicts with other packages, and its writer truncates decimals and dates files by the day of writing.
 """
 
@@ -46,74 +46,66 @@ LINE_MARKING = {"solid": "solid", "broken": "dashed", "curb": "curb", "none": "n
 STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
 
 
-class CommonRoad:
-    """`ZAM_<name>-1_1_T-1.xml` of version 2020a, and `agents.csv` with the agent behind each of its numbers."""
-
-    options: tuple[str, ...] = ()
-    loses = (
-        "colors, uncertainty and observed flags, times between steps of 0.1 s and before the ego's first, the ego's way "
-        "between start and goal, confidences of lanes, crosswalks, states of traffic lights beyond the log, when static vehicles were first and last seen, cameras, stages; text ids (in agents.csv)"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the scenario file and the table of agents."""
-        # The ego, and all steps from its first waypoint to the last of any agent.
-        ego = scenario.ego
-        if ego is None:
-            raise ScenarioError(
-                f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; choose one with --ego AGENT"
-            )
-        start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
-        if stop - start < STEP_S:
-            raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
-        t_s = step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
-        words = "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", scenario.name))[:50]
-        name = f"ZAM_{words or 'Scenario'}-1_1_T-1"  # benchmark ids have letters and digits alone
-        # The document with its header, dated by the start of the scenario so that the same scenario gives the same bytes.
-        root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
-        root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
-        root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
-        frame = scenario.map
-        place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
-        if frame.latitude_deg is not None and frame.longitude_deg is not None:
-            place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
-        location = _texts(element("location"), **place)
-        if frame.projection is not None:
-            x, y, _ = frame.offset_m  # from projected coordinates to those of the file
-            reference = xml_text.escaped(frame.projection)
-            transformation = _texts(element("geoTransformation", location), geoReference=reference)
-            shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
-            _texts(element("additionalTransformation", transformation), **shift)
-        root.append(location)
-        element("scenarioTags", root)
-        roads = lanes(scenario)
-        number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
-        lights = [{lane.id for lane in signal_lanes(signal, roads)} for signal in scenario.signals]
-        marks = MarkFinder(scenario)
-        for lane in roads:
-            own = [len(roads) + k for k, names in enumerate(lights, start=1) if lane.id in names]
-            root.append(_lanelet(lane, number_of, marks, own))
-        root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
-        first = len(roads) + len(scenario.signals) + 1
-        table = [
-            ("commonroad_id", "agent", "category", "role", "confidence", "doubts"),
-            (first, ego.id, ego.category, "planning problem", *_trust(ego)),
-        ]
-        obstacles = []
-        for number, agent in enumerate(scenario.others, start=first + 1):
-            obstacle = _obstacle(agent, number, t_s)
-            obstacles += [obstacle] if obstacle is not None else []
-            role = obstacle.tag if obstacle is not None else "left out: not alive at any step"
-            table.append((number, agent.id, agent.category, role, *_trust(agent)))
-        root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
-        root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
-        xml_text.write(root, folder / f"{name}.xml")
-        write_csv_table(folder / "agents.csv", table)
+options: tuple[str, ...] = ()
+loses = (
+    "colors, uncertainty and observed flags, times between steps of 0.1 s and before the ego's first, the ego's way "
+    "between start and goal, confidences of lanes, crosswalks, states of traffic lights beyond the log, when static vehicles were first and last seen, cameras, stages; text ids (in agents.csv)"
+)
 
 
-def _trust(agent: Agent) -> tuple[float, str]:
-    """Return the confidence of an agent and the reasons to doubt it."""
-    return agent.confidence, ", ".join(doubt.sentence for doubt in agent.doubts)
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the scenario file and the table of agents."""
+    # The ego, and all steps from its first waypoint to the last of any agent.
+    ego = scenario.ego
+    if ego is None:
+        raise ScenarioError(
+            f"scenario '{scenario.name}' has no agent 'ego', which the planning problem needs; choose one with --ego AGENT"
+        )
+    start, stop = ego.waypoints.t_s[0], ego.waypoints.t_s[-1]
+    if stop - start < STEP_S:
+        raise ScenarioError(f"agent 'ego': lives {stop - start:g} s, a planning problem needs {STEP_S} s or more")
+    t_s = step_times(start, max(a.waypoints.t_s[-1] for a in scenario.agents), STEP_S)
+    words = "".join(word[:1].upper() + word[1:] for word in re.findall("[A-Za-z0-9]+", scenario.name))[:50]
+    name = f"ZAM_{words or 'Scenario'}-1_1_T-1"  # benchmark ids have letters and digits alone
+    # The document with its header, dated by the start of the scenario so that the same scenario gives the same bytes.
+    root = element("commonRoad", None, commonRoadVersion=VERSION, benchmarkID=name, timeStepSize=_decimal(STEP_S))
+    root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
+    root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
+    frame = scenario.map
+    place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
+    if frame.latitude_deg is not None and frame.longitude_deg is not None:
+        place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
+    location = _texts(element("location"), **place)
+    if frame.projection is not None:
+        x, y, _ = frame.offset_m  # from projected coordinates to those of the file
+        reference = xml_text.escaped(frame.projection)
+        transformation = _texts(element("geoTransformation", location), geoReference=reference)
+        shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
+        _texts(element("additionalTransformation", transformation), **shift)
+    root.append(location)
+    element("scenarioTags", root)
+    roads = lanes(scenario)
+    number_of = {lane.id: number for number, lane in enumerate(roads, start=1)}
+    lights = [{lane.id for lane in signal_lanes(signal, roads)} for signal in scenario.signals]
+    marks = MarkFinder(scenario)
+    for lane in roads:
+        own = [len(roads) + k for k, names in enumerate(lights, start=1) if lane.id in names]
+        root.append(_lanelet(lane, number_of, marks, own))
+    root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
+    first = len(roads) + len(scenario.signals) + 1
+    table: list[tuple[object, ...]] = [("commonroad_id", "agent", "category", "role", "confidence", "doubts")]
+    obstacles = []
+    for number, agent in enumerate((ego, *scenario.others), start=first):
+        obstacle = None if agent is ego else _obstacle(agent, number, t_s)
+        obstacles += [obstacle] if obstacle is not None else []
+        role = "planning problem" if agent is ego else "left out: not alive at any step"
+        doubts = ", ".join(doubt.sentence for doubt in agent.doubts)
+        role = role if obstacle is None else obstacle.tag
+        table.append((number, agent.id, agent.category, role, agent.confidence, doubts))
+    root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
+    root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
+    xml_text.write(root, folder / f"{name}.xml")
+    write_csv_table(folder / "agents.csv", table)
 
 
 def _decimal(value: float) -> str:
@@ -222,6 +214,3 @@ def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
         _texts(element(tag, goal), intervalStart=_decimal(middle - reach), intervalEnd=_decimal(middle + reach))
     _texts(element("time", goal), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
     return problem
-
-
-EXPORTER = CommonRoad()

@@ -1,4 +1,7 @@
-"""Export to CSV: one table of all agents, a row for every agent and time."""
+"""Export to CSV: `agents.csv`, ordered by agent and time; numbers in full precision.
+
+Standard deviations that are unknown are empty. `doubts` holds the flags of the doubts that hold at the time.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import Scenario
 from log2sim.export.exporters import Options
 
 COLUMNS = (
@@ -29,18 +32,15 @@ def write_csv_table(file: Path, rows: Iterable[Sequence[Any]]) -> None:
             table.writerow([f"'{v}" if isinstance(v, str) and FORMULA.match(v) else v for v in row])
 
 
-class Csv:
-    """`agents.csv`, ordered by agent and time; numbers in full precision.
+options: tuple[str, ...] = ()
+loses = (
+    "map origin, colors, cameras, quality, stages and provenance; ids that a spreadsheet would run get an apostrophe"
+)
 
-    Standard deviations that are unknown are empty. `doubts` holds the flags of the doubts that hold at the time.
-    """
 
-    options: tuple[str, ...] = ()
-    loses = "map origin, colors, cameras, quality, stages and provenance; ids that a spreadsheet would run get an apostrophe"
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the table."""
-        write_csv_table(folder / "agents.csv", _rows(scenario))
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the table."""
+    write_csv_table(folder / "agents.csv", _rows(scenario))
 
 
 def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:
@@ -50,15 +50,6 @@ def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:
         about = (*agent.size_m, int(agent.static), agent.rear_axle_offset_m, agent.confidence)
         known = {**w.columns(), "observed": w.observed.astype(int)}
         columns = [known[name].tolist() if name in known else [""] * len(w) for name in COLUMNS]
-        for row, doubts in zip(zip(*columns), _doubts(agent)):
-            yield agent.id, agent.category, *row, *about, doubts
-
-
-def _doubts(agent: Agent) -> list[str]:
-    """List the flags of the doubts at each waypoint, separated by blanks."""
-    holds = [doubt.holds(agent.waypoints.t_s) for doubt in agent.doubts]
-    flags = [doubt.kind for doubt in agent.doubts]
-    return [" ".join(flag for flag, held in zip(flags, holds) if held[k]) for k in range(len(agent.waypoints))]
-
-
-EXPORTER = Csv()
+        held = [(doubt.kind, doubt.holds(w.t_s)) for doubt in agent.doubts]
+        for k, row in enumerate(zip(*columns)):
+            yield agent.id, agent.category, *row, *about, " ".join(kind for kind, at in held if at[k])

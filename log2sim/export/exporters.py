@@ -39,18 +39,16 @@ class ExportPlacement:
 
     def forward(self, states: Array) -> Array:
         """Convert states (N, 4) x, y, z, heading from the scenario to the export."""
-        origin: Array = np.array([*self.origin_m, 0.0])
         if self.target is not None:
             states = self._projected(states + np.array([*self.offset_m, 0.0]), self.projection, self.target)
-        return states - origin
+        return np.asarray(states - np.array([*self.origin_m, 0.0]))
 
     def back(self, states: Array) -> Array:
         """Convert states (N, 4) from the export to the scenario."""
-        origin: Array = np.array([*self.origin_m, 0.0])
-        offset: Array = np.array([*self.offset_m, 0.0])
+        states = states + np.array([*self.origin_m, 0.0])
         if self.target is None:
-            return states + origin
-        return self._projected(states + origin, self.target, self.projection) - offset
+            return states
+        return np.asarray(self._projected(states, self.target, self.projection) - np.array([*self.offset_m, 0.0]))
 
     @staticmethod
     def _projected(states: Array, source: str | None, target: str | None) -> Array:
@@ -228,17 +226,12 @@ def step_times(start_s: float, stop_s: float, step_s: float, agents: int = 1) ->
             f"waypoints span {stop_s - start_s:g} s, at most {MAX_STEPS * step_s:g} s can be exported in steps of "
             f"{step_s:g} s; cut the scenario into parts"
         )
-    require_sampled_bytes(agents * steps * BYTES_PER_STATE, f"{agents} agents over {stop_s - start_s:g} s")
-    return start_s + step_s * np.arange(int(steps) + 1, dtype=np.float64)
-
-
-def require_sampled_bytes(sampled_bytes: float, what: str) -> None:
-    """Raise `ScenarioError` when samples would take more than `MAX_SAMPLED_BYTES`; `what` says of what they are."""
-    if sampled_bytes > MAX_SAMPLED_BYTES:
+    if (sampled := agents * steps * BYTES_PER_STATE) > MAX_SAMPLED_BYTES:
         raise ScenarioError(
-            f"{what}: their samples take {sampled_bytes / 2**30:.3g} GiB, at most {MAX_SAMPLED_BYTES / 2**30:g} GiB can be exported; "
-            "cut the scenario into parts"
+            f"{agents} agents over {stop_s - start_s:g} s: their samples take {sampled / 2**30:.3g} GiB, at most "
+            f"{MAX_SAMPLED_BYTES / 2**30:g} GiB can be exported; cut the scenario into parts"
         )
+    return start_s + step_s * np.arange(int(steps) + 1, dtype=np.float64)
 
 
 def file_name(text: str) -> str:
@@ -317,7 +310,25 @@ def export(
     with unfinished_folder(temporary_beside(parent / folder.name), folder) as temporary:
         with plugins.blaming("export", to):
             exporter.write(scenario, temporary, chosen)
-        return _move_into(temporary, folder, overwrite=overwrite)
+        # All files are moved, after checking that all may be written.
+        names = sorted(p.relative_to(temporary) for p in temporary.rglob("*") if p.is_file())
+        targets = tuple(folder / name for name in names)
+        for target in targets:
+            refuse_existing(target, overwrite=overwrite)
+            if target.is_dir():
+                raise ConfigError(f"{target}: is a folder, where a file would be written; choose another folder")
+        if not folder.exists():
+            try:
+                temporary.rename(folder)  # all files at once
+            except OSError as error:
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise written_meanwhile(folder) from None
+                raise
+            return targets
+        if not overwrite:
+            expect_new(targets)
+        place_all([(temporary / name, folder / name) for name in names])
+        return targets
 
 
 def make_ego(scenario: Scenario, agent: str) -> Scenario:
@@ -344,25 +355,3 @@ def filter_doubtful(scenario: Scenario, choice: str) -> Scenario:
     if choice not in choices:
         raise ConfigError(f"--doubtful: '{choice}', expected {', '.join(choices)}")
     return choices[choice]
-
-
-def _move_into(temporary: Path, folder: Path, *, overwrite: bool) -> tuple[Path, ...]:
-    """Move all files of a folder into another, after checking that all may be written."""
-    names = sorted(p.relative_to(temporary) for p in temporary.rglob("*") if p.is_file())
-    for name in names:
-        refuse_existing(folder / name, overwrite=overwrite)
-        if (folder / name).is_dir():
-            raise ConfigError(f"{folder / name}: is a folder, where a file would be written; choose another folder")
-    targets = tuple(folder / name for name in names)
-    if not folder.exists():
-        try:
-            temporary.rename(folder)  # all files at once
-        except OSError as error:
-            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-                raise written_meanwhile(folder) from None
-            raise
-        return targets
-    if not overwrite:
-        expect_new(targets)
-    place_all([(temporary / name, folder / name) for name in names])
-    return targets

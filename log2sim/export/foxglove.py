@@ -45,9 +45,19 @@ Message = tuple[int, str, Any]  # time in ns, topic and message
 
 def scene_messages(steps: viewers.AgentSteps, origin: Array) -> Iterator[Message]:
     """Yield the paths, then at every step the present boxes and the ego's frame; positions less `origin` (3,)."""
-    yield int(steps.t_ns[0]), "/paths", SceneUpdate(entities=[_path(steps, k, origin) for k in range(len(steps.moves))])
-    for k, t_ns in enumerate(steps.t_ns.tolist()):
-        here = [(a, m.position_m[k] - origin, float(m.yaw_rad[k])) for a, m in steps.moves if m.valid[k]]
+    stamps, moves = steps
+    first_ns, paths = int(stamps[0]), []
+    for agent, _ in moves:
+        w = agent.waypoints
+        ground = np.column_stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2]) - origin
+        line = LinePrimitive(
+            type=LinePrimitive.LINE_STRIP, pose=_pose(np.zeros(3), 0.0), thickness=PATH_PX, scale_invariant=True,
+            points=[Point3(x=x, y=y, z=z) for x, y, z in ground.tolist()], color=_color(agent, PATH_ALPHA),
+        )  # fmt: skip
+        paths.append(SceneEntity(timestamp=_stamp(first_ns), frame_id=MAP, id=agent.id, lines=[line]))
+    yield first_ns, "/paths", SceneUpdate(entities=paths)
+    for k, t_ns in enumerate(stamps.tolist()):
+        here = [(a, m.position_m[k] - origin, float(m.yaw_rad[k])) for a, m in moves if m.valid[k]]
         gone = SceneEntityDeletion(timestamp=_stamp(t_ns), type=SceneEntityDeletion.ALL)
         yield t_ns, "/agents", SceneUpdate(deletions=[gone], entities=[_box(t_ns, *at) for at in here])
         for agent, position, yaw in here:
@@ -63,7 +73,12 @@ def record_messages(record: viewers.ViewerRecord, origin: Array) -> Iterable[Mes
         )
         return [(record.t_ns, "/log", text)]
     if isinstance(record, viewers.ThinnedSweep):
-        return [(record.t_ns, f"/lidar/{record.lidar}", _cloud(record, origin))]
+        data, real = (record.points_map - origin).astype("<f4").tobytes(), PackedElementField.FLOAT32
+        columns = [PackedElementField(name=n, offset=4 * i, type=real) for i, n in enumerate("xyz")]
+        cloud = PointCloud(
+            timestamp=_stamp(record.t_ns), frame_id=MAP, pose=_pose(np.zeros(3), 0.0), point_stride=12, fields=columns, data=data,
+        )  # fmt: skip
+        return [(record.t_ns, f"/lidar/{record.lidar}", cloud)]
     return _picture(record, origin)
 
 
@@ -82,21 +97,6 @@ def _pose(position: Array, yaw_rad: float) -> Pose:
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn)
 
 
-def _path(steps: viewers.AgentSteps, k: int, origin: Array) -> SceneEntity:
-    agent, _ = steps.moves[k]
-    w = agent.waypoints
-    ground = np.column_stack([w.x_m, w.y_m, w.z_m - agent.size_m[2] / 2]) - origin
-    line = LinePrimitive(
-        type=LinePrimitive.LINE_STRIP,
-        pose=_pose(np.zeros(3), 0.0),
-        thickness=PATH_PX,
-        scale_invariant=True,
-        points=[Point3(x=x, y=y, z=z) for x, y, z in ground.tolist()],
-        color=_color(agent, PATH_ALPHA),
-    )
-    return SceneEntity(timestamp=_stamp(int(steps.t_ns[0])), frame_id=MAP, id=agent.id, lines=[line])
-
-
 def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntity:
     length, width, height = map(float, agent.size_m)
     above = position + np.array([0.0, 0.0, height / 2 + LABEL_ABOVE_M])
@@ -104,13 +104,8 @@ def _box(t_ns: int, agent: Agent, position: Array, yaw_rad: float) -> SceneEntit
     if agent.is_doubtful:
         about["doubtful"] = explain_doubt(agent)
     name = TextPrimitive(
-        pose=_pose(above, 0.0),
-        billboard=True,
-        font_size=TEXT_PX,
-        scale_invariant=True,
-        text=agent.id,
-        color=_color(agent, 1.0),
-    )
+        pose=_pose(above, 0.0), billboard=True, font_size=TEXT_PX, scale_invariant=True, text=agent.id, color=_color(agent, 1.0),
+    )  # fmt: skip
     cube = CubePrimitive(
         pose=_pose(position, yaw_rad), size=Vector3(x=length, y=width, z=height), color=_color(agent, BOX_ALPHA)
     )
@@ -127,15 +122,6 @@ def _frame(t_ns: int, child: str, map_T_child: Array) -> FrameTransform:
     )
 
 
-def _cloud(record: viewers.ThinnedSweep, origin: Array) -> PointCloud:
-    data = (record.points_map - origin).astype("<f4").tobytes()
-    columns = [PackedElementField(name=n, offset=4 * i, type=PackedElementField.FLOAT32) for i, n in enumerate("xyz")]
-    place = _pose(np.zeros(3), 0.0)
-    return PointCloud(
-        timestamp=_stamp(record.t_ns), frame_id=MAP, pose=place, point_stride=12, fields=columns, data=data
-    )
-
-
 def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
     name, t_ns = record.camera.name, record.t_ns
     stamp, topic = _stamp(t_ns), f"/camera/{name}"
@@ -143,20 +129,14 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
         yield t_ns, "/tf", _frame(t_ns, name, transform(record.map_T_cam[:3, :3], record.map_T_cam[:3, 3] - origin))
     yield t_ns, f"{topic}/calibration", _calibration(record)
     yield t_ns, f"{topic}/image", CompressedImage(timestamp=stamp, frame_id=name, data=record.jpeg, format="jpeg")
-    lines = [
-        PointsAnnotation(
-            timestamp=stamp,
-            type=PointsAnnotation.LINE_LIST,
-            points=[Point2(x=u, y=v) for u, v in outline.reshape(-1, 2).tolist()],
-            outline_color=_color(agent, 1.0),
-            thickness=OUTLINE_PX,
-        )
-        for agent, outline in record.outlines
-    ]
-    texts = []
+    lines, texts = [], []
     for agent, outline in record.outlines:
-        u, v = outline.reshape(-1, 2).min(axis=0).tolist()
-        place, color = Point2(x=u, y=v), _color(agent, 1.0)
+        uv, color = outline.reshape(-1, 2), _color(agent, 1.0)
+        points, (u, v) = [Point2(x=u, y=v) for u, v in uv.tolist()], uv.min(axis=0).tolist()
+        lines.append(PointsAnnotation(
+            timestamp=stamp, type=PointsAnnotation.LINE_LIST, points=points, outline_color=color, thickness=OUTLINE_PX,
+        ))  # fmt: skip
+        place = Point2(x=u, y=v)
         texts.append(
             TextAnnotation(timestamp=stamp, position=place, text=agent.id, font_size=TEXT_PX, text_color=color)
         )

@@ -1,4 +1,9 @@
-"""Export of the road to Lanelet2 (OSM XML): lanelets, their borders, stop lines, crosswalks and traffic lights."""
+"""Export of the road to Lanelet2 (OSM XML): lanelets, their borders, stop lines, crosswalks and traffic lights.
+
+`lanelet2_map.osm`, and `map_projector_info.yaml`, with which Autoware takes `local_x` and `local_y` of its nodes. Lanes beside each
+other share a way and those behind each other its ends, as routing needs it. Nodes have latitude and longitude; where the place of
+the map is not known, they are around 0, 0.
+"""
 
 from __future__ import annotations
 
@@ -26,60 +31,67 @@ TYPE_OF_MARK = {
 Way = tuple[str, str]  # of a lane, "left" or "right"
 
 
-class Lanelet2:
-    """`lanelet2_map.osm`, and `map_projector_info.yaml`, with which Autoware takes `local_x` and `local_y` of its nodes.
+options: tuple[str, ...] = ()
+loses = (
+    "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "
+    "gets a stop sign at its right end (`log2sim_assumed`), since Lanelet2 has no stop line by itself; `location` is always urban, and speed limits are not known"
+)
 
-    Lanes beside each other share a way and those behind each other its ends, as routing needs it. Nodes have latitude and
-    longitude; where the place of the map is not known, they are around 0, 0.
-    """
 
-    options: tuple[str, ...] = ()
-    loses = (
-        "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "
-        "gets a stop sign at its right end (`log2sim_assumed`), since Lanelet2 has no stop line by itself; `location` is always urban, and speed limits are not known"
-    )
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the map."""
+    import shapely
 
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the map."""
-        draft = _Draft(scenario.map)
-        roads, marks = lanes(scenario), MarkFinder(scenario)
-        way_of = _add_borders(draft, roads, marks)
-        features = scenario.map_features or MapFeatures()
-        stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
-        rules: dict[str, list[int]] = {lane.id: [] for lane in roads}
-        lit: set[int] = set()  # stop lines of lights
-        for signal in scenario.signals:
-            ahead = signal_lanes(signal, roads)
-            members = [("way", _add_light(draft, signal), "refers")]
-            if not ahead:
-                continue
-            lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
-            members += [("way", number, "ref_line") for number in lines]
-            lit |= set(lines)
-            rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
+    draft = _Draft(scenario.map)
+    roads, marks = lanes(scenario), MarkFinder(scenario)
+    way_of = _add_borders(draft, roads, marks)
+    features = scenario.map_features or MapFeatures()
+    stops = [(m, draft.way(m.points_m, type="stop_line")) for m in features.markings if m.kind == "stop_line"]
+    rules: dict[str, list[int]] = {lane.id: [] for lane in roads}
+    lit: set[int] = set()  # stop lines of lights
+    for signal in scenario.signals:
+        ahead = signal_lanes(signal, roads)
+        members = [("way", _add_light(draft, signal), "refers")]
+        if not ahead:
+            continue
+        lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
+        members += [("way", number, "ref_line") for number in lines]
+        lit |= set(lines)
+        rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
+        for lane in ahead:
+            rules[lane.id].append(rule)
+    for stop, number in stops:
+        ahead = [lane for lane in roads if number not in lit and _ends_at(lane, stop)]
+        if ahead:
+            members = [("way", _add_sign(draft, stop, ahead[0]), "refers"), ("way", number, "ref_line")]
+            rule = draft.relation(members, type="regulatory_element", subtype="traffic_sign", log2sim_assumed="yes")
             for lane in ahead:
                 rules[lane.id].append(rule)
-        for stop, number in stops:
-            ahead = [lane for lane in roads if number not in lit and _ends_at(lane, stop)]
-            if ahead:
-                members = [("way", _add_sign(draft, stop, ahead[0]), "refers"), ("way", number, "ref_line")]
-                rule = draft.relation(members, type="regulatory_element", subtype="traffic_sign", log2sim_assumed="yes")
-                for lane in ahead:
-                    rules[lane.id].append(rule)
-        for lane in roads:
-            members = [("way", way_of[lane.id, side], side) for side in ("left", "right")]
-            members += [("relation", rule, "regulatory_element") for rule in rules[lane.id]]
-            tags = {"subtype": "road", "location": "urban", "one_way": "yes", "participant:vehicle": "yes"}
-            draft.relation(members, type="lanelet", **tags, **_turn(lane), log2sim_id=xml_text.escaped(lane.id))
-        for marking in features.markings:
-            if marking.kind == "crosswalk":
-                edges = [draft.way(edge, type="pedestrian_marking") for edge in _walk_edges(marking)]
-                members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
-                draft.relation(
-                    members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
-                )
-        xml_text.write(draft.document(), folder / "lanelet2_map.osm")
-        (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
+    for lane in roads:
+        members = [("way", way_of[lane.id, side], side) for side in ("left", "right")]
+        members += [("relation", rule, "regulatory_element") for rule in rules[lane.id]]
+        tags = {"subtype": "road", "location": "urban", "one_way": "yes", "participant:vehicle": "yes"}
+        if lane.junction is not None:  # where it leads, as Autoware's signals need it
+            heading = Polyline(lane.points_m).heading_rad
+            turn = float(wrap_angle(heading[-1] - heading[0]))
+            tags["turn_direction"] = "straight" if abs(turn) < TURN_RAD else "left" if turn > 0 else "right"
+        draft.relation(members, type="lanelet", **tags, log2sim_id=xml_text.escaped(lane.id))
+    for marking in features.markings:
+        if marking.kind == "crosswalk":
+            # The long sides of the rectangle around it, both in the direction of people.
+            outline = shapely.MultiPoint(marking.points_m[:, :2]).minimum_rotated_rectangle.exterior
+            ring, z = np.array(outline.coords)[:4], np.full(2, marking.points_m[:, 2].mean())
+            if np.hypot(*(ring[1] - ring[0])) < np.hypot(*(ring[2] - ring[1])):
+                ring = np.roll(ring, -1, axis=0)
+            edges = [
+                draft.way(np.column_stack([ring[side], z]), type="pedestrian_marking") for side in ([3, 2], [0, 1])
+            ]
+            members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
+            draft.relation(
+                members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
+            )
+    xml_text.write(draft.document(), folder / "lanelet2_map.osm")
+    (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
 
 
 class _Draft:
@@ -189,19 +201,16 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
     by_key = {(lane.id, side): (lane, side) for lane in roads for side in ("left", "right")}
     for key, numbers in number_of.items():
         lane, side = by_key[key]
-        way_of[key] = draft.way([root(n) for n in numbers], **_border_tags(lane, side, marks))
+        border = lane.left if side == "left" else lane.right
+        item, mark = marks.items.get(border), marks.mark(border)
+        if isinstance(item, RoadBorder) and item.kind == "edge":
+            tags = {"type": "road_border"}
+        else:
+            kind, subtype = TYPE_OF_MARK[mark.kind]
+            tags = {"type": kind} | ({"subtype": subtype} if subtype else {})
+            tags |= {"color": mark.color} if mark.color in ("white", "yellow") else {}
+        way_of[key] = draft.way([root(n) for n in numbers], **tags)
     return way_of | {key: way_of[other] for key, other in same.items()}
-
-
-def _border_tags(lane: MapLane, side: str, marks: MarkFinder) -> dict[str, str]:
-    name = lane.left if side == "left" else lane.right
-    item = marks.items.get(name)
-    if isinstance(item, RoadBorder) and item.kind == "edge":
-        return {"type": "road_border"}
-    mark = marks.mark(name)
-    kind, subtype = TYPE_OF_MARK[mark.kind]
-    color = {"color": mark.color} if mark.color in ("white", "yellow") else {}
-    return {"type": kind, **({"subtype": subtype} if subtype else {}), **color}
 
 
 def _add_light(draft: _Draft, signal: Signal) -> int:
@@ -231,26 +240,3 @@ def _ends_at(lane: MapLane, stop: Marking) -> bool:
     along = (ends[:, 0] - x) * np.cos(heading) + (ends[:, 1] - y) * np.sin(heading)
     aside = (ends[:, 1] - y) * np.cos(heading) - (ends[:, 0] - x) * np.sin(heading)
     return bool(np.abs(along.mean()) <= STOP_M and aside.min() <= 0 <= aside.max())
-
-
-def _turn(lane: MapLane) -> dict[str, str]:
-    """Return where a lane in a junction leads, as Autoware's signals need it."""
-    if lane.junction is None:
-        return {}
-    heading = Polyline(lane.points_m).heading_rad
-    turn = float(wrap_angle(heading[-1] - heading[0]))
-    return {"turn_direction": "straight" if abs(turn) < TURN_RAD else "left" if turn > 0 else "right"}
-
-
-def _walk_edges(marking: Marking) -> tuple[Array, Array]:
-    """Return the long sides (2, 3) of the rectangle around a crosswalk, both in the direction of people."""
-    import shapely
-
-    ring = np.array(shapely.MultiPoint(marking.points_m[:, :2]).minimum_rotated_rectangle.exterior.coords)[:4]
-    if np.hypot(*(ring[1] - ring[0])) < np.hypot(*(ring[2] - ring[1])):
-        ring = np.roll(ring, -1, axis=0)
-    z = np.full(2, marking.points_m[:, 2].mean())
-    return np.column_stack([ring[[3, 2]], z]), np.column_stack([ring[[0, 1]], z])
-
-
-EXPORTER = Lanelet2()

@@ -1,4 +1,9 @@
-"""Export to ASAM OpenLABEL 1.0.0: 3D boxes, 2D boxes in the pictures of cameras, and coordinate systems, frame by frame."""
+"""Export to ASAM OpenLABEL 1.0.0: objects with a cuboid in the map at each frame; with `--log`, also their boxes in its pictures.
+
+Frames are the synchronized moments of the log; without one, they are 0.1 s apart. Positions are coordinates of the scenario's
+projection, as the frame's `transforms` from the ego to the map. A box in a picture is that of the whole cuboid, whether or not
+something hides it.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, AgentTable, Lidar, Log, Scenario
 from log2sim.errors import ConfigError
@@ -21,85 +25,68 @@ DECIMALS = 6  # of meters, and finer of radians; pixels have two
 PINHOLE_COEFFICIENTS = 5  # that the schema asks for at least
 
 
-class OpenLabel:
-    """`openlabel.json`: objects with a cuboid in the map at each frame; with `--log`, also their boxes in its pictures.
-
-    Frames are the synchronized moments of the log; without one, they are 0.1 s apart. Positions are coordinates of the
-    scenario's projection, as the frame's `transforms` from the ego to the map. A box in a picture is that of the whole cuboid, whether or
-    not something hides it.
-    """
-
-    options: tuple[str, ...] = ("log",)
-    loses = (
-        "uncertainty and observed flags, speeds, times between frames, markings, lanes, traffic lights, map origin, stages; the "
-        "rolling shutter of cameras"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the document."""
-        log = options.log
-        stamps, pictures = _frames_of(scenario, log)
-        if log is None:
-            moves = agent_steps(scenario).moves
-        else:
-            t_s = (stamps - scenario.t0_ns) / NS_PER_S
-            step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else STEP_S
-            moves = tuple((agent, sample_steps(agent, t_s, step_s)) for agent in scenario.agents)
-        data: list[dict[str, dict[str, Any]]] = [{} for _ in stamps]
-        for uid, (agent, move) in enumerate(moves, start=1):
-            for k in np.flatnonzero(move.valid).tolist():
-                data[k][str(uid)] = {"cuboid": [_cuboid(scenario, agent, move, k)]}
-        if log is not None:
-            for found, shown in zip(data, pictures, strict=True):
-                for camera, t_ns in shown.items():
-                    for row, box in _boxes_px(scenario, log, camera, t_ns):
-                        found.setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
-        content = {}
-        for k, (t_ns, shown) in enumerate(zip(stamps.tolist(), pictures)):
-            streams = {name: {"stream_properties": {"timestamp": str(stamp)}} for name, stamp in shown.items()}
-            transforms = _transforms(scenario, log, t_ns, moves, k)
-            content[str(k)] = {
-                "frame_properties": {"timestamp": str(t_ns), "transforms": transforms, "streams": streams},
-                "objects": {uid: {"object_data": found} for uid, found in data[k].items()},
-            }
-        document = {
-            "metadata": {"schema_version": "1.0.0", "name": scenario.name, "annotator": "log2sim"},
-            "coordinate_systems": _systems(scenario, log),
-            "streams": {} if log is None else _streams(log),
-            "objects": {
-                str(uid): _object(agent, [k for k, found in enumerate(data) if str(uid) in found])
-                for uid, agent in enumerate(scenario.agents, start=1)
-            },
-            "frames": content,
-            "frame_intervals": _intervals(range(len(data))),
-        }
-        write_json(folder / "openlabel.json", {"openlabel": document})
+options: tuple[str, ...] = ("log",)
+loses = (
+    "uncertainty and observed flags, speeds, times between frames, markings, lanes, traffic lights, map origin, stages; the "
+    "rolling shutter of cameras"
+)
 
 
-def _frames_of(scenario: Scenario, log: Log | None) -> tuple[NDArray[np.int64], list[dict[str, int]]]:
-    """Return the stamps (T,) of frames, and those of the pictures of cameras in each."""
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the document."""
+    log = options.log
+    # The stamps (T,) of frames, and those of the pictures of cameras in each.
     if log is None:
-        t_ns = agent_steps(scenario).t_ns
-        return t_ns, [{} for _ in t_ns]
-    start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
-    ticks = [tick for tick in log.ticks() if start <= tick.t_ns <= stop]
-    if not ticks:
-        raise ConfigError(
-            f"--log: log '{log.name}' has no moment between {start} and {stop} ns, the time of scenario '{scenario.name}'; give "
-            "the log that it was made from"
-        )
-    return np.array([tick.t_ns for tick in ticks], dtype=np.int64), [dict(tick.image_ns) for tick in ticks]
+        stamps, moves = agent_steps(scenario)
+        pictures: list[dict[str, int]] = [{} for _ in stamps]
+    else:
+        start, stop = scenario.t0_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
+        ticks = [tick for tick in log.ticks() if start <= tick.t_ns <= stop]
+        if not ticks:
+            raise ConfigError(
+                f"--log: log '{log.name}' has no moment between {start} and {stop} ns, the time of scenario '{scenario.name}'; give "
+                "the log that it was made from"
+            )
+        stamps, pictures = np.array([tick.t_ns for tick in ticks], dtype=np.int64), [dict(t.image_ns) for t in ticks]
+        t_s = (stamps - scenario.t0_ns) / NS_PER_S
+        step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else STEP_S
+        moves = tuple((agent, sample_steps(agent, t_s, step_s)) for agent in scenario.agents)
+    data: list[dict[str, dict[str, Any]]] = [{} for _ in stamps]
+    for uid, (agent, move) in enumerate(moves, start=1):
+        for k in np.flatnonzero(move.valid).tolist():
+            center, half = move.position_m[k] + np.array(scenario.map.offset_m), float(move.yaw_rad[k]) / 2
+            turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+            values = [*_rounded(center), *_rounded(turn, 9), *_rounded(np.array(agent.size_m))]
+            data[k][str(uid)] = {"cuboid": [{"name": "cuboid", "coordinate_system": "map", "val": values}]}
+    if log is not None:
+        for found, shown in zip(data, pictures, strict=True):
+            for camera, t_ns in shown.items():
+                for row, box in _boxes_px(scenario, log, camera, t_ns):
+                    found.setdefault(str(row + 1), {}).setdefault("bbox", []).append(box)
+    content = {}
+    for k, (t_ns, shown) in enumerate(zip(stamps.tolist(), pictures)):
+        streams = {name: {"stream_properties": {"timestamp": str(stamp)}} for name, stamp in shown.items()}
+        transforms = _transforms(scenario, log, t_ns, moves, k)
+        content[str(k)] = {
+            "frame_properties": {"timestamp": str(t_ns), "transforms": transforms, "streams": streams},
+            "objects": {uid: {"object_data": found} for uid, found in data[k].items()},
+        }
+    document = {
+        "metadata": {"schema_version": "1.0.0", "name": scenario.name, "annotator": "log2sim"},
+        "coordinate_systems": _systems(scenario, log),
+        "streams": {} if log is None else _streams(log),
+        "objects": {
+            str(uid): _object(agent, [k for k, found in enumerate(data) if str(uid) in found])
+            for uid, agent in enumerate(scenario.agents, start=1)
+        },
+        "frames": content,
+        "frame_intervals": _intervals(range(len(data))),
+    }
+    write_json(folder / "openlabel.json", {"openlabel": document})
 
 
 def _rounded(values: Array, digits: int = DECIMALS) -> list[float]:
     return [round(float(v), digits) for v in np.ravel(values)]
-
-
-def _cuboid(scenario: Scenario, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any]:
-    center, half = move.position_m[k] + np.array(scenario.map.offset_m), float(move.yaw_rad[k]) / 2
-    turn = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
-    values = [*_rounded(center), *_rounded(turn, 9), *_rounded(np.array(agent.size_m))]
-    return {"name": "cuboid", "coordinate_system": "map", "val": values}
 
 
 def _boxes_px(scenario: Scenario, log: Log, camera: str, t_ns: int) -> list[tuple[int, dict[str, Any]]]:
@@ -192,6 +179,3 @@ def _intervals(frames: Sequence[int]) -> list[dict[str, int]]:
     """Return the runs of successive frames."""
     runs = np.split(np.array(frames, dtype=np.int64), np.flatnonzero(np.diff(frames) != 1) + 1)
     return [{"frame_start": int(run[0]), "frame_end": int(run[-1])} for run in runs if len(run)]
-
-
-EXPORTER = OpenLabel()

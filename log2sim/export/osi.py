@@ -1,9 +1,12 @@
-"""Export to ground-truth traces of ASAM OSI, the Open Simulation Interface."""
+"""Export to ground-truth traces of ASAM OSI, the Open Simulation Interface.
+
+`<time>_gt_<OSI>_<protobuf>_<frames>_<name>.osi`: one `GroundTruth` every 0.1 s, stamped with absolute time. Parked vehicles are moving
+objects too, as in the standard. `source_reference` holds the id and category of each agent, and what speaks against it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -30,47 +33,15 @@ LIGHT = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class StaticMap:
-    """What every frame repeats: messages of OSI, and the first id that is free."""
-
-    lanes: list[Any]
-    boundaries: list[Any]
-    markings: list[Any]
-    next_id: int
-
-
-def static_map(osi: Any, scenario: Scenario, first: int) -> StaticMap:
-    """Return the lanes of a scenario with their boundaries, and markings that are no lines, numbered from `first` on."""
-    found = lanes(scenario)
-    marks = MarkFinder(scenario)
-    number_of = {lane.id: first + k for k, lane in enumerate(found)}
-    boundaries, messages = [], []
-    for k, lane in enumerate(found):
-        sides = [first + len(found) + 2 * k + side for side in (0, 1)]
-        for number, points, mark in zip(sides, edges_of(lane), map(marks.mark, (lane.left, lane.right))):
-            boundaries.append(_boundary(osi, number, points, mark))
-        messages.append(_lane(osi, lane, number_of, sides))
-    free = first + 3 * len(found)
-    features = scenario.map_features or MapFeatures()
-    others = [marking for marking in features.markings if not marking.is_lane_line]
-    painted = [_marking(osi, free + k, marking.points_m, marking.color) for k, marking in enumerate(others)]
-    return StaticMap(messages, boundaries, painted, free + len(painted))
-
-
 def _vector(osi: Any, xyz: Iterable[float]) -> Any:
     return osi.Vector3d(**{axis: float(v) for axis, v in zip("xyz", xyz)})
-
-
-def _points(osi: Any, points: Array) -> list[Any]:
-    return [_vector(osi, point) for point in points]
 
 
 def _boundary(osi: Any, number: int, points: Array, mark: RoadMark) -> Any:
     kind = osi.LaneBoundary.Classification
     return osi.LaneBoundary(
         id=osi.Identifier(value=number),
-        boundary_line=[osi.LaneBoundary.BoundaryPoint(position=p, width=mark.width_m) for p in _points(osi, points)],
+        boundary_line=[osi.LaneBoundary.BoundaryPoint(position=_vector(osi, p), width=mark.width_m) for p in points],
         classification=kind(type=kind.Type[BOUNDARY_TYPE[mark.kind]], color=kind.Color[BOUNDARY_COLOR[mark.color]]),
     )
 
@@ -89,7 +60,7 @@ def _lane(osi: Any, lane: MapLane, number_of: dict[str, int], sides: Sequence[in
         classification=kind(
             type=kind.Type.INTERSECTION if inside else kind.Type.DRIVING,
             subtype=kind.Subtype.UNKNOWN if inside else kind.Subtype.NORMAL,
-            centerline=_points(osi, lane.points_m),
+            centerline=[_vector(osi, p) for p in lane.points_m],
             centerline_is_driving_direction=True,
             left_adjacent_lane_id=beside[0],
             right_adjacent_lane_id=beside[1],
@@ -119,7 +90,7 @@ def _marking(osi: Any, number: int, points: Array, color: str | None) -> Any:
     )
 
 
-def traffic_lights(osi: Any, scenario: Scenario, first: int, t_s: float) -> list[Any]:
+def _traffic_lights(osi: Any, scenario: Scenario, first: int, t_s: float) -> list[Any]:
     """Return the traffic lights of a scenario with their states at a time, numbered from `first` on."""
     kind = osi.TrafficLight.Classification
     length, width, height = LIGHT_SIZE_M
@@ -146,88 +117,87 @@ VEHICLE_TYPE = {
 }  # fmt: skip
 
 
-class Osi:
-    """`<time>_gt_<OSI>_<protobuf>_<frames>_<name>.osi`: one `GroundTruth` every 0.1 s, stamped with absolute time.
+options: tuple[str, ...] = ()
+loses = (
+    "uncertainty and observed flags, whether vehicles are static, times between steps of 0.1 s, confidences of lanes and"
+    " markings, cameras, stages"
+)
 
-    Parked vehicles are moving objects too, as in the standard. `source_reference` holds the id and category of each
-    agent, and what speaks against it.
-    """
 
-    options: tuple[str, ...] = ()
-    loses = (
-        "uncertainty and observed flags, whether vehicles are static, times between steps of 0.1 s, confidences of lanes and"
-        " markings, cameras, stages"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the trace."""
-        try:
-            import betterosi
-        except ImportError:
-            raise MissingExtra("export to OSI", "osi") from None
-        steps = agent_steps(scenario)
-        # The fields that all frames share.
-        major, minor, patch = map(int, betterosi.__version_osi__.split("."))
-        head: dict[str, Any] = {
-            "version": betterosi.InterfaceVersion(version_major=major, version_minor=minor, version_patch=patch),
-            # From the coordinates of the trace to those of its projection.
-            "proj_frame_offset": betterosi.GroundTruth.ProjFrameOffset(
-                position=_vector(betterosi, scenario.map.offset_m), yaw=0.0
-            ),
-        }
-        if scenario.map.projection is not None:
-            head["proj_string"] = scenario.map.projection
-        if scenario.ego is not None:
-            head["host_vehicle_id"] = betterosi.Identifier(value=scenario.agents.index(scenario.ego) + 1)
-        ground = static_map(betterosi, scenario, first=len(scenario.agents) + 1)
-        # The file name that the standard prescribes, with the scenario's start time.
-        start = datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
-        versions = betterosi.prepare_channel_metadata()
-        keys = (betterosi.OSI_CHANNEL_OSI_VERSION_KEY, betterosi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
-        standard, protobuf = (versions[key].replace(".", "") for key in keys)
-        name = f"{start}_gt_{standard}_{protobuf}_{len(steps.t_ns)}_{file_name(scenario.name)}.osi"
-        with betterosi.Writer(folder / name) as writer:
-            for k, stamp_ns in enumerate(steps.t_ns.tolist()):
-                alive = [(n, a, m) for n, (a, m) in enumerate(steps.moves, start=1) if m.valid[k]]
-                t_s = (stamp_ns - scenario.t0_ns) / NS_PER_S
-                writer.add(betterosi.GroundTruth(
-                    **head, lane=ground.lanes, lane_boundary=ground.boundaries, road_marking=ground.markings,
-                    traffic_light=traffic_lights(betterosi, scenario, ground.next_id, t_s),
-                    timestamp=betterosi.Timestamp(seconds=stamp_ns // NS_PER_S, nanos=stamp_ns % NS_PER_S),
-                    moving_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if not _stationary(a)],
-                    stationary_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if _stationary(a)],
-                ))  # fmt: skip
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the trace."""
+    try:
+        import betterosi
+    except ImportError:
+        raise MissingExtra("export to OSI", "osi") from None
+    stamps, moves = agent_steps(scenario)
+    # The fields that all frames share.
+    major, minor, patch = map(int, betterosi.__version_osi__.split("."))
+    head: dict[str, Any] = {
+        "version": betterosi.InterfaceVersion(version_major=major, version_minor=minor, version_patch=patch),
+        # From the coordinates of the trace to those of its projection.
+        "proj_frame_offset": betterosi.GroundTruth.ProjFrameOffset(
+            position=_vector(betterosi, scenario.map.offset_m), yaw=0.0
+        ),
+    }
+    if scenario.map.projection is not None:
+        head["proj_string"] = scenario.map.projection
+    if scenario.ego is not None:
+        head["host_vehicle_id"] = betterosi.Identifier(value=scenario.agents.index(scenario.ego) + 1)
+    # What every frame repeats: lanes with their boundaries, and markings that are no lines, numbered after the agents.
+    first = len(scenario.agents) + 1
+    found, marks = lanes(scenario), MarkFinder(scenario)
+    number_of = {lane.id: first + k for k, lane in enumerate(found)}
+    ground: dict[str, list[Any]] = {"lane": [], "lane_boundary": []}
+    for k, lane in enumerate(found):
+        sides = [first + len(found) + 2 * k + side for side in (0, 1)]
+        for number, points, name in zip(sides, edges_of(lane), (lane.left, lane.right)):
+            ground["lane_boundary"].append(_boundary(betterosi, number, points, marks.mark(name)))
+        ground["lane"].append(_lane(betterosi, lane, number_of, sides))
+    free = first + 3 * len(found)
+    painted = [m for m in (scenario.map_features or MapFeatures()).markings if not m.is_lane_line]
+    ground["road_marking"] = [_marking(betterosi, free + k, m.points_m, m.color) for k, m in enumerate(painted)]
+    # The file name that the standard prescribes, with the scenario's start time.
+    start = datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
+    versions = betterosi.prepare_channel_metadata()
+    keys = (betterosi.OSI_CHANNEL_OSI_VERSION_KEY, betterosi.OSI_CHANNEL_PROTOBUF_VERSION_KEY)
+    standard, protobuf = (versions[key].replace(".", "") for key in keys)
+    name = f"{start}_gt_{standard}_{protobuf}_{len(stamps)}_{file_name(scenario.name)}.osi"
+    with betterosi.Writer(folder / name) as writer:
+        for k, stamp_ns in enumerate(stamps.tolist()):
+            alive = [(n, a, m) for n, (a, m) in enumerate(moves, start=1) if m.valid[k]]
+            t_s = (stamp_ns - scenario.t0_ns) / NS_PER_S
+            writer.add(betterosi.GroundTruth(
+                **head, **ground,
+                traffic_light=_traffic_lights(betterosi, scenario, free + len(painted), t_s),
+                timestamp=betterosi.Timestamp(seconds=stamp_ns // NS_PER_S, nanos=stamp_ns % NS_PER_S),
+                moving_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if not _stationary(a)],
+                stationary_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if _stationary(a)],
+            ))  # fmt: skip
 
 
 def _stationary(agent: Agent) -> bool:
     return agent.static and agent.category == "other"
 
 
-def _place(osi: Any, agent: Agent, move: SampledMotion, k: int) -> dict[str, Any]:
-    """Return size and pose of the bounding box. OSI's angles lie in (-pi, pi], ours in [-pi, pi)."""
-    length, width, height = map(float, agent.size_m)
-    yaw = float(move.yaw_rad[k])
-    return {
-        "dimension": osi.Dimension3d(length=length, width=width, height=height),
-        "position": _vector(osi, move.position_m[k]),
-        "orientation": osi.Orientation3d(roll=0.0, pitch=0.0, yaw=-yaw if yaw == -np.pi else yaw),
-    }
-
-
-def _identity(osi: Any, number: int, agent: Agent) -> dict[str, Any]:
-    reference = osi.ExternalReference(
-        type=SOURCE, identifier=[agent.id, agent.category, *(d.sentence for d in agent.doubts)]
-    )
-    identity: dict[str, Any] = {"id": osi.Identifier(value=number), "source_reference": [reference]}
-    if agent.color is not None:
-        red, green, blue = (float(v) / 255 for v in agent.color["rgb"])
-        identity["color_description"] = osi.ColorDescription(rgb=osi.ColorRGB(red=red, green=green, blue=blue))
-    return identity
-
-
 def _object(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) -> Any:
     """Return an agent as a moving object or, where it is stationary, as a stationary one."""
-    named, placed = _identity(osi, number, agent), _place(osi, agent, move, k)
+    texts = [agent.id, agent.category, *(d.sentence for d in agent.doubts)]
+    named: dict[str, Any] = {
+        "id": osi.Identifier(value=number),
+        "source_reference": [osi.ExternalReference(type=SOURCE, identifier=texts)],
+    }
+    if agent.color is not None:
+        red, green, blue = (float(v) / 255 for v in agent.color["rgb"])
+        named["color_description"] = osi.ColorDescription(rgb=osi.ColorRGB(red=red, green=green, blue=blue))
+    length, width, height = map(float, agent.size_m)
+    yaw = float(move.yaw_rad[k])
+    placed = {
+        "dimension": osi.Dimension3d(length=length, width=width, height=height),
+        "position": _vector(osi, move.position_m[k]),
+        # OSI's angles lie in (-pi, pi], ours in [-pi, pi).
+        "orientation": osi.Orientation3d(roll=0.0, pitch=0.0, yaw=-yaw if yaw == -np.pi else yaw),
+    }
     if _stationary(agent):
         kind = osi.StationaryObject.Classification
         still = osi.BaseStationary(**placed)
@@ -246,6 +216,3 @@ def _object(osi: Any, number: int, agent: Agent, move: SampledMotion, k: int) ->
         vehicle_attributes=moving.VehicleAttributes(bbcenter_to_rear=to_rear),
         vehicle_classification=kind(type=type_, role=kind.Role.CIVIL, has_trailer=False),
     )  # fmt: skip
-
-
-EXPORTER = Osi()

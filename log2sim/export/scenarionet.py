@@ -1,6 +1,6 @@
 """Export to scenario descriptions of ScenarioNet, which MetaDrive reads.
 
-The files hold plain Python values and arrays whose pickle references only `numpy.ndarray`, so that they load under any
+One scenario and the two tables of a data set, `dataset_summary.pkl` and `dataset_mapping.pkl`. The files hold plain Python values and arrays whose pickle references only `numpy.ndarray`, so that they load under any
 version of NumPy and without this package.
 """
 
@@ -92,22 +92,27 @@ TYPE_OF_GROUP = {"vehicle": "VEHICLE", "two_wheeler": "CYCLIST", "pedestrian": "
 Value = dict[str, Any]
 
 
-class ScenarioNet:
-    """One scenario and the two tables of a data set, `dataset_summary.pkl` and `dataset_mapping.pkl`."""
+options: tuple[str, ...] = ()
+loses = (
+    "times between steps of 0.1 s and outside the ego's life, uncertainty and observed flags, stop lines and other markings "
+    "that are no lines, colors of lines where unknown, cameras, stages; MetaDrive itself takes over no height, and shows no agents of category other and cyclists and pedestrians in sizes of its own"
+)
 
-    options: tuple[str, ...] = ()
-    loses = (
-        "times between steps of 0.1 s and outside the ego's life, uncertainty and observed flags, stop lines and other markings "
-        "that are no lines, colors of lines where unknown, cameras, stages; MetaDrive itself takes over no height, and shows no agents of category other and cyclists and pedestrians in sizes of its own"
-    )
 
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the description and the two tables."""
-        description = scenario_description(scenario)
-        name = f"sd_{DATASET}_{VERSION}_{file_name(scenario.name)}.pkl"
-        _dump(description, folder / name)
-        _dump({name: _without_arrays(description["metadata"])}, folder / "dataset_summary.pkl")
-        _dump({name: ""}, folder / "dataset_mapping.pkl")
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the description and the two tables."""
+    description = scenario_description(scenario)
+    name = f"sd_{DATASET}_{VERSION}_{file_name(scenario.name)}.pkl"
+
+    def plain(value: Any) -> Any:  # lists in place of arrays, as summaries hold them
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        return value.tolist() if isinstance(value, np.ndarray) else value
+
+    files = {name: description, "dataset_summary.pkl": {name: plain(description["metadata"])}}
+    for file, value in (files | {"dataset_mapping.pkl": {name: ""}}).items():
+        with (folder / file).open("wb") as opened:
+            _Pickler(opened, protocol=PROTOCOL).dump(value)
 
 
 def scenario_description(scenario: Scenario) -> Value:
@@ -182,13 +187,6 @@ def _object_summary(name: str, track: Value) -> Value:
     }  # fmt: skip
 
 
-def _without_arrays(value: Any) -> Any:
-    """Replace arrays by lists, as summaries hold them."""
-    if isinstance(value, dict):
-        return {k: _without_arrays(v) for k, v in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
 class _Pickler(pickle.Pickler):
     """Pickles arrays as calls of `numpy.ndarray` on their bytes: NumPy's own form references modules that NumPy 2 moved."""
 
@@ -196,11 +194,3 @@ class _Pickler(pickle.Pickler):
         if isinstance(value, np.ndarray):
             return np.ndarray, (value.shape, value.dtype.str, bytearray(value.tobytes()))
         return NotImplemented
-
-
-def _dump(value: Value, file: Path) -> None:
-    with file.open("wb") as opened:
-        _Pickler(opened, protocol=PROTOCOL).dump(value)
-
-
-EXPORTER = ScenarioNet()

@@ -28,12 +28,8 @@ RGB_OF_CATEGORY = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class AgentSteps:
-    """All agents at equal steps."""
-
-    t_ns: NDArray[np.int64]  # (T,) absolute time
-    moves: tuple[tuple[Agent, SampledMotion], ...]
+# All agents at equal steps: absolute time (T,), ns, and each with its motion.
+AgentSteps = tuple[NDArray[np.int64], tuple[tuple[Agent, SampledMotion], ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +74,7 @@ def agent_steps(scenario: Scenario) -> AgentSteps:
     ends = [(a.waypoints.t_s[0], a.waypoints.t_s[-1]) for a in scenario.agents]
     t_s = step_times(min(first for first, _ in ends), max(last for _, last in ends), STEP_S, len(ends))
     t_ns = scenario.t0_ns + np.round(t_s * geometry.NS_PER_S).astype(np.int64)
-    return AgentSteps(t_ns, tuple((agent, sample_steps(agent, t_s, STEP_S)) for agent in scenario.agents))
+    return t_ns, tuple((agent, sample_steps(agent, t_s, STEP_S)) for agent in scenario.agents)
 
 
 def ego_pose(agent: Agent, position_m: geometry.Array, yaw_rad: float) -> geometry.Array:
@@ -120,42 +116,26 @@ def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -
         import cv2
         import simplejpeg
 
-        small = _downscaled(camera, min(1.0, MAX_IMAGE_PX / camera.width_px))
-        if small is not camera:
-            size = (small.width_px, small.height_px)
+        scale, small = min(1.0, MAX_IMAGE_PX / camera.width_px), camera
+        if scale < 1.0:  # the center of the first pixel is (0, 0) in both sizes
+            size, K = (round(camera.width_px * scale), round(camera.height_px * scale)), camera.K.copy()
+            for axis, (new, old) in enumerate(zip(size, (camera.width_px, camera.height_px))):
+                K[axis] *= new / old
+                K[axis, 2] += (new / old - 1) / 2
+            small = replace(camera, width_px=size[0], height_px=size[1], K=K)
             image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
         poses, known = log.map_T_sensor(camera.name, t_ns)
         if not known[0]:
             return CameraFrame(t_ns, small, None, jpeg, ())
-        return CameraFrame(
-            t_ns, small, poses[0], jpeg, tuple(_outlines(scenario, small, geometry.inverse(poses[0]), t_ns))
-        )
+        outlines, t_s = [], (t_ns - scenario.t0_ns) / geometry.NS_PER_S
+        for agent in scenario.others if small.mount == "ego" else scenario.agents:  # the ego is not in its own cameras
+            at = agent.at(t_s)
+            if at.valid[0]:
+                corners = geometry.box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
+                lines = geometry.box_lines(small, geometry.apply(geometry.inverse(poses[0]), corners))
+                if len(lines):
+                    outlines.append((agent, lines))
+        return CameraFrame(t_ns, small, poses[0], jpeg, tuple(outlines))
     mapped = sweep_to_map(log, name, record.thinned(MAX_SWEEP_POINTS), compensate=True)
     return ThinnedSweep(t_ns, name, np.zeros((0, 3)) if mapped is None else mapped[0])
-
-
-def _downscaled(camera: geometry.Camera, scale: float) -> geometry.Camera:
-    """Return the camera of the same image in another size; the center of the first pixel is (0, 0) in both."""
-    if scale == 1.0:
-        return camera
-    width, height = round(camera.width_px * scale), round(camera.height_px * scale)
-    K = camera.K.copy()
-    for axis, (new, old) in enumerate(((width, camera.width_px), (height, camera.height_px))):
-        K[axis] *= new / old
-        K[axis, 2] += (new / old - 1) / 2
-    return replace(camera, width_px=width, height_px=height, K=K)
-
-
-def _outlines(
-    scenario: Scenario, camera: geometry.Camera, cam_T_map: geometry.Array, t_ns: int
-) -> Iterator[tuple[Agent, geometry.Array]]:
-    """Edges of the boxes that a camera sees; the ego is not drawn around its own cameras."""
-    t_s = (t_ns - scenario.t0_ns) / geometry.NS_PER_S
-    for agent in scenario.others if camera.mount == "ego" else scenario.agents:
-        at = agent.at(t_s)
-        if at.valid[0]:
-            corners = geometry.box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
-            lines = geometry.box_lines(camera, geometry.apply(cam_T_map, corners))
-            if len(lines):
-                yield agent, lines

@@ -121,16 +121,16 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "labels": "log2sim.perception.detect3d.detectors:create",
     },
     "export": {
-        "openscenario": "log2sim.export.openscenario.write:EXPORTER",
-        "carla": "log2sim.export.carla:EXPORTER",
-        "csv": "log2sim.export.csv_table:EXPORTER",
-        "scenarionet": "log2sim.export.scenarionet:EXPORTER",
-        "commonroad": "log2sim.export.commonroad:EXPORTER",
-        "lanelet2": "log2sim.export.lanelet2:EXPORTER",
-        "openlabel": "log2sim.export.openlabel:EXPORTER",
-        "osi": "log2sim.export.osi:EXPORTER",
-        "mcap": "log2sim.export.mcap:EXPORTER",
-        "rerun": "log2sim.export.rerun:EXPORTER",
+        "openscenario": "log2sim.export.openscenario.write",
+        "carla": "log2sim.export.carla",
+        "csv": "log2sim.export.csv_table",
+        "scenarionet": "log2sim.export.scenarionet",
+        "commonroad": "log2sim.export.commonroad",
+        "lanelet2": "log2sim.export.lanelet2",
+        "openlabel": "log2sim.export.openlabel",
+        "osi": "log2sim.export.osi",
+        "mcap": "log2sim.export.mcap",
+        "rerun": "log2sim.export.rerun",
     },
     "policy": {},
     "vehicle_model": {
@@ -170,7 +170,8 @@ def load(kind: str, name: str) -> Any:
     """
     if name in BUILT_IN[kind]:
         module, _, attribute = BUILT_IN[kind][name].partition(":")
-        return getattr(importlib.import_module(module), attribute)
+        found = importlib.import_module(module)
+        return getattr(found, attribute) if attribute else found
     entries = [entry for entry in installed(kind) if entry.name == name]
     if not entries:
         known = ", ".join(names(kind)) or "none"

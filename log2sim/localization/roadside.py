@@ -340,13 +340,22 @@ class Findings:
         better = structure[1] + objects[1] > structure[0] + objects[0]
         return bool(large and chi2 > MAX_CHANCE_CHI2 and self._fits and better and self._is_free(1, MAX_LEFT))
 
+    @property
+    def _sees_movers(self) -> bool:
+        """Whether both ends see something that moves."""
+        objects = self.found.objects[1]
+        return objects is not None and objects.moving > 0
+
     @cached_property
     def late(self) -> bool:
         """Whether the stamps are off for certain and by enough to matter."""
-        objects = self.found.objects[1]
         delay_s = abs(float(self.found.values[DELAY]))
-        seen = objects is not None and objects.moving > 0
-        return seen and delay_s > max(MIN_DELAY_S, MIN_SIGMAS * self.sigma[DELAY])
+        return self._sees_movers and delay_s > max(MIN_DELAY_S, MIN_SIGMAS * self.sigma[DELAY])
+
+    @property
+    def clock_verified(self) -> bool:
+        """Whether the clock is known to what matters."""
+        return self._sees_movers and bool(self.sigma[DELAY] < MIN_DELAY_S)
 
     @property
     def _fits(self) -> bool:
@@ -412,6 +421,8 @@ class Findings:
             faults.append(Finding("road_clock", lidar, "corrected", values=self._values()))
         if not self.verified:
             faults.append(Finding("unknown_road_pose", lidar, values=self._values()))
+        if not self.clock_verified:
+            faults.append(Finding("unknown_road_clock", lidar, values=self._values()))
         return faults
 
     def _values(self) -> dict[str, float]:
@@ -432,6 +443,7 @@ class Findings:
             "sensors": list(self.unit.sensors),
             "treatment": "left_out" if self.contradicted else "corrected" if self.applied.any() else "kept",
             "verified": self.verified,
+            "clock_verified": self.clock_verified,
             **self._values(),
             "structure": {
                 n: None
@@ -458,8 +470,17 @@ class RoadRegistration:
     """What came of the registration of the road's sensors."""
 
     log: Log  # with the corrected mounts and stamps
-    faults: tuple[Finding, ...] = ()
-    figures: list[dict[str, Any]] = field(default_factory=list)  # for the report, one entry for each roadside unit
+    units: tuple[Findings, ...] = ()
+
+    @property
+    def faults(self) -> tuple[Finding, ...]:
+        """What is wrong, and what cannot be said."""
+        return tuple(fault for unit in self.units for fault in unit.faults())
+
+    @property
+    def figures(self) -> list[dict[str, Any]]:
+        """For the report, one entry for each roadside unit."""
+        return [unit.to_dict() for unit in self.units]
 
 
 def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> RoadRegistration:
@@ -471,7 +492,7 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
     at_road = [n for n, lidar in used.lidars.items() if lidar.mount == "map" and len(log.streams[n].t_ns)]
     if not config.cooperation.register_road or log.ego is None or not at_road or not lidars_on_ego(used):
         return RoadRegistration(log)
-    figures, faults = list[dict[str, Any]](), list[Finding]()
+    units = []
     for unit in units_of(used, at_road):
         stage = f"register {unit.lidars[0]}"
         sight = collect_sight(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]
@@ -487,6 +508,5 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
             findings = replace(findings, found=add_drift(sight, found))
         if findings.applied.any():
             log = correct_unit(log, unit, findings.correction, float(findings.applied[-1]))
-        faults += findings.faults()
-        figures.append(findings.to_dict())
-    return RoadRegistration(log, tuple(faults), figures)
+        units.append(findings)
+    return RoadRegistration(log, tuple(units))

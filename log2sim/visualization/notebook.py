@@ -33,7 +33,6 @@ MAX_CAMERAS = 6
 FRAME_WIDTH_PX, JPEG_QUALITY = 236, 80
 ABOVE_PX, ABOVE_REACH_M = 236, 40.0
 
-
 Thumbnail = tuple[str, bytes, str]  # a small picture: "image/png" or "image/jpeg", the bytes, and a caption
 
 
@@ -109,7 +108,21 @@ def notebook_html(value: Log | Scenario | Replay) -> str:
         drawn = draw()
     except Exception:  # a picture that cannot be drawn must not hide the rest
         drawn = []
-    return _page(repr(value), rows, drawn)
+    cell = 'style="text-align:left;padding:1px 12px 1px 0;vertical-align:top'
+    table = "".join(
+        f'<tr><td {cell};opacity:0.65">{_text(name)}</td><td {cell}">{_text(told)}</td></tr>' for name, told in rows
+    )
+    shown = ""
+    for media_type, data, caption in drawn:
+        label, source = escape(caption or "picture", quote=True), base64.b64encode(data).decode("ascii")
+        below = f'<figcaption style="font-size:85%;opacity:0.65">{_text(caption)}</figcaption>' * bool(caption)
+        image = f'<img alt="{label}" src="data:{media_type};base64,{source}" style="max-width:100%;height:auto">'
+        shown += f'<figure style="margin:0">{image}{below}</figure>'
+    return (
+        f'<div style="max-width:760px"><div><code>{_text(repr(value))}</code></div>'
+        f'<table style="border-collapse:collapse;margin:4px 0">{table}</table>'
+        f'<div style="display:flex;flex-wrap:wrap;gap:8px">{shown}</div></div>'
+    )
 
 
 def _rows_of_log(log: Log) -> list[Row]:
@@ -152,24 +165,6 @@ def _rows_of_replay(replay: Replay) -> list[Row]:
     if replay.metrics.get("cross_track_rms_m") is not None:
         rows.append(("beside the path", f"{replay.metrics['cross_track_rms_m']:.3f} m rms"))
     return rows
-
-
-def _page(title: str, rows: Iterable[Row], pictures: Iterable[Thumbnail]) -> str:
-    cell = 'style="text-align:left;padding:1px 12px 1px 0;vertical-align:top'
-    table = "".join(
-        f'<tr><td {cell};opacity:0.65">{_text(name)}</td><td {cell}">{_text(value)}</td></tr>' for name, value in rows
-    )
-    shown = ""
-    for media_type, data, caption in pictures:
-        label, source = escape(caption or "picture", quote=True), base64.b64encode(data).decode("ascii")
-        below = f'<figcaption style="font-size:85%;opacity:0.65">{_text(caption)}</figcaption>' * bool(caption)
-        image = f'<img alt="{label}" src="data:{media_type};base64,{source}" style="max-width:100%;height:auto">'
-        shown += f'<figure style="margin:0">{image}{below}</figure>'
-    return (
-        f'<div style="max-width:760px"><div><code>{_text(title)}</code></div>'
-        f'<table style="border-collapse:collapse;margin:4px 0">{table}</table>'
-        f'<div style="display:flex;flex-wrap:wrap;gap:8px">{shown}</div></div>'
-    )
 
 
 def _text(text: str) -> str:

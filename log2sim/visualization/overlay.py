@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from log2sim.perception.detect.detectors import MAX_AGE_S, boxes_of_labels, inte
 from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_to_map
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
-from log2sim.perception.sync import Schedule, synchronize
+from log2sim.perception.sync import synchronize
 from log2sim.visualization.plot.drawing import add_lines
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, new_figure, printable_label, save_png
 from log2sim.visualization.recording import corners_in_view, require_cameras
@@ -95,16 +96,50 @@ def read_moment(
         stamps = np.array([min(ends), max(ends) + 1], dtype=np.int64)
         log = log.changed(ego=geometry.PoseTrack(stamps, np.repeat(np.eye(4)[None], 2, axis=0), max_gap_s=np.inf))
     schedule = synchronize(log, tuple(cameras) or tuple(log.cameras))
-    tick = _find_tick(schedule, at_s) if t_ns is None else int(np.argmin(np.abs(schedule.t_ns - t_ns)))
+    seconds = (schedule.t_ns - schedule.t_ns[0]) / geometry.NS_PER_S
+    if t_ns is not None:
+        tick = int(np.argmin(np.abs(schedule.t_ns - t_ns)))
+    elif at_s is None:
+        rows = [*schedule.frames.values(), *(index[schedule.reference_row] for index in schedule.sweeps.values())]
+        records = np.sum([index >= 0 for index in rows], axis=0)
+        fullest = np.flatnonzero(records == records.max())
+        tick = int(fullest[len(fullest) // 2])
+    else:
+        slack = 0.5 * float(np.diff(seconds).max(initial=0.0)) + 1e-9
+        if not -slack <= at_s <= seconds[-1] + slack:
+            known = f"the log has ticks from 0 to {seconds[-1]:.3f} s"
+            raise ConfigError(f"--at {at_s:g}: {known}; choose a time between them")
+        tick = int(np.argmin(np.abs(seconds - at_s)))
     t_ns = int(schedule.t_ns[tick])
     if labels is not None:
         log = log.changed(labels=labels(t_ns), image_labels={})
-    reader = _SweepReader(log)
-    shots = tuple(_shot(log, schedule, reader, row, tick) for row in range(len(schedule.frames)))
-    sweeps = reader.at(schedule, schedule.reference_row, tick)
-    boxes = labels_at(log.labels, t_ns)
+    loaded: dict[tuple[str, int], SweepInMap | None] = {}  # each sweep is read once
+
+    def sweeps_of(row: int) -> tuple[SweepInMap, ...]:
+        wanted = [(name, int(index[row, tick])) for name, index in schedule.sweeps.items()]
+        for name, index in wanted:
+            if index < 0 or (name, index) in loaded:
+                continue
+            loaded[name, index] = None
+            try:
+                sweep: Sweep = RecordSource(log).require(name, index)
+            except RecordError as error:
+                notes.append(str(error))
+                continue
+            if (mapped := sweep_to_map(log, name, sweep, compensate=True)) is None:
+                notes.append(f"{name}: no ego pose at stamp {sweep.stamp_ns}")
+                continue
+            middle = sweep.stamp_ns
+            if sweep.t_ns is not None and len(sweep.t_ns):
+                middle = (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2
+            loaded[name, index] = SweepInMap(name, mapped[0], middle, compensation_of(log, name, sweep))
+        return tuple(found for key in wanted if (found := loaded.get(key)) is not None)
+
+    frames = [(name, int(index[tick])) for name, index in schedule.frames.items()]
+    shots = tuple(_shot(log, name, index, partial(sweeps_of, row)) for row, (name, index) in enumerate(frames))
+    sweeps = sweeps_of(schedule.reference_row)
     at = float(t_ns - schedule.t_ns[0]) / geometry.NS_PER_S
-    return OverlayMoment(log, t_ns, at, shots, sweeps, boxes, (*notes, *reader.problems))
+    return OverlayMoment(log, t_ns, at, shots, sweeps, labels_at(log.labels, t_ns), tuple(notes))
 
 
 def labels_at(labels: Labels | None, t_ns: int) -> Boxes3D:
@@ -129,54 +164,8 @@ def labels_at(labels: Labels | None, t_ns: int) -> Boxes3D:
     return replace(out, t_ns=np.full(len(out), t_ns, dtype=np.int64))
 
 
-def _find_tick(schedule: Schedule, at_s: float | None) -> int:
-    if at_s is None:
-        rows = [*schedule.frames.values(), *(index[schedule.reference_row] for index in schedule.sweeps.values())]
-        records = np.sum([index >= 0 for index in rows], axis=0)
-        fullest = np.flatnonzero(records == records.max())
-        return int(fullest[len(fullest) // 2])
-    seconds = (schedule.t_ns - schedule.t_ns[0]) / geometry.NS_PER_S
-    slack = 0.5 * float(np.diff(seconds).max(initial=0.0)) + 1e-9
-    if not -slack <= at_s <= seconds[-1] + slack:
-        raise ConfigError(f"--at {at_s:g}: the log has ticks from 0 to {seconds[-1]:.3f} s; choose a time between them")
-    return int(np.argmin(np.abs(seconds - at_s)))
-
-
-class _SweepReader:
-    """Reads sweeps once, in the map frame, and collects what cannot be read."""
-
-    def __init__(self, log: Log) -> None:
-        self.log = log
-        self.problems: list[str] = []
-        self._known: dict[tuple[str, int], SweepInMap | None] = {}
-
-    def at(self, schedule: Schedule, row: int, tick: int) -> tuple[SweepInMap, ...]:
-        """Return the sweeps of a row of the schedule at a tick."""
-        wanted = [(name, int(index[row, tick])) for name, index in schedule.sweeps.items()]
-        for key in wanted:
-            if key[1] >= 0 and key not in self._known:
-                self._known[key] = self._load(*key)
-        return tuple(sweep for key in wanted if (sweep := self._known.get(key)) is not None)
-
-    def _load(self, name: str, index: int) -> SweepInMap | None:
-        try:
-            sweep: Sweep = RecordSource(self.log).require(name, index)
-        except RecordError as error:
-            self.problems.append(str(error))
-            return None
-        mapped = sweep_to_map(self.log, name, sweep, compensate=True)
-        if mapped is None:
-            self.problems.append(f"{name}: no ego pose at stamp {sweep.stamp_ns}")
-            return None
-        middle = sweep.stamp_ns
-        if sweep.t_ns is not None and len(sweep.t_ns):
-            middle = (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2
-        return SweepInMap(name, mapped[0], middle, compensation_of(self.log, name, sweep))
-
-
-def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: int) -> Shot:
-    name = list(schedule.frames)[row]
-    camera, index = log.cameras[name], int(schedule.frames[name][tick])
+def _shot(log: Log, name: str, index: int, read_sweeps: Callable[[], tuple[SweepInMap, ...]]) -> Shot:
+    camera = log.cameras[name]
     empty = Shot(camera, 0, None, np.zeros((0, 2)), np.zeros(0), (), np.zeros((0, 4)), {})
     if index < 0:
         return replace(empty, problem="no image near this tick")
@@ -191,26 +180,17 @@ def _shot(log: Log, schedule: Schedule, reader: _SweepReader, row: int, tick: in
         shot = replace(shot, problem=str(error))
     if not log.map_T_sensor(name, t_ns)[1][0]:
         return replace(shot, problem="no ego pose at the stamp of the image")
-    sweeps = reader.at(schedule, row, tick)
+    sweeps = read_sweeps()
     points = np.concatenate([s.xyz for s in sweeps]) if sweeps else np.zeros((0, 3))
     uv, depth, valid = geometry.project_moving(camera, points, poses_around(log, name, t_ns))
     residuals_s = {s.name: (s.middle_ns - t_ns) / geometry.NS_PER_S for s in sweeps}
-    boxes = _wireframes(log, camera, t_ns)
-    return replace(shot, uv_px=uv[valid], depth_m=depth[valid], boxes=boxes, residuals_s=residuals_s)
-
-
-def _wireframes(log: Log, camera: geometry.Camera, t_ns: int) -> tuple[tuple[geometry.Array, str], ...]:
-    """Project the edges of the labels at a stamp; each box takes the pose of the line that shows its center."""
-    boxes = labels_at(log.labels, t_ns)
-    view = view_of(log, camera.name, t_ns)
-    if view is None:
-        return ()
-    shown = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
-    out = []
-    for i in np.flatnonzero(shown.valid):
-        corners = corners_in_view(view, shown.box_px[i], boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])
-        out.append((geometry.box_lines(camera, corners), str(boxes.category[i])))
-    return tuple(out)
+    boxes, view, wires = labels_at(log.labels, t_ns), view_of(log, name, t_ns), []
+    if view is not None:  # each box takes the pose of the line that shows its center
+        shown = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
+        for i in np.flatnonzero(shown.valid):
+            corners = corners_in_view(view, shown.box_px[i], boxes.center_m[i], boxes.size_m[i], boxes.yaw_rad[i])
+            wires.append((geometry.box_lines(camera, corners), str(boxes.category[i])))
+    return replace(shot, uv_px=uv[valid], depth_m=depth[valid], boxes=tuple(wires), residuals_s=residuals_s)
 
 
 # Colors of boxes by group, none of which the colors of depths have.

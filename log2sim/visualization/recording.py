@@ -6,6 +6,7 @@ import base64
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -99,39 +100,29 @@ STRAIGHT_SHARE = 1 / 640
 CORNERS, SEGMENTS = 1, 0
 
 
-class OutlineProjector:
-    """Projects the agents of a scenario, but for the ego, into the frames of a log.
+def outlines_in(log: Log, scenario: Scenario, camera: str, t_ns: int) -> list[list[int]]:
+    """Project the agents of a scenario, but for the ego, into the frame of a camera at a stamp, the farthest first.
 
-    `log`: with the poses that the scenario was made with. `agents`: outlines name them by their place among these.
+    `log`: with the poses that the scenario was made with. Returns whole pixels of the camera, after the agent's place among the
+    `others`; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not known.
     """
-
-    def __init__(self, log: Log, scenario: Scenario) -> None:
-        self.agents = scenario.others
-        self._log, self._t0_ns = log, scenario.t0_ns
-
-    def outlines(self, camera: str, t_ns: int) -> list[list[int]]:
-        """Project the agents into the frame of a camera at a stamp, the farthest first.
-
-        Returns whole pixels of the camera; see `CORNERS` and `SEGMENTS`. Empty where the pose of the camera is not
-        known.
-        """
-        view = view_of(self._log, camera, t_ns)
-        if view is None or not self.agents:
-            return []
-        table = AgentTable.of(self.agents, np.array([(t_ns - self._t0_ns) / geometry.NS_PER_S]), permanent=True)
-        center, yaw, rows = table.center_m[:, 0], table.yaw_rad[:, 0], np.flatnonzero(table.present[:, 0])
-        found = project_boxes_in_view(view, center[rows], table.size_m[rows], yaw[rows])
-        height_px = found.box_px[:, 3] - found.box_px[:, 1]
-        with np.errstate(invalid="ignore"):
-            shown = np.flatnonzero(found.valid & (height_px >= MIN_SHARE * view.camera.height_px))
-        out = []
-        for i in shown[np.argsort(-found.range_m[shown], kind="stable")]:
-            row = int(rows[i])
-            corners = corners_in_view(view, found.box_px[i], center[row], table.size_m[row], yaw[row])
-            kind, coordinates = ground_outline(view.camera, corners)
-            if len(coordinates):
-                out.append([row, kind, *np.rint(coordinates).astype(np.int64).ravel().tolist()])
-        return out
+    view = view_of(log, camera, t_ns)
+    if view is None or not scenario.others:
+        return []
+    table = AgentTable.of(scenario.others, np.array([(t_ns - scenario.t0_ns) / geometry.NS_PER_S]), permanent=True)
+    center, yaw, rows = table.center_m[:, 0], table.yaw_rad[:, 0], np.flatnonzero(table.present[:, 0])
+    found = project_boxes_in_view(view, center[rows], table.size_m[rows], yaw[rows])
+    height_px = found.box_px[:, 3] - found.box_px[:, 1]
+    with np.errstate(invalid="ignore"):
+        shown = np.flatnonzero(found.valid & (height_px >= MIN_SHARE * view.camera.height_px))
+    out = []
+    for i in shown[np.argsort(-found.range_m[shown], kind="stable")]:
+        row = int(rows[i])
+        corners = corners_in_view(view, found.box_px[i], center[row], table.size_m[row], yaw[row])
+        kind, coordinates = ground_outline(view.camera, corners)
+        if len(coordinates):
+            out.append([row, kind, *np.rint(coordinates).astype(np.int64).ravel().tolist()])
+    return out
 
 
 def ground_outline(camera: geometry.Camera, corners_cam: geometry.Array) -> tuple[int, geometry.Array]:
@@ -229,17 +220,16 @@ def picture_document(
     "width_px", "rate_hz" and "bytes" as chosen. Cameras without a picture during the scenario are left out. Raises
     `ConfigError` when not even one small picture of each camera fits.
     """
-    projector = OutlineProjector(log, scenario)
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
     within = {name: index for name, index in within.items() if len(index)}
-    probes = _probe(log, within, projector, reader)
+    probes = _probe(log, scenario, within, reader)
     known = {name: within[name] for name in probes}
     what = "pictures", "one of each camera", ", or choose fewer cameras with --cameras"
     detail, chosen = _fit(log, scenario.t0_ns, known, probes, PICTURE_DETAILS, budget_bytes, what)
     width_px = int(detail.size)
     pictures = ShrunkPictures(chosen, width_px)
     give_pictures(reader, [pictures], progress, least_px=width_px)
-    entries = {name: _entry(log, scenario, projector, name, pictures.jpeg.get(name, {})) for name in chosen}
+    entries = {name: _entry(log, scenario, name, pictures.jpeg.get(name, {})) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     used = [log.cameras[name] for name in entries]
     forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in used]
@@ -252,7 +242,7 @@ def picture_document(
     return {
         "cameras": list(entries.values()),
         "ahead": int(np.argmax(forward)) if forward else 0,
-        "agents": [agent.id for agent in projector.agents],
+        "agents": [agent.id for agent in scenario.others],
         "width_px": min(width_px, max((camera.width_px for camera in used), default=0)),
         "rate_hz": detail.rate_hz,
         "bytes": sum(map(_bytes_of, entries.values())),
@@ -260,7 +250,7 @@ def picture_document(
 
 
 def _probe(
-    log: Log, within: Mapping[str, NDArray[np.int64]], projector: OutlineProjector, reader: RecordSource
+    log: Log, scenario: Scenario, within: Mapping[str, NDArray[np.int64]], reader: RecordSource
 ) -> dict[str, dict[float, float]]:
     """Estimate the bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
     widths = sorted({int(detail.size) for detail in PICTURE_DETAILS})
@@ -271,7 +261,7 @@ def _probe(
             image = reader.get(name, i)
             if image is None:
                 continue
-            outlines = OUTLINE_BYTES * len(projector.outlines(name, int(log.streams[name].t_ns[i])))
+            outlines = OUTLINE_BYTES * len(outlines_in(log, scenario, name, int(log.streams[name].t_ns[i])))
             for width in widths:
                 sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines + POSE_BYTES)
         if sizes[widths[0]]:
@@ -306,9 +296,7 @@ def _fit(
     return detail, {name: index[take_evenly(len(index), most)] for name, index in chosen.items()}
 
 
-def _entry(
-    log: Log, scenario: Scenario, projector: OutlineProjector, name: str, jpeg: Mapping[int, bytes]
-) -> dict[str, Any]:
+def _entry(log: Log, scenario: Scenario, name: str, jpeg: Mapping[int, bytes]) -> dict[str, Any]:
     camera, t_ns = log.cameras[name], log.streams[name].t_ns
     order = sorted(index for index, data in jpeg.items() if data)
     map_T_cam, known = log.map_T_sensor(name, t_ns[order])
@@ -326,7 +314,7 @@ def _entry(
         ],
         "t_s": [round((int(t_ns[i]) - scenario.t0_ns) / geometry.NS_PER_S, 4) for i in order],
         "jpeg": [base64.b64encode(jpeg[i]).decode() for i in order],
-        "outlines": [projector.outlines(name, int(t_ns[i])) for i in order],
+        "outlines": [outlines_in(log, scenario, name, int(t_ns[i])) for i in order],
     }
 
 
@@ -340,7 +328,6 @@ UNIT_M = 0.05  # of stored positions: a pixel of a screen that shows 50 m
 REACH_M = 120.0  # points farther from the ego, or from the middle of the sensors, are left out
 # Above the ground: what is higher, such as trees and bridges, would cover the road from above.
 MIN_HEIGHT_M, MAX_HEIGHT_M = -1.0, 5.0
-
 HEIGHT_UNIT_M = (MAX_HEIGHT_M - MIN_HEIGHT_M) / 255
 MAX_APART_S = 0.1  # between the sweeps of several LiDARs that are shown as one
 
@@ -378,10 +365,10 @@ def point_document(
     lidars = [n for n in log.lidars if n in log.streams and len(records_within(log.streams[n].t_ns, scenario))]
     if not lidars:
         return None
-    sweeps = _Sweeps(log, lidars, reader)
     main = max(lidars, key=lambda name: len(records_within(log.streams[name].t_ns, scenario)))
+    around = partial(_points_around, log, reader, {name: sweep_middle_ns(log, name) for name in lidars}, main)
     within = records_within(log.streams[main].t_ns, scenario)
-    probes = [p for i in take_evenly(len(within), POINT_PROBES) if (p := sweeps.at(main, int(within[i]))) is not None]
+    probes = [p for i in take_evenly(len(within), POINT_PROBES) if (p := around(int(within[i]))) is not None]
     if not probes:
         return None
     known = np.concatenate([p.intensity[np.isfinite(p.intensity)] for p in probes])
@@ -395,7 +382,7 @@ def point_document(
     chosen = by_name[main]
     moments: list[tuple[PointsAbove, str]] = []
     for done, i in enumerate(chosen.tolist()):
-        if (points := sweeps.at(main, i)) is not None:
+        if (points := around(i)) is not None:
             moments.append((points, pack_recording(points, detail.size, bright)))
         progress(done + 1, len(chosen))
     while (total := sum(len(text) + BYTES_OF_ENTRY for _, text in moments)) > budget_bytes and len(moments) > 1:
@@ -428,44 +415,38 @@ def pack_recording(points: PointsAbove, cell_m: float, bright: float) -> str:
     return base64.b64encode(zlib.compress(np.concatenate(planes).astype(np.uint8).tobytes(), 9)).decode()
 
 
-class _Sweeps:
-    """Reads the sweeps of all LiDARs around a moment as points from above."""
+def _points_around(
+    log: Log, reader: RecordSource, middle_ns: Mapping[str, int], main: str, index: int
+) -> PointsAbove | None:
+    """Return the points of all LiDARs around a sweep of one; None where it cannot be read or has no known pose.
 
-    def __init__(self, log: Log, lidars: list[str], reader: RecordSource) -> None:
-        self._log, self._reader = log, reader
-        self._middle_ns = {name: sweep_middle_ns(log, name) for name in lidars}
-
-    def at(self, main: str, index: int) -> PointsAbove | None:
-        """Return the points around a sweep of one LiDAR; None where it cannot be read or has no known pose."""
-        t_ns = int(self._log.streams[main].t_ns[index]) + self._middle_ns[main]
-        xyz, intensity = [], []
-        for name, middle_ns in self._middle_ns.items():
-            stamps = self._log.streams[name].t_ns + middle_ns
-            near = index if name == main else int(geometry.nearest_index(stamps, t_ns)[0])
-            if abs(int(stamps[near]) - t_ns) > MAX_APART_S * geometry.NS_PER_S:
-                continue
-            sweep = self._reader.get(name, near)
-            mapped = None if sweep is None else sweep_to_map(self._log, name, sweep, compensate=True)
-            if sweep is None or mapped is None:
-                if name == main:
-                    return None
-                continue
-            xyz.append(mapped[0])
-            none = np.full(len(mapped[0]), np.nan)
-            intensity.append(none if sweep.intensity is None else np.asarray(sweep.intensity, dtype=np.float64))
-        return self._from_above(t_ns, np.concatenate(xyz), np.concatenate(intensity))
-
-    def _from_above(self, t_ns: int, xyz: geometry.Array, intensity: geometry.Array) -> PointsAbove:
-        """Keep what is near and neither under the ground nor high above it."""
-        middle, ground_z = cloud_origin(self._log, t_ns)
-        origin = np.rint(middle[:2])
-        local = xyz - [*origin, 0.0]
-        near = np.flatnonzero(np.abs(local[:, :2]).max(axis=1) <= REACH_M)
-        local = local[near]
-        height = local[:, 2] - estimate_ground(local, middle[:2] - origin, ground_z).at(local[:, :2])
-        kept = np.flatnonzero((height >= MIN_HEIGHT_M) & (height <= MAX_HEIGHT_M))
-        at = (int(origin[0]), int(origin[1]))
-        return PointsAbove(t_ns, at, local[kept, :2], height[kept], intensity[near][kept])
+    `middle_ns`: of each LiDAR, from the stamp of a sweep to its middle. Kept is what is near and neither under the ground nor high above it.
+    """
+    t_ns = int(log.streams[main].t_ns[index]) + middle_ns[main]
+    xyz, intensity = [], []
+    for name, to_middle_ns in middle_ns.items():
+        stamps = log.streams[name].t_ns + to_middle_ns
+        nearest = index if name == main else int(geometry.nearest_index(stamps, t_ns)[0])
+        if abs(int(stamps[nearest]) - t_ns) > MAX_APART_S * geometry.NS_PER_S:
+            continue
+        sweep = reader.get(name, nearest)
+        mapped = None if sweep is None else sweep_to_map(log, name, sweep, compensate=True)
+        if sweep is None or mapped is None:
+            if name == main:
+                return None
+            continue
+        xyz.append(mapped[0])
+        none = np.full(len(mapped[0]), np.nan)
+        intensity.append(none if sweep.intensity is None else np.asarray(sweep.intensity, dtype=np.float64))
+    middle, ground_z = cloud_origin(log, t_ns)
+    origin = np.rint(middle[:2])
+    local = np.concatenate(xyz) - [*origin, 0.0]
+    near = np.flatnonzero(np.abs(local[:, :2]).max(axis=1) <= REACH_M)
+    local = local[near]
+    height = local[:, 2] - estimate_ground(local, middle[:2] - origin, ground_z).at(local[:, :2])
+    kept = np.flatnonzero((height >= MIN_HEIGHT_M) & (height <= MAX_HEIGHT_M))
+    at = (int(origin[0]), int(origin[1]))
+    return PointsAbove(t_ns, at, local[kept, :2], height[kept], np.concatenate(intensity)[near][kept])
 
 
 POINT_SHARE = 0.3  # of the budget, for points, where there are pictures too; what they leave is for the pictures
@@ -507,10 +488,7 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
             progress=lambda done, total: report("page: pictures", done, total),
         )  # fmt: skip
     reader.require_some()
-    seen, hit = (
-        "no pictures: the log has none during the scenario",
-        "no LiDAR points: the log has none during the scenario",
-    )
+    seen, hit = (f"no {what}: the log has none during the scenario" for what in ("pictures", "LiDAR points"))
     if pictures is not None and pictures["cameras"]:
         count, cameras_shown = sum(len(c["t_s"]) for c in pictures["cameras"]), len(pictures["cameras"])
         noun = f"{count} picture{'s' * (count != 1)} of {cameras_shown} camera{'s' * (cameras_shown != 1)}"

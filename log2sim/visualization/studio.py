@@ -13,9 +13,9 @@ from log2sim.datatypes import Scenario
 from log2sim.edit.corrections import Corrected, correct, load_corrections
 from log2sim.errors import Log2SimError, ScenarioError
 from log2sim.files.documents import check, write_json
+from log2sim.road.ground_map import GroundMap
 from log2sim.visualization.page.document import SCALES, feature_columns, page_document
 from log2sim.visualization.page.writer import make_page, page_html
-from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.recording import Recorded
 
 # A hundred thousand corrections have some 20 MB.
@@ -40,7 +40,7 @@ class Studio:
         path: Path,
         *,
         recorded: Recorded | None = None,
-        background: Background | None = None,
+        background: GroundMap | None = None,
         port: int = 0,
     ) -> None:
         """Open a scenario; `path` holds its corrections, earlier ones are gone on with.

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
@@ -105,13 +104,18 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[setti
     runs, observations = run_all(context, report)
     homographies = homography_points(context, observations, report)
     whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
+    if homographies:  # whole runs state the share of the obstacles that their homographies place
+        shares = {f"homography: {p.setting}": p.figures["placed_share"] for p in homographies}
+        present = next(p for p in homographies if p.present).figures["placed_share"]
+        placed = [shares.get(p.setting, present) for p in whole]
+        whole = [replace(p, figures={**p.figures, "placed_share": share}) for p, share in zip(whole, placed)]
 
     def own(stage: str) -> list[settings.Point]:
         return [_point(context, stage, r) for r in runs if r is runs[0] or r.setting.stage == stage]
 
     points = {
         "detect": own("detect"), "measure": own("measure"), "homography": homographies, "smooth": own("smooth"),
-        "whole run": _add_placed_shares(whole, homographies),
+        "whole run": whole,
     }  # fmt: skip
     whole_ms, known = context.ms_per_tick(runs[0].seconds), context.truth is not None
     return [_panel(stage, found, whole_ms, known) for stage, found in points.items() if found]
@@ -133,15 +137,6 @@ def _point(context: BenchContext, stage: str, run: BenchRun) -> settings.Point:
     ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
     score = run.measurement_score if stage == "measure" and context.truth is not None else run.score
     return score.point(name, run.setting.present, ms, ERRORS[stage][context.truth is None][0])
-
-
-def _add_placed_shares(whole: Sequence[settings.Point], homographies: Sequence[settings.Point]) -> list[settings.Point]:
-    """Add to whole runs the share of the obstacles that their homographies place."""
-    if not homographies:
-        return list(whole)
-    shares = {f"homography: {p.setting}": p.figures["placed_share"] for p in homographies}
-    present = next(p for p in homographies if p.present).figures["placed_share"]
-    return [replace(p, figures={**p.figures, "placed_share": shares.get(p.setting, present)}) for p in whole]
 
 
 def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> settings.Point:
@@ -311,27 +306,7 @@ def write_picture(result: Benchmark, path: Path) -> None:
     """Draw all panels into a PNG, atomically; the last cell explains the marks and gives the recommendations."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
     width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
-    figure = new_figure(width, height)
-    _title(figure, result)
-    for k, panel in enumerate(result.panels):
-        _draw_panel(figure.add_axes(_cell(k, rows, width, height)), panel)
-    _draw_recommendations(figure.add_axes(_cell(len(result.panels), rows, width, height)), result)
-    save_png(figure, path, 150)
-
-
-def _cell(k: int, rows: int, width: float, height: float) -> tuple[float, float, float, float]:
-    """Compute left, bottom, width, height of the axes of cell `k` as fractions of the figure."""
-    column, row = k % COLUMNS, k // COLUMNS
-    x = column * CELL_IN[0] + MARGIN_IN["left"]
-    y = (rows - 1 - row) * CELL_IN[1] + MARGIN_IN["bottom"]
-    w = CELL_IN[0] - MARGIN_IN["left"] - MARGIN_IN["right"]
-    h = CELL_IN[1] - MARGIN_IN["bottom"] - MARGIN_IN["top"]
-    return x / width, y / height, w / width, h / height
-
-
-def _title(figure: Figure, result: Benchmark) -> None:
-    context = result.context
-    height = figure.get_figheight()
+    figure, context = new_figure(width, height), result.context
     against = f"truth: {context.truth.name}" if context.truth is not None else "no truth"
     cameras, lidars = len(context.plan.cameras), len(context.log.lidars)
     counts = [(len(context.schedule), "tick"), (cameras, "camera") if cameras else (lidars, "LiDAR")]
@@ -346,6 +321,17 @@ def _title(figure: Figure, result: Benchmark) -> None:
     title = printable_label(f"{context.log.name}: error against run time", 90)
     figure.text(x, 1 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
     figure.text(x, 1 - 0.6 / height, printable_label(text, 150), fontsize=8, color=MUTED, **style)
+    w = CELL_IN[0] - MARGIN_IN["left"] - MARGIN_IN["right"]
+    h = CELL_IN[1] - MARGIN_IN["bottom"] - MARGIN_IN["top"]
+    for k, panel in enumerate([*result.panels, None]):
+        row, column = divmod(k, COLUMNS)
+        x, y = column * CELL_IN[0] + MARGIN_IN["left"], (rows - 1 - row) * CELL_IN[1] + MARGIN_IN["bottom"]
+        ax = figure.add_axes((x / width, y / height, w / width, h / height))
+        if panel is None:
+            _draw_recommendations(ax, result)
+        else:
+            _draw_panel(ax, panel)
+    save_png(figure, path, 150)
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
@@ -446,6 +432,24 @@ def bench_document(result: Benchmark) -> dict[str, Any]:
     """Return the document of `schemas/bench-1.json`."""
     context, config = result.context, result.context.grid.present.config
     t = context.schedule.t_ns
+    panels = [
+        {
+            "stage": panel.stage,
+            "error": {"figure": panel.error, "label": panel.label, "unit": panel.unit},
+            "points": [
+                {
+                    "setting": p.setting, "present": p.present, "on_front": on_front, "ms_per_tick": round(p.ms_per_tick, 4),
+                    "error": rounded_tree(p.error), "error_interval": _interval(p), "figures": rounded_tree(p.figures),
+                }
+                for p, on_front in zip(panel.points, panel.on_front, strict=True)
+            ],
+            "supports": {
+                "setting": (advice := panel.recommendation).supported, "present": advice.present,
+                "agrees": None if advice.supported is None else advice.agrees, "reason": advice.reason,
+            },
+        }
+        for panel in result.panels
+    ]  # fmt: skip
     out = {
         "bench_version": VERSION,
         "log": {"name": context.log.name, "format": context.log.format, "digest": context.log.digest},
@@ -454,30 +458,10 @@ def bench_document(result: Benchmark) -> dict[str, Any]:
         "duration_s": int(t[-1] - t[0]) / NS_PER_S, "cameras": list(context.plan.cameras),
         "truth": context.truth.name if context.truth is not None else None, "max_range_m": context.scope.max_range_m,
         "categories": None if context.scope.categories is None else list(context.scope.categories),
-        "config": config.to_dict(), "notes": list(result.notes), "panels": [_panel_document(p) for p in result.panels],
+        "config": config.to_dict(), "notes": list(result.notes), "panels": panels,
     }  # fmt: skip
     check(out, "bench-1", ScenarioError)
     return out
-
-
-def _panel_document(panel: Panel) -> dict[str, Any]:
-    recommendation = panel.recommendation
-    return {
-        "stage": panel.stage,
-        "error": {"figure": panel.error, "label": panel.label, "unit": panel.unit},
-        "points": [
-            {
-                "setting": p.setting, "present": p.present, "on_front": on_front, "ms_per_tick": round(p.ms_per_tick, 4),
-                "error": rounded_tree(p.error), "error_interval": _interval(p), "figures": rounded_tree(p.figures),
-            }
-            for p, on_front in zip(panel.points, panel.on_front, strict=True)
-        ],
-        "supports": {
-            "setting": recommendation.supported, "present": recommendation.present,
-            "agrees": None if recommendation.supported is None else recommendation.agrees,
-            "reason": recommendation.reason,
-        },
-    }  # fmt: skip
 
 
 def _interval(point: settings.Point) -> list[float] | None:

@@ -72,6 +72,12 @@ def detect_once(
     Returns recorded detections by the same names, and the seconds of decoding. Raises `LogError` when no frame of a
     camera can be read.
     """
+
+    def decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+        if image is None:
+            raise RecordError("a detector needs the image, but all were expected to need none, and none was decoded")
+        return image
+
     recorded = {key: RecordedDetections(d.name, d.default_min_score) for key, d in detectors.items()}
     records, decoding_s = RecordSource(log), 0.0
     for tick in range(len(schedule)):
@@ -83,7 +89,7 @@ def detect_once(
             decoding_s += time.perf_counter() - begin
             if decode and image is None:
                 continue
-            frame = Frame(log.cameras[camera], int(log.streams[camera].t_ns[index[tick]]), partial(_decoded, image))
+            frame = Frame(log.cameras[camera], int(log.streams[camera].t_ns[index[tick]]), partial(decoded, image))
             for key, detector in detectors.items():
                 begin = time.perf_counter()
                 recorded[key].found[camera, frame.t_ns] = detector.detect(frame)
@@ -93,18 +99,11 @@ def detect_once(
     return recorded, decoding_s
 
 
-def _decoded(image: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-    if image is None:
-        raise RecordError("a detector needs the image, but all were expected to need none, and none was decoded")
-    return image
-
-
 REPEATS = 3  # repetitions of short stages, taking turns; the least time counts, since other processes only add to it
 MEASURE_REPEATS = 2  # repetitions of the measurement, which takes longer
 
 
 Progress = Callable[[str, int, int], None]
-Figures = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,21 +268,17 @@ def homography_points(context: BenchContext, observations: Observations, report:
     out = []
     for setting in settings:
         score = score_homographies(context.log, holdout, fits[setting.name])
-        ms = context.ms_per_tick(min(spent[setting.name]))
-        out.append(score.point(setting.name, setting.present, ms, "error_m", **fit_figures(fits[setting.name])))
+        ms, grounds = context.ms_per_tick(min(spent[setting.name])), list(fits[setting.name].values())
+        jitters = [v for v in (g.fit.jitter_m for g in grounds) if np.isfinite(v)]
+        residuals = [v for v in (g.fit.error_m for g in grounds) if np.isfinite(v)]
+        figures = {
+            "jitter_m": float(np.mean(jitters)) if jitters else None,
+            "residual_m": float(np.mean(residuals)) if residuals else None,
+            "cameras": len(grounds),
+            "cameras_by_calibration": sum(bool(g.refusal) for g in grounds),
+        }
+        out.append(score.point(setting.name, setting.present, ms, "error_m", **figures))
     return out
-
-
-def fit_figures(grounds: Mapping[str, CameraHomography]) -> Figures:
-    """Summarize the fits: jitter and residual, means over cameras, and how many cameras fell back to the calibration."""
-    jitters = [v for v in (g.fit.jitter_m for g in grounds.values()) if np.isfinite(v)]
-    residuals = [g.fit.error_m for g in grounds.values() if np.isfinite(g.fit.error_m)]
-    return {
-        "jitter_m": float(np.mean(jitters)) if jitters else None,
-        "residual_m": float(np.mean(residuals)) if residuals else None,
-        "cameras": len(grounds),
-        "cameras_by_calibration": sum(bool(g.refusal) for g in grounds.values()),
-    }
 
 
 STAGE = "ends"

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, Agent, Log, Measurements, Scenario
+from log2sim.datatypes import GROUP_OF, Log, Measurements, Scenario
 from log2sim.errors import ConfigError
 from log2sim.evaluation.bench.settings import ErrorSums, Point, error_of
-from log2sim.evaluation.metrics.comparison import StateTable, truth_states
+from log2sim.evaluation.metrics.comparison import truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, line_stamps_ns, project_boxes
 from log2sim.perception.first_pass import Observations, base_poses
@@ -77,41 +77,31 @@ def score_scenario(scenario: Scenario, truth: Scenario | None, tick_s: float, sc
     """
     known = [a.quality.get("smoothing_residual_rms_m") for a in scenario.others]
     values = [v for v in known if v is not None]
+    counted = [a for a in scenario.others if "detections" in a.quality] if tick_s > 0 else []
+    ticks = sum((a.waypoints.t_s[-1] - a.waypoints.t_s[0]) / tick_s + 1 for a in counted)
+    found_share = sum(a.quality["detections"] for a in counted) / ticks if counted else None
     out: dict[str, Any] = {
         "agents": len(scenario.others),
         "jitter_m": jitter(scenario, tick_s),
-        "gap_share": _gap_share(scenario, tick_s),
+        "gap_share": None if found_share is None else float(np.clip(1 - found_share, 0.0, 1.0)),
         "smoothing_residual_m": (float(np.median(values)) if values else None),
     }
     if truth is None:
         return Score(out)
     found = evaluate(scenario, truth, max_range_m=scope.max_range_m, categories=scope.categories)
-    parts = {"error_m": _error_parts(found), "state_error_m": _state_parts(found)}
-    out |= {key: found[key] for key in EVALUATE_KEYS} | {key: error_of(p) for key, p in parts.items()}
-    return Score(out, parts)
-
-
-def _error_parts(found: Mapping[str, Any]) -> ErrorSums:
-    """Compute the contribution of each object to `error_m`.
-
-    GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of objects so that it is a distance:
-    0 for a perfect result, the cutoff for one without a match.
-    """
-    parts = {}
+    # What each object contributes. The error is GOSPA (Rahmathullah et al., 2017) with p = 2 and alpha = 2, divided by the number of
+    # objects so that it is a distance: 0 for a perfect result, the cutoff for one without a match.
+    errors, states = dict[str, tuple[float, float]](), dict[str, tuple[float, float]]()
     for row in found["agents"]:
         n, lost = row["matched"], (row["ticks"] - row["matched"]) / 2
-        parts[row["id"]] = n * (row["position_rmse_m"] or 0.0) ** 2 + CUTOFF_M**2 * lost, n + lost
+        errors[row["id"]] = n * (row["position_rmse_m"] or 0.0) ** 2 + CUTOFF_M**2 * lost, n + lost
+        if n:
+            states[row["id"]] = n * (row["position_rmse_m"] ** 2 + (HORIZON_S * row["speed_rmse_mps"]) ** 2), n
     for row in found["false_agents"]:
-        parts[f"false {row['id']}"] = CUTOFF_M**2 * row["false_ticks"] / 2, row["false_ticks"] / 2
-    return parts
-
-
-def _state_parts(found: Mapping[str, Any]) -> ErrorSums:
-    parts = {}
-    for row in found["agents"]:
-        if n := row["matched"]:
-            parts[row["id"]] = n * (row["position_rmse_m"] ** 2 + (HORIZON_S * row["speed_rmse_mps"]) ** 2), n
-    return parts
+        errors[f"false {row['id']}"] = CUTOFF_M**2 * row["false_ticks"] / 2, row["false_ticks"] / 2
+    parts: dict[str, ErrorSums] = {"error_m": errors, "state_error_m": states}
+    out |= {key: found[key] for key in EVALUATE_KEYS} | {key: error_of(p) for key, p in parts.items()}
+    return Score(out, parts)
 
 
 def jitter(scenario: Scenario, tick_s: float) -> float | None:
@@ -122,30 +112,17 @@ def jitter(scenario: Scenario, tick_s: float) -> float | None:
     """
     if tick_s <= 0:
         return None
-    values = [_third_differences(a, tick_s) for a in scenario.others if not a.static and len(a.waypoints) > 1]
-    known = [v for v in values if v is not None]
-    return float(np.median(known)) if known else None
-
-
-def _third_differences(agent: Agent, tick_s: float) -> float | None:
     from scipy.interpolate import CubicHermiteSpline
 
-    w = agent.waypoints
-    ticks = round((w.t_s[-1] - w.t_s[0]) / tick_s) + 1
-    if ticks < 5:
-        return None
-    xy = np.column_stack([w.x_m, w.y_m])
-    velocity = w.speed_mps[:, None] * np.column_stack([np.cos(w.yaw_rad), np.sin(w.yaw_rad)])
-    at = CubicHermiteSpline(w.t_s, xy, velocity)(np.linspace(w.t_s[0], w.t_s[-1], ticks))
-    return float(np.sqrt(np.mean(np.diff(at, n=3, axis=0) ** 2) / 20))
-
-
-def _gap_share(scenario: Scenario, tick_s: float) -> float | None:
-    known = [a for a in scenario.others if "detections" in a.quality]
-    if not known or tick_s <= 0:
-        return None
-    ticks = sum((a.waypoints.t_s[-1] - a.waypoints.t_s[0]) / tick_s + 1 for a in known)
-    return float(np.clip(1 - sum(a.quality["detections"] for a in known) / ticks, 0.0, 1.0))
+    known = []
+    for w in (a.waypoints for a in scenario.others if not a.static and len(a.waypoints) > 1):
+        ticks = round((w.t_s[-1] - w.t_s[0]) / tick_s) + 1
+        if ticks >= 5:
+            xy = np.column_stack([w.x_m, w.y_m])
+            velocity = w.speed_mps[:, None] * np.column_stack([np.cos(w.yaw_rad), np.sin(w.yaw_rad)])
+            at = CubicHermiteSpline(w.t_s, xy, velocity)(np.linspace(w.t_s[0], w.t_s[-1], ticks))
+            known.append(float(np.sqrt(np.mean(np.diff(at, n=3, axis=0) ** 2) / 20)))
+    return float(np.median(known)) if known else None
 
 
 MIN_IOU = 0.5
@@ -189,8 +166,17 @@ def true_positions(
             m = observations.measurements[ticks[k]]
             rows = np.flatnonzero(m.camera == camera)
             if len(rows) and len(table.agents):
-                boxes = _boxes_in_image(log, camera, table, int(k), inverse(map_T_cam[k]))
-                pairs = _matched_agents(m.take(rows), table, boxes)
+                # The truth agents that count at the frame; mutually best IoU within a group of categories.
+                boxes = np.full((len(table.agents), 4), np.nan)
+                there = np.flatnonzero(table.present[:, k] & table.visible[:, k])
+                solids = table.center_m[there, k], table.size_m[there], table.yaw_rad[there, k]
+                boxes[there] = project_boxes(*solids, log.cameras[camera], inverse(map_T_cam[k])).box_px
+                group = np.array([GROUP_OF[str(c)] for c in m.category[rows]])
+                overlap = np.nan_to_num(box_iou(m.box_px[rows], boxes))
+                overlap = np.where(group[:, None] == table.group, overlap, 0.0)
+                best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
+                own = np.arange(len(rows))
+                pairs = np.where((overlap[own, best] >= MIN_IOU) & (back[best] == own), best, -1)
                 later_s = (m.t_ns[rows] - stamps[k]) / NS_PER_S if when == "measured" else np.zeros(len(rows))
                 # A few hundredths of a second at most.
                 yaw, way_m = table.yaw_rad[pairs, k], (table.speed_mps[pairs, k] * later_s)[:, None]
@@ -206,25 +192,6 @@ def lidar_positions(observations: Observations, tick_s: float) -> list[KnownPosi
         KnownPositions(m.center_m[:, :2], np.full(len(m), int(tick * tick_s / BLOCK_S)))
         for tick, m in enumerate(observations.measurements)
     ]
-
-
-def _boxes_in_image(log: Log, camera: str, table: StateTable, k: int, cam_T_map: Array) -> Array:
-    """Project the truth agents that count at a frame: boxes (A, 4), px, NaN for the others."""
-    boxes = np.full((len(table.agents), 4), np.nan)
-    rows = np.flatnonzero(table.present[:, k] & table.visible[:, k])
-    solids = table.center_m[rows, k], table.size_m[rows], table.yaw_rad[rows, k]
-    boxes[rows] = project_boxes(*solids, log.cameras[camera], cam_T_map).box_px
-    return boxes
-
-
-def _matched_agents(m: Measurements, table: StateTable, boxes: Array) -> NDArray[np.intp]:
-    """Find the truth agent (M,) of each measured box, -1 for none: mutually best IoU within a group of categories."""
-    group = np.array([GROUP_OF[str(c)] for c in m.category])
-    overlap = np.nan_to_num(box_iou(m.box_px, boxes))
-    overlap = np.where(group[:, None] == table.group, overlap, 0.0)
-    best, back = overlap.argmax(axis=1), overlap.argmax(axis=0)
-    rows = np.arange(len(m))
-    return np.where((overlap[rows, best] >= MIN_IOU) & (back[best] == rows), best, -1)
 
 
 def score_measurements(observations: Observations, known: Sequence[KnownPositions]) -> Score:
@@ -285,19 +252,15 @@ def split_holdout(
             at_ns = line_stamps_ns(log.cameras[camera], stamp, feet_of_boxes(m.box_px[rows]))
             ego_T_map = inverse(base_poses(log, at_ns))
             holdout[camera].append(foot_points(log.cameras[camera], m.take(rows), ego_T_map, tick))
-            obstacles[camera].append(_drop_positions(m.take(rows), stamp))
+            # As detections in the image of that stamp, without LiDAR evidence.
+            n, nowhere = len(rows), np.full((len(rows), 3), np.nan)
+            obstacles[camera].append(replace(
+                m.take(rows), t_ns=np.full(n, stamp), source=np.full(n, "", dtype="<U16"), center_m=nowhere,
+                covariance=np.full((n, 2, 2), np.nan), cluster=tuple(np.zeros((0, 3)) for _ in range(n)),
+            ))  # fmt: skip
             places[camera].append(KnownPositions(xy[rows], object_id[rows]))
     feet = {name: [_drop_feet(log.cameras[name], parts, obstacles[name])] for name, parts in cameras.items()}
     return Holdout(replace(observations, feet=feet), obstacles, places, holdout)
-
-
-def _drop_positions(m: Measurements, stamp: int) -> Measurements:
-    """Reset the rows to detections in the image of that stamp, without LiDAR evidence."""
-    n = len(m)
-    return replace(
-        m, t_ns=np.full(n, stamp), source=np.full(n, "", dtype="<U16"), center_m=np.full((n, 3), np.nan),
-        covariance=np.full((n, 2, 2), np.nan), cluster=tuple(np.zeros((0, 3)) for _ in range(n)),
-    )  # fmt: skip
 
 
 def _drop_feet(camera: Camera, parts: Sequence[Correspondences], obstacles: Sequence[Measurements]) -> Correspondences:

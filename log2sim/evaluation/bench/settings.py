@@ -25,6 +25,11 @@ MIN_OBJECTS = 5
 INTERVAL = (0.05, 0.95)
 
 
+def _resamples(count: int) -> NDArray[np.int64]:
+    # How often each of some objects is in each resample (`RESAMPLES`, count).
+    return np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
+
+
 def error_of(sums: ErrorSums) -> float | None:
     """Compute the root mean square error, m, of all objects; None without any."""
     squares, count = (sum(column) for column in zip(*sums.values())) if sums else (0.0, 0.0)
@@ -35,15 +40,10 @@ def error_interval(sums: ErrorSums) -> tuple[float, float] | None:
     """Compute the quantiles `INTERVAL` of an error, m, over resamples of its objects; None with fewer than `MIN_OBJECTS`."""
     if len(sums) < MIN_OBJECTS:
         return None
-    drawn = _drawn(len(sums)) @ np.array([sums[name] for name in sorted(sums)])
+    drawn = _resamples(len(sums)) @ np.array([sums[name] for name in sorted(sums)])
     drawn = drawn[drawn[:, 1] > 0]
     low, high = np.sqrt(np.quantile(drawn[:, 0] / drawn[:, 1], INTERVAL))
     return float(low), float(high)
-
-
-def _drawn(count: int) -> NDArray[np.int64]:
-    """Draw how often each of some objects is in each resample (`RESAMPLES`, count)."""
-    return np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
 
 
 def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) -> float:
@@ -58,7 +58,7 @@ def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) ->
     if len(names) < MIN_OBJECTS:
         return 0.0
     mine, theirs = (np.array([side.get(n, (0.0, 0.0)) for n in names]).reshape(-1, 2) for side in (sums, other))
-    drawn = _drawn(len(names))
+    drawn = _resamples(len(names))
     a, b = drawn @ mine, drawn @ theirs
     usable = (a[:, 1] > 0) & (b[:, 1] > 0)
     if not usable.any():
@@ -182,11 +182,12 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
                 f"bench: compares detectors in images, and '{name}' searches LiDAR sweeps; see log2sim detect"
             )
     out: list[Setting] = []
-    for name in names:
+    stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]
+    for name, stem in zip(names, stems):
         own = config
         if name != config.detect.name:
             own = config.changed(detect={"name": name, "layout": "", "input_px": 0})
-        label = f"{_short(name, names)} " if len(names) > 1 else ""
+        label = f"{stem if stems.count(stem) == 1 else name} " if len(names) > 1 else ""
         detector = create_image_detector(log, own)
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
@@ -194,13 +195,6 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
         for title, key, value in _inputs(log, own, detector):
             out.append(Setting("detect", f"{label}{title}", own.changed(detect={key: value}), not out))
     return out
-
-
-def _short(name: str, names: Sequence[str]) -> str:
-    """Shorten a detector's name to its stem unless another one has the same."""
-    stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]
-    stem = stems[list(names).index(name)]
-    return stem if stems.count(stem) == 1 else name
 
 
 def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, str, int]]:
@@ -293,7 +287,13 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
         return Recommendation(None, present.setting, NO_ERROR)
     if not others:
         return Recommendation(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
-    better = [p for p in others if p.covers_as_many_as(present) and _gains(p, present, whole_ms)]
+    # Those with less error than the present one, or about the same in clearly less time.
+    better = []
+    for p in others:
+        error, cheaper = p.error or 0.0, present.ms_per_tick - p.ms_per_tick > TIME_TOLERANCE * whole_ms
+        less = error < present.error * (1 - ERROR_TOLERANCE)
+        same = error <= present.error * (1 + ERROR_TOLERANCE)
+        better += [p] if p.covers_as_many_as(present) and (less or (cheaper and same)) else []
     sure = [p for p in better if _confidence(p, present) >= MIN_CONFIDENCE]
     if sure:
         chosen = _fastest_of_best(sure)
@@ -307,13 +307,6 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
     else:
         reason += f"next is {best.setting}: {_figures(best, unit)}"
     return Recommendation(present.setting, present.setting, reason)
-
-
-def _gains(point: Point, present: Point, whole_ms: float) -> bool:
-    """Tell whether a setting has less error than the present one, or about the same in clearly less time."""
-    error, known = point.error or 0.0, present.error or 0.0
-    cheaper = present.ms_per_tick - point.ms_per_tick > TIME_TOLERANCE * whole_ms
-    return error < known * (1 - ERROR_TOLERANCE) or (cheaper and error <= known * (1 + ERROR_TOLERANCE))
 
 
 def _confidence(point: Point, present: Point) -> float:

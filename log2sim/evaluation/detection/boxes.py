@@ -125,8 +125,22 @@ class DetectedBoxes:
         """Write the file under a temporary name and rename it."""
         document: dict[str, Any] = {"format": FORMAT, "version": VERSION, "log": self.log, "detector": self.detector}
         document |= {"poses": dict(self.poses)} if self.poses else {}
-        stamped = zip(self.t_ns.tolist(), self.boxes, strict=True)
-        write_json(path, {**document, "frames": [{"t_ns": t, "boxes": _to_rows(found)} for t, found in stamped]})
+        frames = []
+        for t_ns, b in zip(self.t_ns.tolist(), self.boxes, strict=True):
+            rows = [
+                {
+                    "center_m": [rounded(v, DIGITS) for v in b.center_m[k]],
+                    "size_m": [rounded(v, DIGITS) for v in b.size_m[k]],
+                    "yaw_rad": rounded(b.yaw_rad[k], DIGITS),
+                    "heading_score": rounded(b.heading_score[k], DIGITS),
+                    "category": str(b.category[k]),
+                    "score": rounded(b.score[k], DIGITS),
+                    "points": int(b.points[k]),
+                }
+                for k in range(len(b))
+            ]
+            frames.append({"t_ns": t_ns, "boxes": rows})
+        write_json(path, {**document, "frames": frames})
 
     @classmethod
     def load(cls, path: Path | str) -> DetectedBoxes:
@@ -147,7 +161,21 @@ class DetectedBoxes:
 
         Raises `LogError`: as for `load`.
         """
-        _check(document)
+        if not is_boxes_document(document):
+            raise LogError(f"not a boxes file: expected format '{FORMAT}', as `log2sim detect` writes it")
+        # The boxes are validated column by column: item by item, a long log takes minutes. What that refuses the full check words.
+        box: dict[str, Any] = load_schema("boxes-1")["$defs"]["box"]
+        try:
+            listed = all(type(frame["boxes"]) is list for frame in document["frames"])
+            rows = [row for frame in document["frames"] for row in frame["boxes"]] if listed else []
+            valid = listed and all(row.keys() == box["properties"].keys() for row in rows)
+            valid = valid and all(_column_is_valid([row[k] for row in rows], v) for k, v in box["properties"].items())
+        except (AttributeError, KeyError, TypeError):
+            valid = False
+        without = (
+            {**document, "frames": [{**frame, "boxes": []} for frame in document["frames"]]} if valid else document
+        )
+        check(without, "boxes-1", LogError)
         frames = document["frames"]
         try:
             t_ns = np.array([f["t_ns"] for f in frames], dtype=np.int64)
@@ -167,31 +195,6 @@ def is_boxes_document(document: Any) -> bool:
     return isinstance(document, dict) and document.get("format") == FORMAT
 
 
-def _check(document: Any) -> None:
-    """Validate a document, its boxes column by column: item by item, a long log takes minutes."""
-    if not is_boxes_document(document):
-        raise LogError(f"not a boxes file: expected format '{FORMAT}', as `log2sim detect` writes it")
-    if not _boxes_are_valid(document.get("frames")):
-        check(document, "boxes-1", LogError)
-        return
-    frames = [{**frame, "boxes": []} for frame in document["frames"]]
-    check({**document, "frames": frames}, "boxes-1", LogError)
-
-
-def _boxes_are_valid(frames: Any) -> bool:
-    """Whether all boxes match the schema; False also where only the full check can tell."""
-    box: dict[str, Any] = load_schema("boxes-1")["$defs"]["box"]
-    try:
-        if any(type(frame["boxes"]) is not list for frame in frames):
-            return False
-        rows = [row for frame in frames for row in frame["boxes"]]
-        if any(row.keys() != box["properties"].keys() for row in rows):
-            return False
-        return all(_column_is_valid([row[k] for row in rows], v) for k, v in box["properties"].items())
-    except (AttributeError, KeyError, TypeError):
-        return False
-
-
 def _column_is_valid(values: list[Any], expected: dict[str, Any]) -> bool:
     if "enum" in expected:
         return set(values) <= set(expected["enum"])
@@ -204,21 +207,6 @@ def _column_is_valid(values: list[Any], expected: dict[str, Any]) -> bool:
     types = {int} if expected["type"] == "integer" else {int, float}
     low, above = expected.get("minimum", -math.inf), expected.get("exclusiveMinimum", -math.inf)
     return set(map(type, values)) <= types and above < min(values) >= low and max(values) <= expected["maximum"]
-
-
-def _to_rows(boxes: Boxes3D) -> list[dict[str, Any]]:
-    return [
-        {
-            "center_m": [rounded(v, DIGITS) for v in boxes.center_m[k]],
-            "size_m": [rounded(v, DIGITS) for v in boxes.size_m[k]],
-            "yaw_rad": rounded(boxes.yaw_rad[k], DIGITS),
-            "heading_score": rounded(boxes.heading_score[k], DIGITS),
-            "category": str(boxes.category[k]),
-            "score": rounded(boxes.score[k], DIGITS),
-            "points": int(boxes.points[k]),
-        }
-        for k in range(len(boxes))
-    ]
 
 
 def _from_rows(rows: list[dict[str, Any]], t_ns: int) -> Boxes3D:

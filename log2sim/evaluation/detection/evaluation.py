@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,16 +16,14 @@ from log2sim.evaluation.detection.protocols import (
     DIFFICULTIES,
     MIN_POINTS,
     PROTOCOLS,
-    BoxPairs,
     Criterion,
     Matches,
     ObjectClass,
-    Protocol,
     assign_boxes,
     candidate_pairs,
     match_detections,
 )
-from log2sim.evaluation.detection.truth import ImageViews, SweepTruth, image_views, truth_of_sweeps
+from log2sim.evaluation.detection.truth import ImageViews, image_views, truth_of_sweeps
 from log2sim.evaluation.metrics.comparison import MIN_REGION_SHARE
 from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.evaluation.metrics.table import columns_text, percent, verdict_text
@@ -190,114 +188,66 @@ class BothBoxes:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Objects:
-    """Some objects of a class, such as those of one difficulty: the same rows, of which others are ignored."""
-
-    name: str
-    boxes: BothBoxes
-    found: SceneBoxes
-    truth: SceneBoxes
-    # (M,) found boxes that are not false where they match nothing, since they are out of range or of other objects.
-    elsewhere: Mask
-
-    def matches(self, pairs: BoxPairs, criterion: Criterion) -> Matches:
-        """Match them; boxes where nothing was labeled are not false."""
-        found = assign_boxes(self.found, self.truth, pairs, criterion)
-        return found.excusing(self.elsewhere).excusing(self.boxes.region_share > self.boxes.max_region_share)
-
-
 def class_figures(boxes: BothBoxes, of_class: ObjectClass, min_score: float) -> dict[str, Any]:
     """Compute all figures of a class.
 
     `of_class`: the first of its criteria is that of the tables by range and by points. `min_score`: score from which
     boxes are reported, for precision and recall.
+
+    Of all objects and of parts of them, such as those of one difficulty, the others are ignored, and a found box that matches
+    nothing is false in its own part: its range, or its number of points where that was counted. KITTI's difficulties count
+    objects with any number of points, the rest those with enough.
     """
-    pairs = {c: candidate_pairs(boxes.found, boxes.truth, c) for c in of_class.criteria}
-    everything, main = all_objects(boxes), of_class.criteria[0]
+    found, truth, far, main = boxes.found, boxes.truth, boxes.far, of_class.criteria[0]
+    pairs = {c: candidate_pairs(found, truth, c) for c in of_class.criteria}
+    unlabeled = boxes.region_share > boxes.max_region_share  # found where nothing was labeled: not false
+    enough = truth if truth.points is None else truth.ignoring(truth.points < MIN_POINTS)
 
-    def rows(some: Iterator[Objects], *criteria: Criterion) -> list[dict[str, Any]]:
-        return [figures(o, pairs[c], c, min_score) for o in some for c in criteria]
+    def figures(name: str, mine: SceneBoxes, true: SceneBoxes, elsewhere: Mask, criterion: Criterion) -> dict[str, Any]:
+        # By KITTI's published program what is found in regions without labels is false, too: it compares 3D boxes of these
+        # regions, which do not exist.
+        matched = assign_boxes(mine, true, pairs[criterion], criterion).excusing(elsewhere)
+        matches = matched.excusing(unlabeled)
+        curve, published = precision_recall(mine, matches), precision_recall(mine, matched)
+        rows = np.flatnonzero(matches.right & (mine.score >= min_score))
+        turned = wrap_angle(mine.box[rows, 6] - true.box[matches.truth[rows], 6])
+        views = boxes.found_views is not None
+        of_program = {f"ap_r{n}_published": published.sampled_average(n) for n in (40, 11)} if views else {}
+        return {
+            "objects": name, "match": asdict(criterion), "truths": matches.truths, "ap_r40": curve.average(40),
+            "ap_r11": curve.average(11),
+            "ap_nuscenes": curve.nuscenes_average() if criterion.measure == "center_m" else None,
+            **of_program, **operating_point(mine, matches, min_score),
+            "heading_over_90_deg": float((np.abs(turned) > np.pi / 2).mean()) if len(rows) else None,
+        }  # fmt: skip
 
-    matches = everything.matches(pairs[main], main)
+    rows = [figures("all", found, enough, far, c) for c in of_class.criteria]
+    if boxes.found_views is not None and boxes.truth_views is not None:
+        for level in DIFFICULTIES:
+            true = truth.ignoring(level.ignores_truth(boxes.truth_views, boxes.occlusion))
+            mine = found.ignoring(level.ignores_found(boxes.found_views))
+            rows += [figures(level.name, mine, true, far, c) for c in of_class.criteria]
+    by_range, by_points = [], []
+    for low, high in RANGES_M:
+        beyond, elsewhere = ((b.range_m < low) | (b.range_m >= high) for b in (truth, found))
+        name = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g}+ m"
+        by_range.append(figures(name, found, enough.ignoring(beyond), far | elsewhere, main))
+    for low, high in POINTS if truth.points is not None else ():
+        assert truth.points is not None
+        outside = (truth.points < low) | (truth.points > high)
+        own = found.points
+        elsewhere = np.zeros(len(found), dtype=bool) if own is None else (own < low) | (own > high)
+        name = f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points"
+        by_points.append(figures(name, found, truth.ignoring(outside), far | elsewhere, main))
+    matches = assign_boxes(found, enough, pairs[main], main).excusing(far).excusing(unlabeled)
     return {
         "categories": list(of_class.categories),
         "ignored_kinds": list(of_class.ignored_kinds),
-        "figures": rows(iter((everything, *difficulties(boxes))), *of_class.criteria),
-        "by_range": rows(by_range(boxes), main),
-        "by_points": None if boxes.truth.points is None else rows(by_points(boxes), main),
-        "calibration": {"match": match_entry(main), **calibration(everything.found, matches)},
+        "figures": rows,
+        "by_range": by_range,
+        "by_points": None if truth.points is None else by_points,
+        "calibration": {"match": asdict(main), **calibration(found, matches)},
     }
-
-
-def all_objects(boxes: BothBoxes) -> Objects:
-    """Select all objects with enough points."""
-    few = np.zeros(len(boxes.truth), dtype=bool) if boxes.truth.points is None else boxes.truth.points < MIN_POINTS
-    return Objects("all", boxes, boxes.found, boxes.truth.ignoring(few), boxes.far)
-
-
-def difficulties(boxes: BothBoxes) -> Iterator[Objects]:
-    """Select the objects of each of KITTI's difficulties, whatever their number of points; none without views."""
-    if boxes.found_views is None or boxes.truth_views is None:
-        return
-    for level in DIFFICULTIES:
-        truth = boxes.truth.ignoring(level.ignores_truth(boxes.truth_views, boxes.occlusion))
-        found = boxes.found.ignoring(level.ignores_found(boxes.found_views))
-        yield Objects(level.name, boxes, found, truth, boxes.far)
-
-
-def by_range(boxes: BothBoxes) -> Iterator[Objects]:
-    """Select the objects of each range; a found box that matches nothing is false in its own range."""
-    enough = all_objects(boxes).truth
-    for low, high in RANGES_M:
-        beyond, elsewhere = (((b.range_m < low) | (b.range_m >= high)) for b in (boxes.truth, boxes.found))
-        name = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g}+ m"
-        yield Objects(name, boxes, boxes.found, enough.ignoring(beyond), boxes.far | elsewhere)
-
-
-def by_points(boxes: BothBoxes) -> Iterator[Objects]:
-    """Select the objects of each number of points; a found box that matches nothing is false where its own points are.
-
-    Found boxes whose points were not counted are false everywhere.
-    """
-    assert boxes.truth.points is not None
-    for low, high in POINTS:
-        outside = (boxes.truth.points < low) | (boxes.truth.points > high)
-        own = boxes.found.points
-        elsewhere = np.zeros(len(boxes.found), dtype=bool) if own is None else (own < low) | (own > high)
-        name = f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points"
-        yield Objects(name, boxes, boxes.found, boxes.truth.ignoring(outside), boxes.far | elsewhere)
-
-
-def figures(objects: Objects, pairs: BoxPairs, criterion: Criterion, min_score: float) -> dict[str, Any]:
-    """Compute average precision, the figures at a score, and the share of right boxes there that are off by more than 90 degrees."""
-    matches = objects.matches(pairs, criterion)
-    curve = precision_recall(objects.found, matches)
-    rows = np.flatnonzero(matches.right & (objects.found.score >= min_score))
-    turned = wrap_angle(objects.found.box[rows, 6] - objects.truth.box[matches.truth[rows], 6])
-    return {
-        "objects": objects.name, "match": match_entry(criterion), "truths": matches.truths, "ap_r40": curve.average(40),
-        "ap_r11": curve.average(11),
-        "ap_nuscenes": curve.nuscenes_average() if criterion.measure == "center_m" else None,
-        **(published(objects, pairs, criterion) if objects.boxes.found_views is not None else {}),
-        **operating_point(objects.found, matches, min_score),
-        "heading_over_90_deg": float((np.abs(turned) > np.pi / 2).mean()) if len(rows) else None,
-    }  # fmt: skip
-
-
-def published(objects: Objects, pairs: BoxPairs, criterion: Criterion) -> dict[str, Any]:
-    """Compute average precision as KITTI's published program does: sampled, and false in regions without labels too.
-
-    The program compares the 3D boxes of these regions, which do not exist, so that its figures for 3D boxes lack the rule.
-    """
-    found = assign_boxes(objects.found, objects.truth, pairs, criterion).excusing(objects.elsewhere)
-    curve = precision_recall(objects.found, found)
-    return {"ap_r40_published": curve.sampled_average(40), "ap_r11_published": curve.sampled_average(11)}
-
-
-def match_entry(criterion: Criterion) -> dict[str, Any]:
-    """Return a criterion as a document."""
-    return {"measure": criterion.measure, "limit": criterion.limit}
 
 
 def overall(classes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -347,7 +297,17 @@ def format_verdict(result: Mapping[str, Any]) -> str:
         turned = row["heading_over_90_deg"]
         backwards = f", {percent(turned)} backwards" if turned else ""
         lines.append((name, f"{text}{average}{backwards} ({limit})"))
-    return verdict_text([*lines, ("scope", _scope(result))])
+    sweeps, skipped = result["sweeps"], result["sweeps_without_labels"]
+    left_out = f" ({skipped} without labels left out)" if skipped else ""
+    parts = [f"{sweeps} labeled sweep{'s' * (sweeps != 1)}{left_out}"]
+    if result["reference_camera"] is not None:
+        parts.append(f"boxes that {result['reference_camera']} shows")
+        if not result["occlusion_known"]:
+            parts.append("difficulties without occlusion, which the labels do not state")
+    if result["max_range_m"] is not None:
+        parts.append(f"up to {result['max_range_m']:g} m")
+    scores = f"precision, recall and what follows at scores from {result['min_score']:g}"
+    return verdict_text([*lines, ("scope", f"{'; '.join(parts)}; {scores}")])
 
 
 def format_table(result: Mapping[str, Any]) -> str:
@@ -391,20 +351,6 @@ def _rows(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
         # Only false boxes, which one match tells as well as all.
         return [row for row in everything[:1] if row["false_positives"]]
     return [*everything, *(row for row in parts if row["truths"])]
-
-
-def _scope(result: Mapping[str, Any]) -> str:
-    sweeps, skipped = result["sweeps"], result["sweeps_without_labels"]
-    parts = [
-        f"{sweeps} labeled sweep{'s' * (sweeps != 1)}" + (f" ({skipped} without labels left out)" if skipped else "")
-    ]
-    if result["reference_camera"] is not None:
-        parts.append(f"boxes that {result['reference_camera']} shows")
-        if not result["occlusion_known"]:
-            parts.append("difficulties without occlusion, which the labels do not state")
-    if result["max_range_m"] is not None:
-        parts.append(f"up to {result['max_range_m']:g} m")
-    return f"{'; '.join(parts)}; precision, recall and what follows at scores from {result['min_score']:g}"
 
 
 VERSION = 1
@@ -458,7 +404,16 @@ def evaluate_boxes(
     protocol, classes = PROTOCOLS[options.protocol], options.chosen()
     if len(detected.t_ns) == 0:
         raise LogError(f"the boxes of '{detected.log}' are of no sweep at all; detect them in a log with LiDAR sweeps")
-    camera = _reference_camera(log, protocol)
+    camera = None
+    if protocol.of_camera:  # the difficulties are those in a camera whose objects are labeled
+        labeled = log.labels.cameras if log.labels is not None else None
+        names = [*(labeled or ()), *([log.reference_camera] if log.reference_camera else []), *log.cameras]
+        camera = next((name for name in names if name in log.cameras), None)
+        if camera is None:
+            raise ConfigError(
+                f"--protocol {protocol.name}: its difficulties need a camera, and log '{log.name}' has none; "
+                "choose dair or center"
+            )
     truth = truth_of_sweeps(log, detected.t_ns, progress=progress)
     # Collect the found boxes of the labeled sweeps; their scenes are indices of sweeps.
     tables = []
@@ -469,8 +424,23 @@ def evaluate_boxes(
         tables.append(SceneBoxes.of(box, b.category, b.score, points=b.points, range_m=away))
     joined = SceneBoxes.join(tables)
     found = replace(joined, scene=np.flatnonzero(truth.labeled)[joined.scene])
-    boxes = _project(log, detected.t_ns, found, truth, camera, options)
-    figures = {c.name: class_figures(_class_boxes(boxes, c), c, options.min_score) for c in classes}
+    # With a reference camera, only what it shows is kept.
+    limit_m = np.inf if options.max_range_m is None else options.max_range_m
+    far, true = found.range_m > limit_m, truth.boxes.ignoring(truth.boxes.range_m > limit_m)
+    if camera is None:
+        boxes = BothBoxes(found, true, far, _unlabeled(log, detected.t_ns, found), truth.kind, truth.occlusion)
+    else:
+        views = image_views(log, camera, detected.t_ns, found)
+        true_views = image_views(log, camera, detected.t_ns, true, truncation=True)
+        boxes = BothBoxes(found, true, far, views.region_share, truth.kind, truth.occlusion, views, true_views)
+        boxes = boxes.take(views.shown, true_views.shown)
+    figures = {}
+    for c in classes:
+        own = boxes.take(*(np.isin(b.category, c.categories) for b in (boxes.found, boxes.truth)))
+        # By KITTI's rule, as much of a box may lie in regions without labels as boxes have to overlap.
+        limit = MIN_REGION_SHARE if own.found_views is None else c.criteria[0].limit
+        own = replace(own, truth=own.truth.ignoring(np.isin(own.kind, c.ignored_kinds)), max_region_share=limit)
+        figures[c.name] = class_figures(own, c, options.min_score)
     return {
         "detection_metrics_version": VERSION, "log": detected.log, "truth": log.name, "detector": detected.detector,
         "protocol": protocol.name, "min_score": options.min_score, "max_range_m": options.max_range_m,
@@ -482,40 +452,6 @@ def evaluate_boxes(
     }  # fmt: skip
 
 
-def _reference_camera(log: Log, protocol: Protocol) -> str | None:
-    """Choose the camera of the difficulties: one whose objects are labeled; None for protocols without difficulties."""
-    if not protocol.of_camera:
-        return None
-    labeled = log.labels.cameras if log.labels is not None else None
-    names = [*(labeled or ()), *([log.reference_camera] if log.reference_camera else []), *log.cameras]
-    found = next((name for name in names if name in log.cameras), None)
-    if found is None:
-        raise ConfigError(
-            f"--protocol {protocol.name}: its difficulties need a camera, and log '{log.name}' has none; "
-            "choose dair or center"
-        )
-    return found
-
-
-def _project(
-    log: Log,
-    t_ns: NDArray[np.int64],
-    found: SceneBoxes,
-    truth: SweepTruth,
-    camera: str | None,
-    options: DetectionOptions,
-) -> BothBoxes:
-    """Project boxes where it is needed; with a reference camera, only what it shows is kept."""
-    limit_m = np.inf if options.max_range_m is None else options.max_range_m
-    far, true = found.range_m > limit_m, truth.boxes.ignoring(truth.boxes.range_m > limit_m)
-    if camera is None:
-        return BothBoxes(found, true, far, _unlabeled(log, t_ns, found), truth.kind, truth.occlusion)
-    views = image_views(log, camera, t_ns, found)
-    true_views = image_views(log, camera, t_ns, true, truncation=True)
-    both = BothBoxes(found, true, far, views.region_share, truth.kind, truth.occlusion, views, true_views)
-    return both.take(views.shown, true_views.shown)
-
-
 def _unlabeled(log: Log, t_ns: NDArray[np.int64], found: SceneBoxes) -> Array:
     """Compute the least share (M,) of each box in regions without labels over cameras; 1 where no labeled one shows it."""
     only = None if log.labels is None else log.labels.cameras
@@ -525,12 +461,3 @@ def _unlabeled(log: Log, t_ns: NDArray[np.int64], found: SceneBoxes) -> Array:
         views = image_views(log, name, t_ns, found)
         share = np.where(views.shown, np.minimum(share, views.region_share), share)
     return np.where(np.isfinite(share), share, 0.0 if only is None else 1.0)
-
-
-def _class_boxes(boxes: BothBoxes, of_class: ObjectClass) -> BothBoxes:
-    """Select the boxes of a class and decide what is ignored."""
-    own = boxes.take(*(np.isin(b.category, of_class.categories) for b in (boxes.found, boxes.truth)))
-    truth = own.truth.ignoring(np.isin(own.kind, of_class.ignored_kinds))
-    # By KITTI's rule, as much of a box may lie in regions without labels as boxes have to overlap.
-    limit = MIN_REGION_SHARE if own.found_views is None else of_class.criteria[0].limit
-    return replace(own, truth=truth, max_region_share=limit)

@@ -135,28 +135,17 @@ def image_views(
         height[rows] = np.where(seen.valid, seen.box_px[:, 3] - seen.box_px[:, 1], 0)
         inside = image_shares(log.cameras[camera], inverse(poses[scene]), *solid) if truncation else 1.0
         outside[rows] = np.where(seen.valid, 1 - inside, 1.0)
-        share[rows] = _region_share(seen.box_px, _regions(log, camera, int(t_ns[scene])))
+        # The regions (R, 4) without labels of the image nearest to the stamp, and the greatest share of a box in one of them.
+        regions = log.ignored_regions.get(camera)
+        lag = np.zeros(0) if regions is None else np.abs(regions.t_ns - t_ns[scene])
+        if regions is not None and len(lag) and lag.min() <= MAX_STAMP_LAG_NS:
+            region_px = regions.box_px[lag == lag.min()]
+            low = np.maximum(seen.box_px[:, None, :2], region_px[None, :, :2])
+            high = np.minimum(seen.box_px[:, None, 2:], region_px[None, :, 2:])
+            shared = np.clip(high - low, 0, None).prod(axis=2).max(axis=1)
+            area = (seen.box_px[:, 2:] - seen.box_px[:, :2]).prod(axis=1)
+            share[rows] = np.divide(shared, area, out=np.zeros_like(area), where=area > 0)
     return ImageViews(shown, height, outside, np.where(shown, share, 0))
-
-
-def _regions(log: Log, camera: str, t_ns: int) -> Array:
-    """Select the regions (R, 4) without labels of the image nearest to a stamp."""
-    regions = log.ignored_regions.get(camera)
-    if regions is None or not len(regions.t_ns):
-        return np.zeros((0, 4))
-    lag = np.abs(regions.t_ns - t_ns)
-    return regions.box_px[lag == lag.min()] if lag.min() <= MAX_STAMP_LAG_NS else np.zeros((0, 4))
-
-
-def _region_share(box_px: Array, region_px: Array) -> Array:
-    """Compute the greatest share (M,) of boxes (M, 4) that one of the regions (R, 4) covers."""
-    if not len(region_px):
-        return np.zeros(len(box_px))
-    low = np.maximum(box_px[:, None, :2], region_px[None, :, :2])
-    high = np.minimum(box_px[:, None, 2:], region_px[None, :, 2:])
-    shared = np.clip(high - low, 0, None).prod(axis=2).max(axis=1)
-    area = (box_px[:, 2:] - box_px[:, :2]).prod(axis=1)
-    return np.asarray(np.divide(shared, area, out=np.zeros_like(area), where=area > 0))
 
 
 MAX_STAMP_ERROR_NS = 1_000_000  # stamps of one sweep differ by rounding at most this much

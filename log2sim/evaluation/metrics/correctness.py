@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -72,48 +71,91 @@ RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
 MAX_WRONG_SHARE = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedAgents:
-    """B reconstructed agents with verdicts at T ticks, with their confidence, doubts and sigma from the scenario."""
-
-    states: StateTable
-    verdicts: Verdicts
-    wrong: Mask  # (B, T)
-    confidence: Array  # (B,)
-    reasons: tuple[tuple[str, ...], ...]  # why the scenario doubts each agent; empty where it does not
-    doubted: Mask  # (B, T) when it does
-    sigma_m: Array  # (B, T) standard deviation of the position for each axis
-    sigma_rad: Array  # (B, T) of the heading; NaN where the scenario states none, as in the next one
-    sigma_mps: Array  # (B, T) of the speed
-
-
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
     """Judge the reconstructed agents and summarize by kind, category and range.
 
     `agents`: the B reconstructed agents of the comparison. `ticks_s` (T,), s. `ego`: one row; without it there are no
     figures by range. Returns the part `correctness` of a document of `schemas/metrics-1.json`.
     """
-    verdicts, ranged = judge_against_truth(c, ego), ego is not None
-    judged = JudgedAgents(
-        states=c.other,
-        verdicts=verdicts,
-        wrong=verdicts.wrong,
-        confidence=np.array([a.confidence for a in agents], dtype=np.float64),
-        reasons=tuple(doubts(a) for a in agents),
-        doubted=np.array([doubted_at(a, ticks_s) for a in agents], dtype=bool).reshape(len(agents), len(ticks_s)),
-        sigma_m=_sigma_at(agents, ticks_s, "sigma_xy_m"),
-        sigma_rad=_sigma_at(agents, ticks_s, "sigma_yaw_rad"),
-        sigma_mps=_sigma_at(agents, ticks_s, "sigma_speed_mps"),
-    )
-    everything = np.ones_like(verdicts.judged)
-    kinds, categories = _present(judged, c.other.group, GROUPS), _present(judged, c.other.category, CATEGORIES)
+    v = judge_against_truth(c, ego)
+    wrong, confidences = v.wrong, np.array([a.confidence for a in agents], dtype=np.float64)
+    doubted = np.array([doubted_at(a, ticks_s) for a in agents], dtype=bool).reshape(len(agents), len(ticks_s))
+    # (B, T) standard deviations, for each axis of positions; NaN where the scenario states none.
+    sigmas = {name: np.full(wrong.shape, np.nan) for name in ("sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps")}
+    for name, out in sigmas.items():
+        for k, agent in enumerate(agents):
+            if (sigma := getattr(agent.waypoints, name)) is not None:
+                out[k] = np.interp(ticks_s, agent.waypoints.t_s, sigma)
+
+    def share(
+        ticks: Mask, mask: Mask
+    ) -> dict[str, Any]:  # of one measure: of the ticks, and the agents that are wrong by it
+        hit = int((ticks & mask).sum())
+        return {"share": _mean(mask[ticks]), "ticks": hit, "agents": int(_wrong_agents(ticks, mask).sum())}
+
+    def figures(selected: Mask) -> dict[str, Any]:
+        ticks = v.judged & selected
+        wrong_agents, doubted_agents = _wrong_agents(ticks, wrong), np.asarray((doubted & ticks).any(axis=1))
+        matched = ticks & (v.matched >= 0)
+        xy, yaw, speed = (sigma[matched] for sigma in sigmas.values())
+        return {
+            "agents": int(ticks.any(axis=1).sum()),
+            "ticks": int(ticks.sum()),
+            "undecided_ticks": int((v.undecided & selected).sum()),
+            "matched_ticks": int(matched.sum()),
+            **{name: share(ticks, mask) for name, mask in v.measures.items()},
+            "wrong": share(ticks, wrong),
+            "doubted": {
+                "wrong_ticks": _mean(doubted[ticks & wrong]),
+                "right_ticks": _mean(doubted[ticks & ~wrong]),
+                "wrong_agents": _mean(doubted_agents[wrong_agents]),
+                "right_agents": _mean(doubted_agents[ticks.any(axis=1) & ~wrong_agents]),
+            },
+            "sigma": normalized_errors(v.error_m[matched], xy),
+            "sigma_yaw": normalized_errors(v.error_rad[matched][:, None], yaw),
+            "sigma_speed": normalized_errors(v.error_mps[matched][:, None], speed),
+        }
+
+    def detailed(selected: Mask) -> dict[str, Any]:  # with calibration, and by range
+        ticks, range_m = v.judged & selected, c.other.range_m
+        judged = ticks.any(axis=1)
+        by_range = {
+            f"{low:g}-{high:g}".removesuffix("inf"): figures(selected & (range_m >= low) & (range_m < high))
+            for low, high in RANGES_M
+        }
+        of_ticks = np.broadcast_to(confidences[:, None], ticks.shape)[ticks]
+        return {
+            **figures(selected),
+            "calibration": {
+                "ticks": reliability(of_ticks, ~wrong[ticks]),
+                "agents": reliability(confidences[judged], ~_wrong_agents(ticks, wrong)[judged]),
+            },
+            "by_range": by_range if ego is not None else None,
+        }
+
+    rows, everything = [], np.ones_like(v.judged)
+    for k in np.flatnonzero(v.judged.any(axis=1)).tolist():
+        ticks, reasons = v.judged[k], doubts(agents[k])
+        there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
+        rows.append({
+            "id": c.other.agents[k].id, "category": str(c.other.category[k]), "ticks": int(ticks.sum()),
+            "wrong_ticks": int((wrong[k] & ticks).sum()),
+            **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
+            "taken_for": {c.truth.agents[i].id if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
+            "confidence": float(confidences[k]), "doubted": bool(reasons), "doubts": list(reasons),
+            "mean_range_m": float(c.other.range_m[k, ticks].mean()),
+        })  # fmt: skip
+    shown = (v.judged | v.undecided).any(axis=1)
+    kinds, categories = (set(column[shown].tolist()) for column in (c.other.group, c.other.category))
     return {
         "rules": correctness_rules(MAX_WRONG_SHARE, MIN_TRUSTED_CONFIDENCE),
-        **_detailed(judged, everything, ranged=ranged),
-        "by_kind": {k: _detailed(judged, over_ticks(c.other.group == k, everything), ranged=ranged) for k in kinds},
-        "by_category": {k: _figures(judged, over_ticks(c.other.category == k, everything)) for k in categories},
-        "confusion": _confusion(judged, c.truth.category),
-        "judged_agents": _agent_rows(judged, c.truth),
+        **detailed(everything),
+        "by_kind": {k: detailed(over_ticks(c.other.group == k, everything)) for k in GROUPS if k in kinds},
+        "by_category": {
+            k: figures(over_ticks(c.other.category == k, everything)) for k in CATEGORIES if k in categories
+        },
+        "confusion": _confusion(v, c.other.category, c.truth.category),
+        "judged_agents": rows,
     }
 
 
@@ -129,76 +171,9 @@ def doubted_at(agent: Agent, t_s: Array) -> Mask:
     return np.asarray(np.any([low, *(doubt.holds(t_s) for doubt in agent.doubts)], axis=0))
 
 
-def _sigma_at(agents: Sequence[Agent], t_s: Array, column: str) -> Array:
-    """Interpolate (B, T) a column of standard deviations at times (T,); NaN for agents without it."""
-    out = np.full((len(agents), len(t_s)), np.nan)
-    for k, agent in enumerate(agents):
-        sigma = getattr(agent.waypoints, column)
-        if sigma is not None:
-            out[k] = np.interp(t_s, agent.waypoints.t_s, sigma)
-    return out
-
-
-def _present(j: JudgedAgents, column: NDArray[np.str_], names: Iterable[str]) -> list[str]:
-    """List those of the names that the selected agents have in a column (B,)."""
-    known = set(column[(j.verdicts.judged | j.verdicts.undecided).any(axis=1)].tolist())
-    return [name for name in names if name in known]
-
-
 def over_ticks(which: Mask, like: Mask) -> Mask:
     """Spread (A,) over the ticks of a mask (A, T)."""
     return np.broadcast_to(which[:, None], like.shape)
-
-
-def _detailed(j: JudgedAgents, selected: Mask, *, ranged: bool) -> dict[str, Any]:
-    """Compute the figures of the selected ticks, their calibration, and the figures by range."""
-    ticks, range_m = j.verdicts.judged & selected, j.states.range_m
-    agents = ticks.any(axis=1)
-    confidence = np.broadcast_to(j.confidence[:, None], ticks.shape)
-    by_range = {
-        f"{low:g}-{high:g}".removesuffix("inf"): _figures(j, selected & (range_m >= low) & (range_m < high))
-        for low, high in RANGES_M
-    }
-    return {
-        **_figures(j, selected),
-        "calibration": {
-            "ticks": reliability(confidence[ticks], ~j.wrong[ticks]),
-            "agents": reliability(j.confidence[agents], ~_wrong_agents(ticks, j.wrong)[agents]),
-        },
-        "by_range": by_range if ranged else None,
-    }
-
-
-def _figures(j: JudgedAgents, selected: Mask) -> dict[str, Any]:
-    """Count the selected judged ticks and their agents, and the wrong and doubted ones among them."""
-    v, ticks = j.verdicts, j.verdicts.judged & selected
-    wrong_agents = _wrong_agents(ticks, j.wrong)
-    right_agents = ticks.any(axis=1) & ~wrong_agents
-    doubted: Mask = np.asarray((j.doubted & ticks).any(axis=1))
-    matched = ticks & (v.matched >= 0)
-    return {
-        "agents": int(ticks.any(axis=1).sum()),
-        "ticks": int(ticks.sum()),
-        "undecided_ticks": int((v.undecided & selected).sum()),
-        "matched_ticks": int(matched.sum()),
-        **{name: _share(ticks, mask) for name, mask in v.measures.items()},
-        "wrong": _share(ticks, j.wrong),
-        "doubted": {
-            "wrong_ticks": _mean(j.doubted[ticks & j.wrong]),
-            "right_ticks": _mean(j.doubted[ticks & ~j.wrong]),
-            "wrong_agents": _mean(doubted[wrong_agents]),
-            "right_agents": _mean(doubted[right_agents]),
-        },
-        "sigma": normalized_errors(v.error_m[matched], j.sigma_m[matched]),
-        "sigma_yaw": normalized_errors(v.error_rad[matched][:, None], j.sigma_rad[matched]),
-        "sigma_speed": normalized_errors(v.error_mps[matched][:, None], j.sigma_mps[matched]),
-    }
-
-
-def _share(ticks: Mask, mask: Mask) -> dict[str, Any]:
-    """Summarize one measure: its share of the ticks, its ticks, and the agents that are wrong by it."""
-    hit = ticks & mask
-    return {"share": _mean(mask[ticks]), "ticks": int(hit.sum()), "agents": int(_wrong_agents(ticks, mask).sum())}
 
 
 def _wrong_agents(ticks: Mask, mask: Mask) -> Mask:
@@ -210,16 +185,16 @@ def _mean(values: Mask) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _confusion(j: JudgedAgents, true_category: NDArray[np.str_]) -> dict[str, Any]:
+def _confusion(v: Verdicts, category: NDArray[np.str_], true_category: NDArray[np.str_]) -> dict[str, Any]:
     """Count, by category of the agent and of what is there, judged ticks, and agents by what is there most of the time."""
     names = np.array([*CATEGORIES, "nothing"])
     place = {str(name): k for k, name in enumerate(names)}
     true_place = np.array([*(place[str(c)] for c in true_category), len(CATEGORIES)], dtype=np.int64)
-    ours = np.array([place[str(c)] for c in j.states.category], dtype=np.int64)
-    judged = j.verdicts.judged
+    ours = np.array([place[str(c)] for c in category], dtype=np.int64)
+    judged = v.judged
     row, _ = np.nonzero(judged)
     counts = np.zeros((len(ours), len(names)), dtype=np.int64)
-    np.add.at(counts, (row, true_place[j.verdicts.taken_for[judged]]), 1)
+    np.add.at(counts, (row, true_place[v.taken_for[judged]]), 1)
     rows = np.flatnonzero(judged.any(axis=1))
     ticks, agents = (np.zeros((len(CATEGORIES), len(names)), dtype=np.int64) for _ in range(2))
     np.add.at(ticks, ours, counts)
@@ -231,19 +206,3 @@ def _confusion(j: JudgedAgents, true_category: NDArray[np.str_]) -> dict[str, An
         }
         for what, matrix in (("ticks", ticks), ("agents", agents))
     }
-
-
-def _agent_rows(j: JudgedAgents, truth: StateTable) -> list[dict[str, Any]]:
-    v, rows = j.verdicts, []
-    for k in np.flatnonzero(v.judged.any(axis=1)):
-        ticks = v.judged[k]
-        there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
-        rows.append({
-            "id": j.states.agents[k].id, "category": str(j.states.category[k]), "ticks": int(ticks.sum()),
-            "wrong_ticks": int((j.wrong[k] & ticks).sum()),
-            **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
-            "taken_for": {truth.agents[i].id if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
-            "confidence": float(j.confidence[k]), "doubted": bool(j.reasons[k]), "doubts": list(j.reasons[k]),
-            "mean_range_m": float(j.states.range_m[k, ticks].mean()),
-        })  # fmt: skip
-    return rows

@@ -170,9 +170,20 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
         def reproject(states: Array, _t_s: Array) -> Array:
             return np.asarray(target.forward(states) + np.array([0, 0, rise_m, 0]))
 
+        def around_ego(
+            states: Array, t_s: Array
+        ) -> Array:  # what is around the ego is kept as it is, and the ego moved
+            assert truth.ego is not None
+            s = truth.ego.at(np.clip(t_s, truth.ego.waypoints.t_s[0], truth.ego.waypoints.t_s[-1]))
+            before = np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)
+            after = reproject(before, t_s)
+            turn = after[:, 3] - before[:, 3]
+            xyz = np.einsum("nij,nj->ni", rotation_from_rpy(0 * turn, 0 * turn, turn), states[:, :3] - before[:, :3])
+            return np.column_stack([xyz + after[:, :3], states[:, 3] + turn])
+
         method = "projection"
         far: Move = reproject
-        near: Move = far if truth.ego is None else _around(truth.ego, far)
+        near: Move = reproject if truth.ego is None else around_ego
     else:
         apart_m = _ego_apart_m(truth, scenario, truth.shift_to(scenario))
         if apart_m is None or apart_m <= comparison.GATE_M:
@@ -234,20 +245,6 @@ def _fit_egos(truth: Scenario, scenario: Scenario) -> Move:
         return np.column_stack([xyz, states[:, 3] + turn])
 
     return move
-
-
-def _around(ego: Agent, move: Move) -> Move:
-    """Return a motion that keeps what is around the ego as it is, and moves the ego by `move`."""
-
-    def moved(states: Array, t_s: Array) -> Array:
-        s = ego.at(np.clip(t_s, ego.waypoints.t_s[0], ego.waypoints.t_s[-1]))
-        before = np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)
-        after = move(before, t_s)
-        turn = after[:, 3] - before[:, 3]
-        xyz = np.einsum("nij,nj->ni", rotation_from_rpy(0 * turn, 0 * turn, turn), states[:, :3] - before[:, :3])
-        return np.column_stack([xyz + after[:, :3], states[:, 3] + turn])
-
-    return moved
 
 
 def _moved(truth: Scenario, near: Move, far: Move) -> Scenario:
@@ -327,7 +324,13 @@ def evaluate(
     elif not isinstance(scenario, Scenario):
         scenario = scenario.scenario
     quarantined = [agent.id for agent in scenario.agents if agent.quarantined]
-    scenario = replace(scenario, agents=tuple(_while_observed(agent) for agent in scenario.active.agents))
+    agents = []
+    for agent in scenario.active.agents:
+        rows = np.flatnonzero(agent.waypoints.observed)
+        if agent.static and len(rows):  # from its first to its last observation
+            agent = replace(agent, waypoints=agent.waypoints.take(slice(rows[0], rows[-1] + 1)))
+        agents.append(agent)
+    scenario = replace(scenario, agents=tuple(agents))
     truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
     compared, ticks_s, ego = compare_scenarios(
         scenario, truth, comparison.Selection(max_range_m, _selected(categories))
@@ -348,12 +351,23 @@ def evaluate(
         if name in names
     }
     # The agent that each truth agent is matched with most often, by its id.
-    agents = {agent.id: agent for agent in scenario.others}
-    partners = {}
+    by_id, partners = {agent.id: agent for agent in scenario.others}, {}
     for row, agent in enumerate(compared.truth.agents):
         hits = compared.match[row][compared.counted[row] & (compared.match[row] >= 0)]
         if len(hits):
-            partners[agent.id] = agents[compared.other.agents[int(np.bincount(hits).argmax())].id]
+            partners[agent.id] = by_id[compared.other.agents[int(np.bincount(hits).argmax())].id]
+    of_ego, shift_m = None, truth.shift_to(scenario)
+    if truth.ego is not None and scenario.ego is not None:
+        true = comparison.truth_states((truth.ego,), truth_ticks_s, shift_m, None)
+        own = comparison.reconstructed_states((scenario.ego,), ticks_s, None)
+        both = true.present & true.visible & own.present
+        errors = verdicts.state_errors(true, own, np.where(own.present, 0, -1), both)
+        of_ego = {
+            "ticks": int(both.sum()),
+            "position_rmse_m": verdicts.root_mean_square(errors.position_m),
+            "yaw_median_deg": verdicts.median(np.degrees(errors.yaw_rad)),
+            "speed_rmse_mps": verdicts.root_mean_square(errors.speed_mps),
+        }
     result = {
         "metrics_version": VERSION,
         "scenario": scenario.name,
@@ -368,12 +382,12 @@ def evaluate(
         "by_range": None if ego is None else by_range,
         "by_category": by_category,
         "correctness": correctness(compared, scenario.others, ticks_s, ego),
-        "ego": _ego_figures(scenario, truth, ticks_s, truth_ticks_s, truth.shift_to(scenario)),
+        "ego": of_ego,
         "map_features": map_figures(scenario, truth),
         "colors": color_figures(truth.others, partners),
         "signals": signal_figures(scenario, truth),
         "matching": verdicts.matching_rules(),
-        "counting": verdicts.counting_rules(truth, comparison.MIN_COUNTED_S),
+        "counting": verdicts.counting_rules(truth),
         "agents": agent_rows(compared),
         "false_agents": uncounted_rows(
             ours, "false", compared.false, matched_ticks=comparison.matched_ticks(compared, compared.counted)
@@ -449,14 +463,6 @@ def _figures(
     }  # fmt: skip
 
 
-def _while_observed(agent: Agent) -> Agent:
-    """Return a static agent without the time before its first and after its last observation."""
-    rows = np.flatnonzero(agent.waypoints.observed)
-    if not agent.static or not len(rows):
-        return agent
-    return replace(agent, waypoints=agent.waypoints.take(slice(rows[0], rows[-1] + 1)))
-
-
 def _selected(categories: Sequence[str] | None) -> frozenset[str]:
     if categories is None:
         return frozenset(CATEGORIES)
@@ -465,20 +471,3 @@ def _selected(categories: Sequence[str] | None) -> frozenset[str]:
         if name not in known:
             raise ConfigError(f"unknown category '{name}'{nearest(name, known)}; known: {', '.join(known)}")
     return frozenset(c for name in categories for c in GROUPS.get(name, (name,)))
-
-
-def _ego_figures(
-    scenario: Scenario, truth: Scenario, ticks_s: Array, truth_ticks_s: Array, shift_m: Array
-) -> dict[str, Any] | None:
-    if truth.ego is None or scenario.ego is None:
-        return None
-    true = comparison.truth_states((truth.ego,), truth_ticks_s, shift_m, None)
-    ours = comparison.reconstructed_states((scenario.ego,), ticks_s, None)
-    both = true.present & true.visible & ours.present
-    errors = verdicts.state_errors(true, ours, np.where(ours.present, 0, -1), both)
-    return {
-        "ticks": int(both.sum()),
-        "position_rmse_m": verdicts.root_mean_square(errors.position_m),
-        "yaw_median_deg": verdicts.median(np.degrees(errors.yaw_rad)),
-        "speed_rmse_mps": verdicts.root_mean_square(errors.speed_mps),
-    }

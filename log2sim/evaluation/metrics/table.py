@@ -36,21 +36,10 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     """Format the part `correctness` of a result of `evaluate` as tables; no line where nothing was judged."""
     if not found["ticks"]:
         return []
-    return [
-        "", "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
-        "NEES: squared errors of position, yaw and speed over sigma, 1 is right", *columns_text(_cells(found)),
-        *textwrap.wrap(_confused_line(found["confusion"]), 100, subsequent_indent="  "), "", *_calibration_lines(found),
-        "", *worst_agents(found["judged_agents"], MAX_WORST),
-    ]  # fmt: skip
-
-
-def _cells(found: Mapping[str, Any]) -> list[list[str]]:
     lines = [("all", found)]
     lines += list(found["by_kind"].items()) if len(found["by_kind"]) > 1 else []
     lines += [(f"{name} m", figures) for name, figures in (found["by_range"] or {}).items()]
-    cells = [
-        ["", "agents", "ticks", *(title for _, title in CORRECTNESS_COLUMNS), *("doubted", "right"), *NEES.values()]
-    ]
+    cells = [["", "agents", "ticks", *(title for _, title in CORRECTNESS_COLUMNS), "doubted", "right", *NEES.values()]]
     for name, figures in lines:
         if figures["ticks"]:
             parts = [figures[key] for key, _ in CORRECTNESS_COLUMNS]
@@ -58,19 +47,21 @@ def _cells(found: Mapping[str, Any]) -> list[list[str]]:
             doubted = [cell(figures["doubted"][key], 0, 100) for key in ("wrong_ticks", "right_ticks")]
             nees = [cell(figures[key]["nees"], 1) for key in NEES]
             cells.append([name, str(figures["agents"]), str(figures["ticks"]), *shares, *doubted, *nees])
-    return cells
-
-
-def _confused_line(confusion: Mapping[str, Any]) -> str:
-    """Say which categories are taken for which, most agents first; "" without any."""
-    agents, ticks = confusion["agents"], confusion["ticks"]
-    pairs = [(true, ours) for ours, row in ticks.items() for true in row if true not in (ours, "nothing")]
-    counts = {(true, ours): (agents.get(ours, {}).get(true, 0), ticks[ours][true]) for true, ours in pairs}
-    parts = [
+    # Which categories are taken for which, most agents first.
+    of_agents, of_ticks = found["confusion"]["agents"], found["confusion"]["ticks"]
+    pairs = [(true, ours) for ours, row in of_ticks.items() for true in row if true not in (ours, "nothing")]
+    counts = {(true, ours): (of_agents.get(ours, {}).get(true, 0), of_ticks[ours][true]) for true, ours in pairs}
+    taken = [
         f"{true} as {ours} ({_noun(counts[true, ours][0], 'agent')}, {_noun(counts[true, ours][1], 'tick')})"
         for true, ours in sorted(pairs, key=lambda pair: (*(-n for n in counts[pair]), pair))
     ]
-    return f"class: {', '.join(parts)}" if parts else ""
+    confused = f"class: {', '.join(taken)}" if taken else ""
+    return [
+        "", "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
+        "NEES: squared errors of position, yaw and speed over sigma, 1 is right", *columns_text(cells),
+        *textwrap.wrap(confused, 100, subsequent_indent="  "), "", *_calibration_lines(found),
+        "", *worst_agents(found["judged_agents"], MAX_WORST),
+    ]  # fmt: skip
 
 
 def _calibration_lines(found: Mapping[str, Any]) -> list[str]:

@@ -116,22 +116,21 @@ def ignore_regions_of(log: Log, t0_ns: int) -> IgnoreRegions | None:
                 f"{log.name}: its labels are of camera '{name}'{nearest(name, list(log.cameras))}, which it does not "
                 f"have; there are: {', '.join(log.cameras)}"
             )
-    views = tuple(_label_view(log, name, t0_ns) for name in names)
-    return IgnoreRegions(views, outside_views=only is not None, categories=never)
-
-
-def _label_view(log: Log, name: str, t0_ns: int) -> LabelView:
-    t_ns = np.unique(log.streams[name].t_ns) if name in log.streams else np.zeros(0, dtype=np.int64)
-    poses, known = log.map_T_sensor(name, t_ns)
-    t_ns, poses = t_ns[known], poses[known]
-    frame, box = np.zeros(0, dtype=np.int64), np.zeros((0, 4))
-    regions = log.ignored_regions.get(name)
-    if regions is not None and len(t_ns):
-        frame = nearest_index(t_ns, regions.t_ns)
-        near = np.abs(t_ns[frame] - regions.t_ns) <= MAX_STAMP_LAG_NS
-        frame, box = frame[near], regions.box_px[near]
-    rotation = quaternion_from_rotation(poses[:, :3, :3])
-    return LabelView(log.cameras[name], (t_ns - t0_ns) / NS_PER_S, poses[:, :3, 3], rotation, frame, box)
+    views = []
+    for name in names:
+        t_ns = np.unique(log.streams[name].t_ns) if name in log.streams else np.zeros(0, dtype=np.int64)
+        poses, known = log.map_T_sensor(name, t_ns)
+        t_ns, poses = t_ns[known], poses[known]
+        frame, box = np.zeros(0, dtype=np.int64), np.zeros((0, 4))
+        regions = log.ignored_regions.get(name)
+        if regions is not None and len(t_ns):
+            frame = nearest_index(t_ns, regions.t_ns)
+            near = np.abs(t_ns[frame] - regions.t_ns) <= MAX_STAMP_LAG_NS
+            frame, box = frame[near], regions.box_px[near]
+        rotation = quaternion_from_rotation(poses[:, :3, :3])
+        t_s = (t_ns - t0_ns) / NS_PER_S
+        views.append(LabelView(log.cameras[name], t_s, poses[:, :3, 3], rotation, frame, box))
+    return IgnoreRegions(tuple(views), outside_views=only is not None, categories=never)
 
 
 MIN_POINTS = 20
@@ -239,20 +238,36 @@ def truth_from_log(
             visible &= in_some_image(log, labels, used, visible)
     ego_t_ns, map_T_ego = _ego_poses(log)
     t0_ns = int(min([labels.t_ns.min(), *ego_t_ns[:1]]))
-    agents = [_label_agent(labels, visible, counts, rows, t0_ns) for rows in rows_by_track(labels)]
+    agents = []
+    for rows in rows_by_track(labels):
+        center, yaw = labels.center_m[rows], np.asarray(labels.yaw_rad[rows], dtype=np.float64)
+        t_s = (labels.t_ns[rows] - t0_ns) / NS_PER_S
+        static = is_static(t_s, center[:, :2])
+        speed = np.zeros(len(rows)) if static else speed_along(t_s, center[:, :2], yaw)
+        w = _waypoints(t_s, center, yaw, speed, visible[rows])
+        w = replace(w, lidar_points=None if counts is None else counts[rows].astype(np.float64))
+        name, size_m = str(labels.track_id[rows[0]]), tuple(np.median(labels.size_m[rows], axis=0).tolist())
+        name = "label-ego" if name == "ego" else name  # "ego" is reserved
+        agents.append(Agent(name, str(labels.category[rows[0]]), size_m, w, static=static))
     if len(ego_t_ns):
         vehicle, center, t_s = log.ego_vehicle, log.ego_centers(map_T_ego), (ego_t_ns - t0_ns) / NS_PER_S
         yaw, static = yaw_of(map_T_ego), is_static(t_s, center[:, :2])
         w = _waypoints(t_s, center, yaw, speed_along(t_s, center[:, :2], yaw), np.ones(len(t_s), dtype=bool))
         offset_m = vehicle.rear_axle_offset_m
         agents.insert(0, Agent("ego", "car", vehicle.size_m, w, static=static, rear_axle_offset_m=offset_m))
+    computed = f"at least {MIN_IMAGE_SHARE:g} of the projected box inside a used camera and at least {MIN_POINTS} LiDAR points in the box"
+    how = ("as the log states", "stated") if labels.visible is not None else (computed, "computed")
+    provenance = {
+        "source": "labels", "log": log.name, "format": log.format, "digest": log.digest, "cameras": used,
+        "visible": how[0], "visibility": how[1], "unreadable_sweeps": unreadable,
+    }  # fmt: skip
     return Scenario(
         name=log.name,
         t0_ns=t0_ns,
         duration_s=max(float(a.waypoints.t_s[-1]) for a in agents),
         agents=tuple(agents),
         map=log.map,
-        provenance=_provenance(log, used, labels, unreadable),
+        provenance=provenance,
         ignore_regions=ignore_regions_of(log, t0_ns),
     )
 
@@ -363,26 +378,6 @@ def count_points(truth: Scenario, log: Log, progress: Progress | None = None) ->
     return replace(truth, agents=(*([truth.ego] if truth.ego is not None else []), *agents))
 
 
-def _label_agent(
-    labels: Labels,
-    visible: NDArray[np.bool_],
-    points: NDArray[np.int64] | None,
-    rows: NDArray[np.int64],
-    t0_ns: int,
-) -> Agent:
-    center, yaw = labels.center_m[rows], np.asarray(labels.yaw_rad[rows], dtype=np.float64)
-    t_s = (labels.t_ns[rows] - t0_ns) / NS_PER_S
-    static = is_static(t_s, center[:, :2])
-    speed = np.zeros(len(rows)) if static else speed_along(t_s, center[:, :2], yaw)
-    track_id = str(labels.track_id[rows[0]])
-    if track_id == "ego":  # it is reserved
-        track_id = "label-ego"
-    length, width, height = np.median(labels.size_m[rows], axis=0).tolist()
-    w = _waypoints(t_s, center, yaw, speed, visible[rows])
-    w = replace(w, lidar_points=None if points is None else points[rows].astype(np.float64))
-    return Agent(track_id, str(labels.category[rows[0]]), (length, width, height), w, static=static)
-
-
 def _ego_poses(log: Log) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (T,) and the ego poses (T, 4, 4) known there.
 
@@ -434,12 +429,3 @@ def speed_along(t_s: Array, xy_m: Array, yaw_rad: Array) -> Array:
         since = t - t.mean()
         velocity[k] = since @ (xy - xy.mean(axis=0)) / (since @ since)
     return velocity[:, 0] * np.cos(yaw_rad) + velocity[:, 1] * np.sin(yaw_rad)
-
-
-def _provenance(log: Log, cameras: Sequence[str], labels: Labels, unreadable: int) -> dict[str, Any]:
-    computed = f"at least {MIN_IMAGE_SHARE:g} of the projected box inside a used camera and at least {MIN_POINTS} LiDAR points in the box"
-    visible = ("as the log states", "stated") if labels.visible is not None else (computed, "computed")
-    return {
-        "source": "labels", "log": log.name, "format": log.format, "digest": log.digest, "cameras": list(cameras),
-        "visible": visible[0], "visibility": visible[1], "unreadable_sweeps": unreadable,
-    }  # fmt: skip

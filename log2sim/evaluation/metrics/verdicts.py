@@ -10,18 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUPS, Scenario
-from log2sim.evaluation.metrics.comparison import (
-    GATE_M,
-    GATE_PER_LENGTH,
-    MAX_FRAME_LAG_S,
-    MAX_TRUTH_GAP_S,
-    MIN_HIT_POINTS,
-    MIN_REGION_SHARE,
-    Comparison,
-    Index,
-    Mask,
-    StateTable,
-)
+from log2sim.evaluation.metrics import comparison
+from log2sim.evaluation.metrics.comparison import Comparison, Index, Mask, StateTable
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 
 MIN_WALKING_MPS = 0.5  # the heading of a slower pedestrian does not count
@@ -239,7 +229,7 @@ def _marked(shape: tuple[int, ...], agent: Index, tick: Index) -> Mask:
 
 IGNORED_RULE = (
     "an unmatched reconstructed agent is neither right nor false at the ticks at which the labels may be incomplete there: "
-    f"every labeled camera that shows it (a frame within {MAX_FRAME_LAG_S:g} s) has at least {MIN_REGION_SHARE:g} of its "
+    f"every labeled camera that shows it (a frame within {comparison.MAX_FRAME_LAG_S:g} s) has at least {comparison.MIN_REGION_SHARE:g} of its "
     "outline inside the image in regions left without labels, or no labeled camera shows any of it and only what these "
     "cameras see was labeled, or its category was never labeled"
 )
@@ -248,8 +238,8 @@ IGNORED_RULE = (
 def matching_rules() -> dict[str, Any]:
     """Describe how agents are matched."""
     return {
-        "gate_m": GATE_M,
-        "gate_per_length": GATE_PER_LENGTH,
+        "gate_m": comparison.GATE_M,
+        "gate_per_length": comparison.GATE_PER_LENGTH,
         "groups": {name: list(members) for name, members in GROUPS.items()},
         "rule": "one to one per tick by 2D distance of box centers within max(gate_m, gate_per_length x true length); "
         "last match kept while within the gate, then most pairs with least total distance; "
@@ -261,15 +251,15 @@ def matching_rules() -> dict[str, Any]:
     }
 
 
-def counting_rules(truth: Scenario, min_s: float) -> dict[str, Any]:
-    """Describe what is counted; `min_s` is the shortest counted time of a truth agent, s."""
+def counting_rules(truth: Scenario) -> dict[str, Any]:
+    """Describe what is counted."""
     return {
-        "min_s": min_s,
-        "max_truth_gap_s": MAX_TRUTH_GAP_S,
+        "min_s": comparison.MIN_COUNTED_S,
+        "max_truth_gap_s": comparison.MAX_TRUTH_GAP_S,
         "rule": "a truth agent counts at the ticks at which it is visible, within range and selected, "
         "when these make up at least min_s; a reconstructed agent is false at the ticks at which no labeled object, "
         "visible or not, counted or not, matches it, but for the ignored ones",
-        "hit": f"within range, selected and at least {MIN_HIT_POINTS} points of all LiDARs in the box, visible or not",
+        "hit": f"within range, selected and at least {comparison.MIN_HIT_POINTS} points of all LiDARs in the box, visible or not",
         "ignored": IGNORED_RULE if truth.ignore_regions is not None else "none; the truth states that it is complete",
         "visible": truth.provenance.get("visible", "as the truth file states; all where it states nothing"),
     }

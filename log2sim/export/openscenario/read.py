@@ -85,15 +85,6 @@ def _pose(node: Element, where: str) -> list[float]:
     return [x, y, z, heading]
 
 
-def speeds_of(vertices: Array) -> Array:
-    """Return the speed (V,) along the heading from vertices (V, 5)."""
-    t, x, y, _, heading = vertices.T
-    if len(t) < 2 or np.any(np.diff(t) <= 0):
-        return np.zeros(len(t))
-    result: Array = np.gradient(x, t) * np.cos(heading) + np.gradient(y, t) * np.sin(heading)
-    return result
-
-
 CATEGORY_OF = {kind.category: category for category, kind in reversed(list(VEHICLE_DEFAULTS.items()))} | {
     "van": "car", "semitrailer": "truck", "trailer": "other", "tram": "other", "train": "other",
 }  # fmt: skip
@@ -204,6 +195,15 @@ def _agent(
             )
         pose = _pose(start, where)
         vertices = np.nan_to_num(np.array([[0.0, *pose], [max(last_s, 1e-3), *pose]]))
+    doubts: Any = []
+    text = properties.get(PREFIX + "doubts")
+    if text is not None:
+        try:
+            doubts = parse_unique(unescaped(text))
+        except (ValueError, RecursionError):
+            doubts = None
+        if not isinstance(doubts, list):
+            raise ScenarioError(f"{where}: property doubts is {text[:60]!r}, expected the list that an export writes")
     is_ego = properties.get("type") == "ego_vehicle" or name.lower() in EGO_NAMES
     own_id = properties.get(PREFIX + "id")
     if body.tag == "Vehicle":
@@ -218,23 +218,10 @@ def _agent(
         "static": properties.get(PREFIX + "static", str(not np.ptp(vertices[:, 1:], axis=0).any()).lower()) == "true",
         "rear_axle_offset_m": offset_m,
         "confidence": require_number(properties.get(PREFIX + "confidence", "1"), f"{where}: property confidence"),
-        "doubts": _doubts(properties, where),
+        "doubts": doubts,
         "quality": {},
         "waypoints": _waypoints(vertices, properties, placement, (offset_m, height_m), where),
     }  # fmt: skip
-
-
-def _doubts(properties: Mapping[str, str], where: str) -> list[Any]:
-    text = properties.get(PREFIX + "doubts")
-    if text is None:
-        return []
-    try:
-        doubts = parse_unique(unescaped(text))
-    except (ValueError, RecursionError):
-        doubts = None
-    if not isinstance(doubts, list):
-        raise ScenarioError(f"{where}: property doubts is {text[:60]!r}, expected the list that an export writes")
-    return doubts
 
 
 def _color(properties: Mapping[str, str], where: str) -> Mapping[str, Any] | None:
@@ -271,8 +258,13 @@ def _waypoints(
     t, x, y, z, heading = vertices.T
     ahead_m, above_m = center_m
     centers = np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + above_m, heading])
-    columns = dict(zip(("x_m", "y_m", "z_m", "yaw_rad"), placement.back(centers).T))
-    columns |= {"t_s": t, "speed_mps": speeds if exported else speeds_of(vertices)}
+    columns: dict[str, Any] = dict(zip(("x_m", "y_m", "z_m", "yaw_rad"), placement.back(centers).T))
+    if not exported:  # along the heading
+        steady = len(t) > 1 and np.all(np.diff(t) > 0)
+        speeds = (
+            np.gradient(x, t) * np.cos(heading) + np.gradient(y, t) * np.sin(heading) if steady else np.zeros(len(t))
+        )
+    columns |= {"t_s": t, "speed_mps": speeds}
     columns["sigma_xy_m"] = np.zeros(len(t))
     columns |= {key: sigma for key, sigma in sigmas.items() if sigma is not None and len(sigma) == len(t)}
     columns["yaw_rad"] = wrap_angle(columns["yaw_rad"])

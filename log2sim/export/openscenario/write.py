@@ -1,4 +1,4 @@
-"""Export to OpenSCENARIO XML 1.0, 1.1 and 1.2 with an OpenDRIVE road.
+"""Export to OpenSCENARIO XML 1.0, 1.1 and 1.2: `scenario.xosc` and its OpenDRIVE road.
 
 It depends on the revision. 1.0 is for CARLA's ScenarioRunner, which does not spawn or delete entities and stops at such
 an action, so agents wait `HIDDEN_DEPTH_M` or more below their first pose and return below after the last one; it also
@@ -8,7 +8,7 @@ lacks `greaterOrEqual` and `TrajectoryRef`. From 1.1 on agents are added and del
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,10 +18,11 @@ import numpy as np
 
 from log2sim.datatypes import EGO, Agent, Scenario
 from log2sim.errors import ConfigError
+from log2sim.export import xml_text
 from log2sim.export.checks import require_start_as_in_scenario
 from log2sim.export.exporters import EXTERNAL, ExportPlacement, Options
 from log2sim.export.roads.opendrive import add_road_file
-from log2sim.export.xml_text import element, escaped, number, unique_names, write
+from log2sim.export.xml_text import element, escaped, number, unique_names
 from log2sim.geometry import Array
 
 PREFIX = "log2sim."  # prefix of the properties that only `log2sim import` reads
@@ -132,29 +133,6 @@ JUST_BEFORE_S = 1e-6
 SAME_TIME_S = 1e-6
 
 
-@dataclass(frozen=True)
-class Revision:
-    """Differences between OpenSCENARIO 1.0, 1.1 and 1.2; `minor` is the second number."""
-
-    minor: int
-
-    @property
-    def spawns(self) -> bool:
-        """Whether agents are added and deleted."""
-        return self.minor >= 1
-
-    @property
-    def override(self) -> str:
-        """The priority of an event that ends others."""
-        return "override" if self.minor >= 2 else "overwrite"
-
-    def at_or_after(self, t_s: float) -> dict[str, str]:
-        """Return the attributes of a `SimulationTimeCondition`."""
-        if self.minor >= 1:
-            return {"rule": "greaterOrEqual", "value": number(t_s, 9)}
-        return {"rule": "greaterThan", "value": number(t_s - JUST_BEFORE_S, 9)}
-
-
 @dataclass(frozen=True, eq=False)
 class AgentStory:
     """What one agent does."""
@@ -166,22 +144,7 @@ class AgentStory:
     leaves: bool  # whether it is absent after them
     hidden_m: float  # how far below it waits in revisions without spawning
     external: bool  # whether it is driven from outside: it gets a place and a speed at the start, and nothing else
-
-    @property
-    def first_s(self) -> float:
-        """Time of the first vertex."""
-        return float(self.vertices[0, 0])
-
-    @property
-    def last_s(self) -> float:
-        """Time of the last vertex."""
-        return float(self.vertices[-1, 0])
-
-    @property
-    def start(self) -> Array:
-        """The first pose as a vertex (5,), or the pose at 0 s if its waypoints begin before."""
-        t_s = max(self.first_s, 0.0)
-        return np.array([np.interp(t_s, self.vertices[:, 0], column) for column in self.vertices.T])
+    start: Array  # (5,) the first vertex, or the pose at 0 s if its waypoints begin before
 
 
 def _agent_story(
@@ -197,42 +160,35 @@ def _agent_story(
         vertices = np.repeat(vertices, 2, axis=0) + np.outer([0, MIN_DURATION_S], [1, 0, 0, 0, 0])
     enters, leaves = bool(w.t_s[0] > SAME_TIME_S), bool(vertices[-1, 0] < duration_s - SAME_TIME_S)
     # Players refuse a negative initial speed; a reversing agent takes its speed from the trajectory at once.
-    return AgentStory(name, vertices, max(float(w.speed_mps[0]), 0.0), enters, leaves, hidden_m, external)
+    speed_mps = max(float(w.speed_mps[0]), 0.0)
+    start = np.array([np.interp(max(vertices[0, 0], 0.0), vertices[:, 0], column) for column in vertices.T])
+    return AgentStory(name, vertices, speed_mps, enters, leaves, hidden_m, external, start)
 
 
-def start_poses(stories: Sequence[AgentStory], revision: Revision) -> Array:
-    """Return poses at the start (A, 4) x, y, z, heading of the reference points; NaN for agents added later."""
-    rows = np.array([story.start[1:] for story in stories])
-    for row, story in zip(rows, stories):
-        if story.enters:
-            row[2] = np.nan if revision.spawns else row[2] - story.hidden_m
-    return rows
-
-
-def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float, revision: Revision) -> None:
+def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float, minor: int) -> None:
     """Add the `Storyboard` of all agents."""
     storyboard = element("Storyboard", parent)
     actions = element("Actions", element("Init", storyboard))
     for story in stories:
-        if not story.enters or not revision.spawns:
+        if not story.enters or minor == 0:
             private = element("Private", actions, entityRef=story.name)
             below_m = story.hidden_m if story.enters else 0.0
             _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
             _add_speed(private, 0.0 if story.enters else story.speed_mps)
         if story.external:
-            _add_external_control(actions[-1], revision)
+            _add_external_control(actions[-1], minor)
     act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
     for story in stories:
         if not story.external:
-            _add_group(act, story, revision)
-    _add_trigger(act, "StartTrigger", "at the start", 0.0, revision)
-    _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, revision)
+            _add_group(act, story, minor)
+    _add_trigger(act, "StartTrigger", "at the start", 0.0, minor)
+    _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, minor)
 
 
-def _add_external_control(private: Element, revision: Revision) -> None:
+def _add_external_control(private: Element, minor: int) -> None:
     """Hand the control over: to who reports states to esmini from 1.1 on, to who drives the vehicle in CARLA in 1.0."""
     control = element("ControllerAction", element("PrivateAction", private))
-    if revision.minor > 0:
+    if minor > 0:
         element("ActivateControllerAction", control, longitudinal="true", lateral="true")
         return
     controller = element("Controller", element("AssignControllerAction", control), name="external control")
@@ -243,22 +199,23 @@ def _add_external_control(private: Element, revision: Revision) -> None:
     element("Gear", overridden, number="0", active="false")
 
 
-def _add_group(act: Element, story: AgentStory, revision: Revision) -> None:
+def _add_group(act: Element, story: AgentStory, minor: int) -> None:
     """Add one agent's maneuver: it enters, follows its trajectory and leaves, or stops at the last vertex."""
+    first_s, override = float(story.vertices[0, 0]), "override" if minor >= 2 else "overwrite"
     group = element("ManeuverGroup", act, name=f"{story.name} group", maximumExecutionCount="1")
     element("EntityRef", element("Actors", group, selectTriggeringEntities="false"), entityRef=story.name)
     maneuver = element("Maneuver", group, name=f"{story.name} maneuver")
     if story.enters:
         action, event = _event(maneuver, f"{story.name} enters", "parallel")
-        if revision.spawns:
+        if minor > 0:
             entity = element("EntityAction", element("GlobalAction", action), entityRef=story.name)
             _add_position(element("AddEntityAction", entity), story.vertices[0])
         else:
             _add_position(element("TeleportAction", element("PrivateAction", action)), story.vertices[0])
-        _add_trigger(event, "StartTrigger", f"{story.name} is seen", story.first_s, revision)
+        _add_trigger(event, "StartTrigger", f"{story.name} is seen", first_s, minor)
     action, event = _event(maneuver, f"{story.name} follows", "parallel")
     follow = element("FollowTrajectoryAction", element("RoutingAction", element("PrivateAction", action)))
-    holder = element("TrajectoryRef", follow) if revision.minor >= 1 else follow
+    holder = element("TrajectoryRef", follow) if minor > 0 else follow
     trajectory = element("Trajectory", holder, name=f"{story.name} trajectory", closed="false")
     polyline = element("Polyline", element("Shape", trajectory))
     for row in story.vertices:
@@ -266,23 +223,19 @@ def _add_group(act: Element, story: AgentStory, revision: Revision) -> None:
     timing = element("TimeReference", follow)
     element("Timing", timing, domainAbsoluteRelative="absolute", scale="1", offset="0")
     element("TrajectoryFollowingMode", follow, followingMode="position")
-    _add_trigger(event, "StartTrigger", f"{story.name} may move", max(story.first_s, 0.0), revision)
-    _add_end(maneuver, story, revision)
-
-
-def _add_end(maneuver: Element, story: AgentStory, revision: Revision) -> None:
+    _add_trigger(event, "StartTrigger", f"{story.name} may move", max(first_s, 0.0), minor)
     if not story.leaves:
-        action, event = _event(maneuver, f"{story.name} stops", revision.override)
+        action, event = _event(maneuver, f"{story.name} stops", override)
         _add_speed(action, 0.0)
     else:
-        action, event = _event(maneuver, f"{story.name} leaves", revision.override)
-        if revision.spawns:
+        action, event = _event(maneuver, f"{story.name} leaves", override)
+        if minor > 0:
             entity = element("EntityAction", element("GlobalAction", action), entityRef=story.name)
             element("DeleteEntityAction", entity)
         else:
             private = element("PrivateAction", action)
             _add_position(element("TeleportAction", private), story.vertices[-1], story.hidden_m)
-    _add_trigger(event, "StartTrigger", f"{story.name} was seen", story.last_s, revision)
+    _add_trigger(event, "StartTrigger", f"{story.name} was seen", float(story.vertices[-1, 0]), minor)
 
 
 def _event(maneuver: Element, name: str, priority: str) -> tuple[Element, Element]:
@@ -305,57 +258,47 @@ def _add_speed(parent: Element, speed_mps: float) -> None:
     element("AbsoluteTargetSpeed", element("SpeedActionTarget", action), value=number(speed_mps, 4))
 
 
-def _add_trigger(parent: Element, tag: str, name: str, t_s: float, revision: Revision) -> None:
+def _add_trigger(parent: Element, tag: str, name: str, t_s: float, minor: int) -> None:
     """Add a trigger by time; its edge is "none", since "rising" never occurs for a condition that holds from the start."""
     group = element("ConditionGroup", element(tag, parent))
     condition = element("Condition", group, name=name, delay="0", conditionEdge="none")
-    element("SimulationTimeCondition", element("ByValueCondition", condition), **revision.at_or_after(t_s))
+    if minor > 0:
+        when = {"rule": "greaterOrEqual", "value": number(t_s, 9)}
+    else:
+        when = {"rule": "greaterThan", "value": number(t_s - JUST_BEFORE_S, 9)}
+    element("SimulationTimeCondition", element("ByValueCondition", condition), **when)
 
 
-REVISIONS = {"1.0": Revision(0), "1.1": Revision(1), "1.2": Revision(2)}
+REVISIONS = {"1.0": 0, "1.1": 1, "1.2": 2}  # the second number
 NEWEST = "1.2"
 
 
-class OpenScenario:
-    """`scenario.xosc` and its road."""
-
-    options: tuple[str, ...] = ("revision", "map", "ego")
-    loses = (
-        "states of traffic lights, confidences of lanes and markings, cameras, quality, stages and provenance; players take a"
-        " cyclist for a bicycle and what is 'other' for a van (an import does not), and ScenarioRunner takes over no sizes"
-    )
-
-    def write(self, scenario: Scenario, folder: Path, options: Options) -> None:
-        """Write the scenario and its road."""
-        revision = REVISIONS.get(options.revision or NEWEST)
-        if revision is None:
-            known = ", ".join(REVISIONS)
-            raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
-        external = options.ego is not None
-        if external:
-            # Raise unless there is an ego on wheels from the start, which another program can drive.
-            driver = str(options.ego)
-            if driver != EXTERNAL:
-                raise ConfigError(f"--ego {driver}: expected '{EXTERNAL}', an ego that another program drives")
-            ego = scenario.ego
-            if ego is None or ego.category == "pedestrian":
-                raise ConfigError(
-                    f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive"
-                )
-            if ego.waypoints.t_s[0] > SAME_TIME_S:
-                first_s = float(ego.waypoints.t_s[0])
-                raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
-        road, placement = add_road_file(scenario, folder, options.map)
-        write(openscenario_document(scenario, road, placement, revision, external=external), folder / "scenario.xosc")
+options: tuple[str, ...] = ("revision", "map", "ego")
+loses = (
+    "states of traffic lights, confidences of lanes and markings, cameras, quality, stages and provenance; players take a"
+    " cyclist for a bicycle and what is 'other' for a van (an import does not), and ScenarioRunner takes over no sizes"
+)
 
 
-EXPORTER = OpenScenario()
-
-
-def openscenario_document(
-    scenario: Scenario, road: str, placement: ExportPlacement, revision: Revision, *, external: bool = False
-) -> Element:
-    """Return the document of a scenario whose road is in the file `road` beside it; an `external` ego is driven from outside."""
+def write(scenario: Scenario, folder: Path, options: Options) -> None:
+    """Write the scenario and its road."""
+    minor = REVISIONS.get(options.revision or NEWEST)
+    if minor is None:
+        known = ", ".join(REVISIONS)
+        raise ConfigError(f"--revision {options.revision}: OpenSCENARIO XML is written as one of {known}")
+    external = options.ego is not None
+    if external:
+        # Raise unless there is an ego on wheels from the start, which another program can drive.
+        driver = str(options.ego)
+        if driver != EXTERNAL:
+            raise ConfigError(f"--ego {driver}: expected '{EXTERNAL}', an ego that another program drives")
+        ego = scenario.ego
+        if ego is None or ego.category == "pedestrian":
+            raise ConfigError(f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
+        if ego.waypoints.t_s[0] > SAME_TIME_S:
+            first_s = float(ego.waypoints.t_s[0])
+            raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
+    road, placement = add_road_file(scenario, folder, options.map)
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
     driven = [external and agent.id == EGO for agent in scenario.agents]
@@ -363,11 +306,18 @@ def openscenario_document(
         _agent_story(agent, name, duration_s, placement, HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k, external=flag)
         for k, (agent, name, flag) in enumerate(zip(scenario.agents, names, driven))
     ]
-    require_start_as_in_scenario(scenario.agents, _boxes(scenario, start_poses(stories, revision)))
+    # Box centers and headings at the start (A, 4); NaN for agents added later.
+    _, x, y, z, heading = np.array([story.start for story in stories]).T
+    enters, below_m = np.array([s.enters for s in stories]), np.array([s.hidden_m for s in stories])
+    z = np.where(enters, np.nan if minor > 0 else z - below_m, z)
+    ahead_m = np.array([a.rear_axle_offset_m for a in scenario.agents])
+    up_m = np.array([a.size_m[2] for a in scenario.agents]) / 2
+    boxes = np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + up_m, heading])
+    require_start_as_in_scenario(scenario.agents, boxes)
     root = element("OpenSCENARIO")
     # A leading "CARLA:" in the description would switch ScenarioRunner to left-handed axes.
     element(
-        "FileHeader", root, revMajor="1", revMinor=str(revision.minor), date=_date(scenario.t0_ns), author="log2sim",
+        "FileHeader", root, revMajor="1", revMinor=str(minor), date=_date(scenario.t0_ns), author="log2sim",
         description=f"log2sim: {escaped(scenario.name)}",
     )  # fmt: skip
     _add_parameters(root, scenario, placement)
@@ -375,17 +325,9 @@ def openscenario_document(
     element("LogicFile", element("RoadNetwork", root), filepath=road)
     entities = element("Entities", root)
     for agent, name, flag in zip(scenario.agents, names, driven):
-        add_entity(entities, agent, name, revision.minor, external=flag)
-    add_storyboard(root, stories, duration_s, revision)
-    return root
-
-
-def _boxes(scenario: Scenario, references: Array) -> Array:
-    """Box centers and headings (A, 4) of agents whose reference points are at (A, 4)."""
-    ahead_m = np.array([a.rear_axle_offset_m for a in scenario.agents])
-    x, y, z, heading = references.T
-    height_m = np.array([a.size_m[2] for a in scenario.agents])
-    return np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + height_m / 2, heading])
+        add_entity(entities, agent, name, minor, external=flag)
+    add_storyboard(root, stories, duration_s, minor)
+    xml_text.write(root, folder / "scenario.xosc")
 
 
 def _add_parameters(root: Element, scenario: Scenario, placement: ExportPlacement) -> None:

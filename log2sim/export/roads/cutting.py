@@ -35,7 +35,10 @@ def cut_together(lanes: Sequence[MapLane], refused: Collection[frozenset[str]] =
     plain = [lane for lane in lanes if not is_connection(lane, by_id)]
     lines = [Polyline.through(lane.points_m) for lane in plain]
     beside = [b for b in find_beside(lines) if _may_share(plain[b.route], plain[b.other], b, refused)]
-    beside += [_mirrored(b) for b in beside]
+    for b in list(beside):  # the same stretch as the other line has it
+        order = slice(None, None, 1 if b.same_way else -1)
+        aside = -b.aside_m if b.same_way else b.aside_m
+        beside.append(Beside(b.other, b.route, b.other_s_m[order], b.s_m[order], aside[order], b.same_way))
     stations = _stations(plain, lines, beside)
     names = {lane.id: [lane.id] for lane in lanes}
     for lane, at in zip(plain, stations):
@@ -56,7 +59,12 @@ def cut_together(lanes: Sequence[MapLane], refused: Collection[frozenset[str]] =
             part = replace(lane, id=name, predecessors=links[k], successors=links[k + 2], **known)
             if lane.id in rows:
                 row = rows[lane.id]
-                part = _part(part, lines[row], stations[row][k : k + 2])
+                begin_m, end_m = stations[row][k : k + 2]
+                if begin_m != 0.0 or end_m != lines[row].length_m:
+                    points = lines[row].part(begin_m, end_m)
+                    ahead = begin_m + Polyline(points).s_m
+                    width = np.interp(ahead, Polyline(part.points_m).s_m, part.width_m)
+                    part = replace(part, points_m=points, width_m=width)
                 part = replace(part, **_neighbors(row, stations, k, beside, plain, names))
             found.append(part)
     return found
@@ -74,13 +82,6 @@ def _may_share(lane: MapLane, other: MapLane, pair: Beside, refused: Collection[
     else:
         own, theirs = lane.right_lane, other.left_lane
     return own in (None, other.id) and theirs in (None, lane.id)
-
-
-def _mirrored(pair: Beside) -> Beside:
-    """Return the same stretch as the other line has it."""
-    order = slice(None, None, 1 if pair.same_way else -1)
-    aside = -pair.aside_m if pair.same_way else pair.aside_m
-    return Beside(pair.other, pair.route, pair.other_s_m[order], pair.s_m[order], aside[order], pair.same_way)
 
 
 def _stations(lanes: Sequence[MapLane], lines: Sequence[Polyline], beside: Sequence[Beside]) -> list[list[float]]:
@@ -110,15 +111,6 @@ def _cut_at(cuts: list[float], s: float, free: tuple[bool, bool]) -> None:
     else:
         cuts.append(s)
         cuts.sort()
-
-
-def _part(lane: MapLane, line: Polyline, span_m: Sequence[float]) -> MapLane:
-    """Return what lies between two stations of a lane."""
-    if span_m[0] == 0.0 and span_m[1] == line.length_m:
-        return lane
-    points = line.part(span_m[0], span_m[1])
-    ahead = span_m[0] + Polyline(points).s_m
-    return replace(lane, points_m=points, width_m=np.interp(ahead, Polyline(lane.points_m).s_m, lane.width_m))
 
 
 def _neighbors(

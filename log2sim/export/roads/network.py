@@ -45,17 +45,13 @@ def cubics_through(stations: Array, values: Array) -> Array:
     if np.ptp(v) < EXACT_M / 10:
         return np.array([[0.0, v[0], 0.0, 0.0, 0.0]])
     d, c, b, a = PchipInterpolator(s, v).c
-    return _merged_cubics(np.column_stack([s[:-1], a, b, c, d]))
-
-
-def _merged_cubics(rows: Array) -> Array:
-    """Drop cubics (K, 5) that only continue the one before, which checkers call redundant."""
-    kept = [rows[0]]
-    for row in rows[1:]:
-        s, a, b, c, d = kept[-1]
-        h = row[0] - s
+    first, *rest = np.column_stack([s[:-1], a, b, c, d])
+    kept = [first]
+    for row in rest:
+        start, a, b, c, d = kept[-1]
+        h = row[0] - start
         goes_on = [a + h * (b + h * (c + h * d)), b + h * (2 * c + 3 * h * d), c + 3 * h * d, d]
-        if np.abs(row[1:] - goes_on).max() > 2e-6:
+        if np.abs(row[1:] - goes_on).max() > 2e-6:  # one that only continues the one before checkers call redundant
             kept.append(row)
     return np.array(kept)
 
@@ -93,10 +89,7 @@ class MarkFinder:
 # Roads go on straight for so long where nothing is known of what is before or after them, so that whole vehicles are
 # on them.
 EXTENSION_M = 10.0
-
 STEP_M = 2.0  # stations at which widths are taken
-
-
 TAPER_M = 10.0  # over so much of its length a lane changes to the width that it has in the next road
 
 
@@ -134,7 +127,9 @@ class Road:
     widths: tuple[Array, ...]
     opposite: tuple[MapLane, ...] = ()  # against the line, from the right to the left: lane 1, 2,
     opposite_widths: tuple[Array, ...] = ()
+    # Of a road that connects others in a junction: its id, and the road and lane from which it leads.
     junction: int | None = None
+    incoming: tuple[int, int] = (0, 0)
     before: Link | None = None
     after: Link | None = None
 
@@ -226,44 +221,20 @@ def _edges(group: Sequence[MapLane], base: MapLane, reference: Array) -> Array:
     """
     share = np.linspace(0.0, 1.0, len(reference))
     heading = reference[:, 2]
+    along = np.column_stack([np.cos(heading), np.sin(heading)])
     middles, widths = [], []
     for lane in group:
         line = Polyline(lane.points_m)
-        feet = _across(reference, line, share * line.length_m)
+        feet = share * line.length_m
+        for _ in range(8):  # from a guess to the stations straight across
+            off = line.at(feet)[:, :2] - reference[:, :2]
+            feet = np.clip(feet - (off * along).sum(axis=1), 0.0, line.length_m)
         gap = line.at(feet)[:, :2] - reference[:, :2]
         middle = gap[:, 1] * np.cos(heading) - gap[:, 0] * np.sin(heading)
         middles.append(np.zeros(len(share)) if lane is base else middle)
         widths.append(np.interp(feet, line.s_m, lane.width_m))
     m, h = np.array(middles), np.array(widths) / 2
     return np.concatenate([m[:1] + h[:1], (m[:-1] - h[:-1] + m[1:] + h[1:]) / 2, m[-1:] - h[-1:]])
-
-
-def _across(reference: Array, line: Polyline, s: Array) -> Array:
-    """Return the stations (N,) of a line straight across from points (N, 3) x, y, heading, starting from a guess."""
-    along = np.column_stack([np.cos(reference[:, 2]), np.sin(reference[:, 2])])
-    for _ in range(8):
-        gap = line.at(s)[:, :2] - reference[:, :2]
-        s = np.clip(s - (gap * along).sum(axis=1), 0.0, line.length_m)
-    return np.asarray(s)
-
-
-@dataclass(frozen=True)
-class RoadConnection:
-    """A connecting road of a junction."""
-
-    junction: int
-    incoming: int
-    connecting: int
-    lane: int
-
-
-@dataclass(frozen=True, eq=False)
-class RoadNetwork:
-    """Roads and the junctions between them, by their ids and names."""
-
-    roads: tuple[Road, ...]
-    junctions: Mapping[int, str]
-    connections: tuple[RoadConnection, ...]
 
 
 @dataclass(frozen=True)
@@ -284,8 +255,8 @@ class _Place:
         return -1 - self.start
 
 
-def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
-    """Return the roads that lanes form, linked where it is clear which follows which, and by junctions elsewhere."""
+def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]:
+    """Return the roads that lanes form, linked where it is clear which follows which, and the names of junctions elsewhere by id."""
     refused: set[frozenset[str]] = set()
     while True:
         parts = cut_together(lanes, refused)
@@ -311,13 +282,18 @@ def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
     # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
     for number, (group, opposite) in sorted(plain.items(), key=lambda item: -len(item[1][0]) - len(item[1][1])):
         before, after = (_link([*group, *opposite], place, by_id, number_of, at) for at in (0, -1))
-        met = _met([*group, *opposite], place, (before, after), ends)
+        # The ends, as far as they are there, of the lanes that those of the road are linked with, by lane and its start or end.
+        met = {}
+        for at, link in ((0, before), (-1, after)):
+            for lane, name in _linked([*group, *opposite], place, at) if link and link.kind == "road" else ():
+                own_end = -1 if place[lane.id].end == at else 0
+                if (name, -1 - own_end) in ends:
+                    met[lane.id, own_end] = ends[name, -1 - own_end]
         own_headings, free = (headings.get((number, 0)), headings.get((number, -1))), (before is None, after is None)
         road, own = road_of_lanes(number, group, opposite, headings=own_headings, free=free, met=met)
         roads.append(replace(road, before=before, after=after))
         ends.update(own)
     roads.sort(key=lambda road: road.number)
-    connections = []
     for name in inside:
         lane = by_id[name]
         origin, target = lane.predecessors[0], lane.successors[0]
@@ -326,9 +302,8 @@ def build_network(lanes: Sequence[MapLane]) -> RoadNetwork:
         before = Link("road", one.road, {-1: one.lane}, one.end)
         after = Link("road", two.road, {-1: two.lane}, two.start)
         junction = number_of[str(lane.junction)]
-        roads.append(replace(road, junction=junction, before=before, after=after))
-        connections.append(RoadConnection(junction, one.road, road.number, one.lane))
-    return RoadNetwork(tuple(roads), {number: name for name, number in number_of.items()}, tuple(connections))
+        roads.append(replace(road, junction=junction, incoming=(one.road, one.lane), before=before, after=after))
+    return roads, {number: name for name, number in number_of.items()}
 
 
 def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list[MapLane]]:
@@ -362,18 +337,15 @@ def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane]
         if group[0].id in taken:
             continue
         other = by_left.get(str(group[0].opposite), [])
-        if other and not (other[0].opposite == group[0].id and _faces(group[0], _turned(other[0]))):
-            other = []
+        if other:  # begins and ends with the lane, to the left of it
+            lane, facing = group[0], _turned(other[0])
+            heading = float(Polyline(lane.points_m).heading_rad[0])
+            gap = facing.points_m[0] - lane.points_m[0]
+            left = gap[1] * np.cos(heading) > gap[0] * np.sin(heading)
+            other = other if other[0].opposite == lane.id and left and _aligned(lane, facing) else []
         taken |= {side[0].id for side in (group, other) if side}
         found.append((group, other) if _surest([*group, *other]) in group else (other, group))
     return found
-
-
-def _faces(lane: MapLane, other: MapLane) -> bool:
-    """Whether another lane begins and ends with a lane, to the left of it."""
-    heading = float(Polyline(lane.points_m).heading_rad[0])
-    gap = other.points_m[0] - lane.points_m[0]
-    return bool(gap[1] * np.cos(heading) > gap[0] * np.sin(heading)) and _aligned(lane, other)
 
 
 def _torn(
@@ -426,7 +398,9 @@ def _link(
         if is_connection(by_id[name], by_id):
             return Link("junction", number_of[str(by_id[name].junction)])
     own = place[group[0].id].road
-    there = {(place[name].road, _met_at(lane, name, place, at)) for lane, name in names}
+    # At which end of its road a lane adjoins another one.
+    touched = [place[name].start if place[lane.id].end == at else place[name].end for lane, name in names]
+    there = {(place[name].road, end) for (_, name), end in zip(names, touched)}
     if len(there) != 1 or any(len(set(side)) < len(names) for side in zip(*((a.id, b) for a, b in names))):
         return None
     ((number, point),) = there
@@ -442,28 +416,6 @@ def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> l
     return [
         (lane, name) for lane in group for name in (lane.successors if place[lane.id].end == at else lane.predecessors)
     ]
-
-
-def _met(
-    group: Sequence[MapLane],
-    place: Mapping[str, _Place],
-    links: tuple[Link | None, Link | None],
-    ends: Mapping[tuple[str, int], End],
-) -> dict[tuple[str, int], End]:
-    """Return the ends, as far as they are there, of the lanes that those of a road are linked with, by lane and its start or end."""
-    found = {}
-    for at in (0, -1):
-        link = links[at]
-        for lane, name in _linked(group, place, at) if link is not None and link.kind == "road" else ():
-            own = -1 if place[lane.id].end == at else 0
-            if (name, -1 - own) in ends:
-                found[lane.id, own] = ends[name, -1 - own]
-    return found
-
-
-def _met_at(lane: MapLane, name: str, place: Mapping[str, _Place], at: int) -> int:
-    """Return at which end, 0 or -1, of its road a lane adjoins another one whose road meets it at `at`."""
-    return place[name].start if place[lane.id].end == at else place[name].end
 
 
 def _shared_headings(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -13,7 +12,7 @@ import numpy as np
 from log2sim.datatypes import MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.exporters import ExportPlacement, geo_reference, near_origin, on_map
-from log2sim.export.roads.network import MarkFinder, Road, RoadMark, RoadNetwork, build_network
+from log2sim.export.roads.network import MarkFinder, Road, RoadMark, build_network
 from log2sim.export.xml_text import element, escaped, number, read, require_number, write
 from log2sim.geometry import Array, Polyline, wrap_angle
 from log2sim.road.lane_graph import add_missing_lanes, infer_lanes
@@ -91,31 +90,27 @@ STEP_M = 0.5  # stations at which the nearest point of a road is looked for
 MAX_ASIDE_M = 15.0  # crosswalks farther beside a road's reference line belong to another one
 
 
-@dataclass(frozen=True)
-class RoadObjects:
-    """Crosswalks with their stations and offsets, and traffic lights with their lanes, by the number of the road that names them."""
+def road_objects(
+    scenario: Scenario, roads: Sequence[Road]
+) -> tuple[dict[int, list[tuple[Marking, float, float]]], dict[int, list[tuple[Signal, MapLane]]]]:
+    """Return crosswalks with their stations and offsets, and traffic lights with their lanes, by the number of their road.
 
-    crosswalks: Mapping[int, Sequence[tuple[Marking, float, float]]]
-    signals: Mapping[int, Sequence[tuple[Signal, MapLane]]]
-
-    @classmethod
-    def of(cls, scenario: Scenario, roads: Sequence[Road]) -> RoadObjects:
-        """Give each crosswalk to the road whose reference line is nearest to its middle, each light to the first of its roads."""
-        crosswalks: dict[int, list[tuple[Marking, float, float]]] = {}
-        markings = scenario.map_features.markings if scenario.map_features is not None else ()
-        for marking in markings:
-            places = [(_place_on(road, marking.points_m[:, :2].mean(axis=0)), road.number) for road in roads]
-            if marking.kind == "crosswalk" and places:
-                (s, t), number_ = min(places, key=lambda place: abs(place[0][1]))
-                if abs(t) <= MAX_ASIDE_M:
-                    crosswalks.setdefault(number_, []).append((marking, s, t))
-        signals: dict[int, list[tuple[Signal, MapLane]]] = {}
-        lanes = [lane for road in roads for lane in (*road.lanes, *road.opposite)]
-        for signal in scenario.signals:
-            for lane in signal_lanes(signal, lanes)[:1]:
-                owner = next(road.number for road in roads if any(lane is o for o in (*road.lanes, *road.opposite)))
-                signals.setdefault(owner, []).append((signal, lane))
-        return cls(crosswalks, signals)
+    Each crosswalk goes to the road whose reference line is nearest to its middle, each light to the first of its roads.
+    """
+    crosswalks: dict[int, list[tuple[Marking, float, float]]] = {}
+    for marking in scenario.map_features.markings if scenario.map_features is not None else ():
+        if marking.kind == "crosswalk":
+            places = [(*_place_on(road, marking.points_m[:, :2].mean(axis=0)), road.number) for road in roads]
+            s, t, owner = min(places, key=lambda place: abs(place[1]))
+            if abs(t) <= MAX_ASIDE_M:
+                crosswalks.setdefault(owner, []).append((marking, s, t))
+    signals: dict[int, list[tuple[Signal, MapLane]]] = {}
+    owners = {lane.id: road.number for road in roads for lane in (*road.lanes, *road.opposite)}
+    found = [lane for road in roads for lane in (*road.lanes, *road.opposite)]
+    for signal in scenario.signals:
+        for lane in signal_lanes(signal, found)[:1]:
+            signals.setdefault(owners[lane.id], []).append((signal, lane))
+    return crosswalks, signals
 
 
 def _place_on(road: Road, xy_m: Array) -> tuple[float, float]:
@@ -129,10 +124,9 @@ def _place_on(road: Road, xy_m: Array) -> tuple[float, float]:
     return float(s[k]), np.inf if beyond else float(dy * np.cos(heading[k]) - dx * np.sin(heading[k]))
 
 
-def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float, float]) -> None:
-    s, t, heading = place
-    middle = marking.points_m.mean(axis=0)
-    gap = marking.points_m[:, :2] - middle[:2]
+def _add_crosswalk(parent: Element, road: Road, marking: Marking, s: float, t: float) -> None:
+    heading = float(road.line.at(np.array([s]))[0, 2])
+    gap = marking.points_m[:, :2] - marking.points_m[:, :2].mean(axis=0)
     c, s_ = np.cos(heading), np.sin(heading)
     u, v = gap[:, 0] * c + gap[:, 1] * s_, gap[:, 1] * c - gap[:, 0] * s_
     node = element(
@@ -141,15 +135,14 @@ def _add_crosswalk(parent: Element, marking: Marking, place: tuple[float, float,
         width=number(float(np.ptp(v)), DIGITS), height="0",
     )  # fmt: skip
     outline = element("outline", element("outlines", node), id="0", closed="true", outer="true")
-    for k, (a, b) in enumerate(zip(u, v)):
-        element(
-            "cornerLocal", outline, u=number(float(a), DIGITS), v=number(float(b), DIGITS), z="0", height="0", id=str(k)
-        )
+    for k, (a, b) in enumerate(zip(u.tolist(), v.tolist())):
+        element("cornerLocal", outline, u=number(a, DIGITS), v=number(b, DIGITS), z="0", height="0", id=str(k))
 
 
-def add_signals(parent: Element, road: Road, objects: RoadObjects, placement: ExportPlacement) -> None:
+def _add_signals(
+    parent: Element, road: Road, own: Sequence[tuple[Signal, MapLane]], placement: ExportPlacement
+) -> None:
     """Add the traffic lights where the lanes end that they are for: at the end of the road, or for lanes against it at its start."""
-    own = objects.signals.get(road.number, ())
     nodes = element("signals", parent) if own else parent
     for signal, lane in own:
         along = any(lane is other for other in road.lanes)
@@ -233,7 +226,7 @@ def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tu
     """
     if map_path is None:
         placement = near_origin(scenario)
-        root = opendrive_document(scenario, placement)
+        root = _document(scenario, placement)
         require_roads(root, FILE_NAME)
         write(root, folder / FILE_NAME)
         return FILE_NAME, placement
@@ -270,11 +263,11 @@ def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> ExportPl
     return placement
 
 
-def opendrive_document(scenario: Scenario, placement: ExportPlacement) -> Element:
+def _document(scenario: Scenario, placement: ExportPlacement) -> Element:
     """Return the OpenDRIVE document of a scenario's roads, with the same origin as the agents."""
     x0, y0, _ = placement.origin_m
-    network = build_network(lanes(scenario))
-    spread = [r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in network.roads]
+    roads, junctions = build_network(lanes(scenario))
+    spread = [r.line.at(np.linspace(0.0, r.line.length_m, 50))[:, :2] for r in roads]
     ends = np.concatenate(spread) - [x0, y0]
     (west, south), (east, north) = ends.min(axis=0), ends.max(axis=0)
     root = element("OpenDRIVE")
@@ -288,18 +281,22 @@ def opendrive_document(scenario: Scenario, placement: ExportPlacement) -> Elemen
     x, y, z = (float(a + b) for a, b in zip(scenario.map.offset_m, placement.origin_m))
     if (x, y, z) != (0.0, 0.0, 0.0):
         element("offset", header, x=number(x), y=number(y), z=number(z), hdg="0")
-    marks, objects = MarkFinder(scenario), RoadObjects.of(scenario, network.roads)
-    for road in network.roads:
+    marks, (crosswalks, signals) = MarkFinder(scenario), road_objects(scenario, roads)
+    for road in roads:
         node = _add_road(root, road, placement, marks)
-        # Add the crosswalks of a road.
-        own = objects.crosswalks.get(road.number, ())
+        own = crosswalks.get(road.number, ())
         nodes = element("objects", node) if own else node
         for marking, s, t in own:
-            heading = float(road.line.at(np.array([s]))[0, 2])
-            _add_crosswalk(nodes, marking, (s, t, heading))
-        add_signals(node, road, objects, placement)
-    for junction, name in network.junctions.items():
-        _add_junction(root, junction, name, network)
+            _add_crosswalk(nodes, road, marking, s, t)
+        _add_signals(node, road, signals.get(road.number, ()), placement)
+    for junction, name in junctions.items():
+        parent = element("junction", root, name=escaped(name), id=str(junction), type="default")
+        for k, road in enumerate(road for road in roads if road.junction == junction):
+            incoming, lane = road.incoming
+            node = element(
+                "connection", parent, id=str(k), incomingRoad=str(incoming), connectingRoad=str(road.number), contactPoint="start",
+            )  # fmt: skip
+            element("laneLink", node, **{"from": str(lane), "to": "-1"})
     return root
 
 
@@ -315,15 +312,13 @@ def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: Mark
             there = {"contactPoint": "end" if link.point else "start"} if link.kind == "road" else {}
             element(tag, links, elementType=link.kind, elementId=str(link.number), **there)
     plan = element("planView", parent)
-    for piece in road.line.pieces:
+    for s, x, y, heading, length, curvature in road.line.pieces.tolist():
         geometry = element(
-            "geometry", plan, s=number(piece.s_m, LENGTH_DIGITS), x=number(piece.x_m - x0, LENGTH_DIGITS),
-            y=number(piece.y_m - y0, LENGTH_DIGITS), hdg=number(piece.heading_rad, ANGLE_DIGITS), length=number(piece.length_m, LENGTH_DIGITS),
+            "geometry", plan, s=number(s, LENGTH_DIGITS), x=number(x - x0, LENGTH_DIGITS), y=number(y - y0, LENGTH_DIGITS),
+            hdg=number(heading, ANGLE_DIGITS), length=number(length, LENGTH_DIGITS),
         )  # fmt: skip
-        if piece.curvature_1pm == 0:
-            element("line", geometry)
-        else:
-            element("arc", geometry, curvature=number(piece.curvature_1pm, ANGLE_DIGITS))
+        shape = {"curvature": number(curvature, ANGLE_DIGITS)} if curvature else {}
+        element("arc" if curvature else "line", geometry, **shape)
     profile = element("elevationProfile", parent)
     for s, a, *rest in road.elevation:
         _add_cubic(profile, "elevation", "s", s, [a - z0, *rest])
@@ -364,16 +359,6 @@ def _add_mark(lane: Element, mark: RoadMark) -> None:
     element(
         "roadMark", lane, sOffset="0", type=mark.kind, weight="standard", color=mark.color, width=number(mark.width_m, 3)
     )  # fmt: skip
-
-
-def _add_junction(root: Element, junction: int, name: str, network: RoadNetwork) -> None:
-    parent = element("junction", root, name=escaped(name), id=str(junction), type="default")
-    for k, connection in enumerate(c for c in network.connections if c.junction == junction):
-        node = element(
-            "connection", parent, id=str(k), incomingRoad=str(connection.incoming),
-            connectingRoad=str(connection.connecting), contactPoint="start",
-        )  # fmt: skip
-        element("laneLink", node, **{"from": str(connection.lane), "to": "-1"})
 
 
 def _add_cubic(parent: Element, tag: str, station: str, s: float, coefficients: list[float]) -> None:

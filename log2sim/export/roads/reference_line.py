@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -28,60 +27,36 @@ EXACT_M, EXACT_RAD = 1e-6, 1e-6
 MAX_LINE_SAGITTA_M = 1e-6
 
 
-@dataclass(frozen=True)
-class LinePiece:
-    """A line (curvature 0) or an arc."""
-
-    s_m: float  # station of its start
-    # x_m, y_m, heading_rad: at its start.
-    x_m: float
-    y_m: float
-    heading_rad: float
-    length_m: float
-    curvature_1pm: float  # positive to the left
-
-    @property
-    def end(self) -> Array:
-        """x, y, heading (3,) at its end."""
-        start = np.array([self.x_m, self.y_m, self.heading_rad])
-        result: Array = _along(start, np.array([self.curvature_1pm]), np.array([self.length_m]))[0]
-        return result
-
-
 @dataclass(frozen=True, eq=False)
 class ReferenceLine:
-    """Pieces in order of `s_m`, the first at 0, each beginning where the one before ends."""
+    """Lines and arcs, each beginning where the one before ends.
 
-    pieces: tuple[LinePiece, ...]
+    `pieces` (K, 6): station, x, y and heading of its start, length, and curvature, positive to the left and 0 of a line.
+    """
+
+    pieces: Array
 
     @property
     def length_m(self) -> float:
         """Total length."""
-        return self.pieces[-1].s_m + self.pieces[-1].length_m
-
-    @cached_property
-    def _columns(self) -> Array:
-        return np.array([[p.s_m, p.x_m, p.y_m, p.heading_rad, p.curvature_1pm] for p in self.pieces]).T
+        return float(self.pieces[-1, 0] + self.pieces[-1, 4])
 
     def at(self, s_m: Array) -> Array:
         """Return points (N, 3) x, y, heading at stations (N,)."""
-        starts = self._columns[0]
-        k = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, None)
-        return _along(self._columns[1:4, k].T, self._columns[4, k], s_m - starts[k])
+        starts = self.pieces[:, 0]
+        at = self.pieces[np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, None)]
+        return _along(at[:, 1:4], at[:, 5], s_m - at[:, 0])
 
     def extended(self, before_m: float, after_m: float) -> ReferenceLine:
         """Extend by straight lines before and after; stations are counted from the new start."""
-        first, (x, y, heading) = self.pieces[0], self.pieces[-1].end
-        back = first.heading_rad
-        start = (first.x_m - before_m * np.cos(back), first.y_m - before_m * np.sin(back))
-        steps = [(*start, back, before_m, 0.0)]
-        steps += [(p.x_m, p.y_m, p.heading_rad, p.length_m, p.curvature_1pm) for p in self.pieces]
-        steps += [(x, y, heading, after_m, 0.0)]
-        return joined_pieces(steps)
+        (_, x, y, heading, *_), last = self.pieces[0], self.pieces[-1:]
+        start = (x - before_m * np.cos(heading), y - before_m * np.sin(heading), heading, before_m, 0.0)
+        end = (*_along(last[:, 1:4], last[:, 5], last[:, 4])[0], after_m, 0.0)
+        return joined_pieces([start, *(tuple(row) for row in self.pieces[:, 1:]), end])
 
 
 def _along(start: Array, curvature_1pm: Array, along_m: Array) -> Array:
-    """Return points (N, 3) x, y, heading at distances (N,) along arcs that begin at (N, 3) or all at (3,)."""
+    """Return points (N, 3) x, y, heading at distances (N,) along arcs that begin at (N, 3)."""
     x, y, heading = start.T
     turned = curvature_1pm * along_m
     chord = along_m * np.sinc(turned / (2 * np.pi))
@@ -90,18 +65,18 @@ def _along(start: Array, curvature_1pm: Array, along_m: Array) -> Array:
     )
 
 
-def joined_pieces(steps: Sequence[tuple[float, float, float, float, float]]) -> ReferenceLine:
+def joined_pieces(steps: Sequence[tuple[float, ...]]) -> ReferenceLine:
     """Join pieces (x, y, heading, length, curvature); consecutive collinear lines become one."""
-    pieces: list[LinePiece] = []
+    pieces: list[tuple[float, ...]] = []
     for x, y, heading, length, curvature in steps:
         if length <= 0:
             continue
-        if pieces and curvature == 0 == pieces[-1].curvature_1pm and abs(heading - pieces[-1].heading_rad) < 1e-9:
-            last = pieces.pop()
-            x, y, heading, length = last.x_m, last.y_m, last.heading_rad, last.length_m + length
-        s = pieces[-1].s_m + pieces[-1].length_m if pieces else 0.0
-        pieces.append(LinePiece(s, float(x), float(y), float(heading), float(length), float(curvature)))
-    return ReferenceLine(tuple(pieces))
+        if pieces and curvature == 0 == pieces[-1][5] and abs(heading - pieces[-1][3]) < 1e-9:
+            _, x, y, heading, before, _ = pieces.pop()
+            length += before
+        s = pieces[-1][0] + pieces[-1][4] if pieces else 0.0
+        pieces.append((s, x, y, heading, length, curvature))
+    return ReferenceLine(np.array(pieces, dtype=np.float64).reshape(-1, 6))
 
 
 def fit(xy_m: Array, start: Array | None = None, end: Array | None = None) -> tuple[ReferenceLine, Array]:
@@ -133,7 +108,9 @@ def _pinned(samples: Array, rows: Array, start: Array | None, end: Array | None)
     """Bend samples (M, 3) over up to `PIN_M` so that they begin and end as told; `rows` (N,) are those of points in them."""
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[:, :2], axis=0).T))])
     if len(samples) == 2:  # of a straight line only the ends are there
-        if all(pose is None or _is_at(samples[k], pose) for k, pose in ((0, start), (-1, end))):
+        gaps = [pose - samples[k] for k, pose in ((0, start), (-1, end)) if pose is not None]
+        turns = [np.angle(np.exp(1j * gap[2])) for gap in gaps]
+        if all(np.hypot(*gap[:2]) < EXACT_M and abs(turn) < EXACT_RAD for gap, turn in zip(gaps, turns)):
             return samples, rows
         share = np.linspace(0.0, 1.0, max(int(np.ceil(way[-1] / SAMPLE_M)), 2) + 1)
         samples = samples[0] + share[:, None] * (samples[1] - samples[0])
@@ -156,11 +133,6 @@ def _pinned(samples: Array, rows: Array, start: Array | None, end: Array | None)
             moved[k, :2] = pose[:2]
             moved[k, 2] = samples[k, 2] + np.angle(np.exp(1j * (pose[2] - samples[k, 2])))
     return moved, rows
-
-
-def _is_at(sample: Array, pose: Array) -> bool:
-    turn = np.angle(np.exp(1j * (pose[2] - sample[2])))
-    return bool(np.hypot(*(pose[:2] - sample[:2])) < EXACT_M and abs(turn) < EXACT_RAD)
 
 
 def _spline(xy_m: Array) -> tuple[Array, Array]:
@@ -219,7 +191,7 @@ def _longest_biarcs(samples: Array) -> list[int]:
 def _deviation(samples: Array) -> float:
     """How far the biarc from the first to the last of samples (M, 3) passes from those between."""
     line = joined_pieces(_biarc(samples[0], samples[-1]))
-    if abs(samples[-1, 2] - samples[0, 2]) > np.pi / 2 or line.length_m == 0:
+    if abs(samples[-1, 2] - samples[0, 2]) > np.pi / 2 or not len(line.pieces):
         return np.inf
     travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(samples[:, :2], axis=0).T))])
     x, y, heading = line.at(travelled / travelled[-1] * line.length_m).T
@@ -227,7 +199,7 @@ def _deviation(samples: Array) -> float:
     return float(np.abs(across).max())
 
 
-def _biarc(start: Array, end: Array) -> list[tuple[float, float, float, float, float]]:
+def _biarc(start: Array, end: Array) -> list[tuple[float, ...]]:
     """Two arcs (x, y, heading, length, curvature) from one x, y, heading (3,) to another, with equal tangent lengths."""
     p, q = start[:2], end[:2]
     t, v = (np.array([np.cos(h), np.sin(h)]) for h in (start[2], end[2]))
@@ -240,7 +212,7 @@ def _biarc(start: Array, end: Array) -> list[tuple[float, float, float, float, f
     return [first, _arc(middle, first[2] + first[3] * first[4], q)]
 
 
-def _arc(start: Array, heading: float, end: Array) -> tuple[float, float, float, float, float]:
+def _arc(start: Array, heading: float, end: Array) -> tuple[float, ...]:
     chord = end - start
     distance = float(np.hypot(*chord))
     c, s = np.cos(heading), np.sin(heading)

@@ -24,9 +24,9 @@ from log2sim.datatypes import (
 )
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
+from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.expected_motion import ends_of
 from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
-from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.plot.layers import lane_arrows, lane_outline, shown_spans
 from log2sim.visualization.plot.viewport import assign_view_roles, is_moving
 
@@ -135,7 +135,7 @@ MAX_BYTES = 3_000_000
 QUALITY = 75  # of 100; artifacts are invisible below the tracks
 
 
-def embed(picture: Background) -> dict[str, Any] | None:
+def embed(picture: GroundMap) -> dict[str, Any] | None:
     """Return the picture as a data URL with its extent, x0, x1, y0, y1, m; None where it shows nothing.
 
     Cut to what it shows; WebP, since that has opacity and every browser shows it.
@@ -186,7 +186,7 @@ def page_document(
     truth: Scenario | None = None,
     replay: Any = None,
     predict_s: float | None = None,
-    background: Background | None = None,
+    background: GroundMap | None = None,
     metrics: Sequence[tuple[str, str]] = (),
 ) -> dict[str, Any]:
     """Assemble the document of a page: name, span of time and a layer each for scenario, truth and replay.
@@ -221,12 +221,23 @@ def page_document(
     shown_entries = [e for name in ("scenario", "replay") for e in layers.get(name, ())]
     times = [np.cumsum(np.cumsum(e["t_s"])) / SCALES["t_s"] for e in shown_entries]
     collisions, shown = [], list(metrics)
+    warned: dict[str, Any] = {"title": "", "events": []}
     if replay is not None:
         from log2sim.simulation.metrics.all_metrics import summarize
+        from log2sim.simulation.warnings import count_warnings, describe_briefly, describe_warning
 
         keys = ("t_s", "until_s", "agents", "belongs_to")
         collisions = [{k: event[k] for k in keys} for event in replay.metrics.get("collisions", ())]
         shown.append(("Replay", summarize(replay)))
+        if replay.warnings is not None:
+            warned["title"] = count_warnings(replay.warnings)
+            warned["events"] = [
+                {
+                    "agent": w.agent, "driver": w.driver, "t_s": w.begin_s, "spans": [list(span) for span in w.spans_s],
+                    "brief": describe_briefly(w), "text": describe_warning(w, replay.warnings),
+                }
+                for w in replay.warnings.events
+            ]  # fmt: skip
     m = scenario.map
     known = m.latitude_deg is not None and m.longitude_deg is not None
     return {
@@ -239,7 +250,7 @@ def page_document(
         "features": feature_columns(scenario),
         "background": None if background is None else embed(background),
         "events": collisions,
-        "warnings": _warnings(replay),
+        "warnings": warned,
         "metrics": [[title, text] for title, text in shown],
         "recording": None,
         "studio": {
@@ -247,23 +258,6 @@ def page_document(
             "paints": {name: list(rgb) for name, rgb in PAINTS.items()}, "corrections": [],
         },
     }  # fmt: skip
-
-
-def _warnings(replay: Any) -> dict[str, Any]:
-    """Describe the warnings of a replay, and say when they hold."""
-    from log2sim.simulation.warnings import count_warnings, describe_briefly, describe_warning
-
-    warnings = None if replay is None else replay.warnings
-    if warnings is None:
-        return {"title": "", "events": []}
-    events = [
-        {
-            "agent": w.agent, "driver": w.driver, "t_s": w.begin_s, "spans": [list(span) for span in w.spans_s],
-            "brief": describe_briefly(w), "text": describe_warning(w, warnings),
-        }
-        for w in warnings.events
-    ]  # fmt: skip
-    return {"title": count_warnings(warnings), "events": events}
 
 
 def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
@@ -279,26 +273,21 @@ def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
             confidence = agent.color.get("confidence")
             sure = "" if confidence is None else f" ({confidence:.2f})"
             entry["paint"] = {"rgb": list(agent.color["rgb"]), "text": f"{agent.color['name']}{sure}"}
-        entry |= mark | _trust(agent)
+        # How far it can be trusted; what nobody knows is left out.
+        points = agent.quality.get("points_median")
+        sigmas = {key: getattr(agent.waypoints, key) for key in SIGMAS}
+        low = () if agent.doubts or not agent.is_doubtful else (Finding("confidence", text=explain_doubt(agent)),)
+        entry |= mark | {
+            "confidence": round(agent.confidence, 4),
+            "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in (*agent.doubts, *low)],
+            "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
+            **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
+            **({"source": source} if (source := _source(agent)) else {}),
+            **{k: second_differences(c, SCALES[k]) for k, c in sigmas.items() if c is not None and np.any(c > 0)},
+        }
         # In which spans, s, each end observed it; nothing where that is not known, as of the ego.
         spans = {end: [[round(t, 3) for t in s] for s in found] for end, found in agent.observed_by.items() if found}
         yield entry | ({"observed_by": spans} if spans and tell_ends else {})
-
-
-def _trust(agent: Agent) -> dict[str, Any]:
-    """Return what is known of how far an agent can be trusted; what nobody knows is left out."""
-    w, points, source = agent.waypoints, agent.quality.get("points_median"), _source(agent)
-    columns = {key: getattr(w, key) for key in SIGMAS}
-    known = {key: c for key, c in columns.items() if c is not None and np.any(c > 0)}
-    low = () if agent.doubts or not agent.is_doubtful else (Finding("confidence", text=explain_doubt(agent)),)
-    return {
-        "confidence": round(agent.confidence, 4),
-        "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in (*agent.doubts, *low)],
-        "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
-        **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
-        **({"source": source} if source else {}),
-        **{key: second_differences(column, SCALES[key]) for key, column in known.items()},
-    }
 
 
 def _source(agent: Agent) -> str:
@@ -310,11 +299,8 @@ def _source(agent: Agent) -> str:
     if not isinstance(detections, int):
         return ""
     parts = [f"{detections} detection{'s' * (detections != 1)}"]
-    if isinstance(cameras, int) and cameras:
-        parts.append(f"{cameras} of them placed by camera")
-    if isinstance(sweeps, int) and sweeps:
-        parts.append(f"{sweeps} more by LiDAR alone")
-    return ", ".join(parts)
+    parts += [f"{cameras} of them placed by camera"] if isinstance(cameras, int) and cameras else []
+    return ", ".join([*parts, *([f"{sweeps} more by LiDAR alone"] if isinstance(sweeps, int) and sweeps else [])])
 
 
 def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from log2sim.datatypes import Log, Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
 from log2sim.localization.choice import localize_like
+from log2sim.road.ground_map import GroundMap
 from log2sim.visualization.page.document import SCALES, page_document
-from log2sim.visualization.plot.drawing import Background
 from log2sim.visualization.recording import Recorded, recording_document
 
 SUFFIXES = (".html", ".htm")
@@ -37,7 +37,7 @@ def write_page(
     truth: Scenario | None = None,
     replay: Any = None,
     predict_s: float | None = None,
-    background: Background | None = None,
+    background: GroundMap | None = None,
     recorded: Recorded | Log | None = None,
     metrics: Sequence[tuple[str, str]] = (),
     overwrite: bool = False,
@@ -56,7 +56,7 @@ def write_page(
         Shown as a layer, and beside the scenario in the plots of an agent.
     predict_s : float, s, or None
         For how long it is shown where agents were expected to go.
-    background : Background or None
+    background : GroundMap or None
         Map of the ground to show below everything; the page holds a copy of at most some megabytes.
     recorded : Log, Recorded or None
         Log whose pictures and LiDAR points are shown, and the size of the page that they have to fit into.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -96,8 +95,15 @@ class AnimatedArtists:
             self.truths.set_verts(
                 [viewport.footprints(a, pose[:2], pose[2])[0] for a, pose in there if pose is not None]
             )
-        if self.replayed:
-            self._show_driven(t_s)
+        driven, colors = [], []
+        for replayed, role in self.replayed:
+            t = np.asarray(replayed.t_s)
+            if len(t) and t[0] - 1e-6 <= t_s <= t[-1] + 1e-6:
+                x, y, yaw = (np.interp(t_s, t, c) for c in (replayed.x_m, replayed.y_m, np.unwrap(replayed.yaw_rad)))
+                driven.append(viewport.footprints(role.agent, (x, y), yaw)[0])
+                colors.append(to_rgba(INK if not role.leading else role.color))
+        self.driven.set_verts(driven)
+        self.driven.set_edgecolor(colors)
         for collection in self.collections:
             self.layout.ax.draw_artist(collection)
         self.signals.show(t_s)
@@ -109,18 +115,6 @@ class AnimatedArtists:
         self.layout.figure.draw_artist(self.stamp)
         if self.charts is not None:
             self.charts.show(t_s)
-
-    def _show_driven(self, t_s: float) -> None:
-        verts, colors = [], []
-        for driven, role in self.replayed:
-            t = np.asarray(driven.t_s)
-            if len(t) and t[0] - 1e-6 <= t_s <= t[-1] + 1e-6:
-                x, y = np.interp(t_s, t, driven.x_m), np.interp(t_s, t, driven.y_m)
-                yaw = np.interp(t_s, t, np.unwrap(driven.yaw_rad))
-                verts.append(viewport.footprints(role.agent, (x, y), yaw)[0])
-                colors.append(to_rgba(INK if not role.leading else role.color))
-        self.driven.set_verts(verts)
-        self.driven.set_edgecolor(colors)
 
 
 def _pose(agent: Agent, t_s: float) -> Array | None:
@@ -135,26 +129,18 @@ WIDTH_PX = {".gif": 960, ".mp4": 1280, ".webm": 1280}  # without a size of the u
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class FrameTiming:
-    """How many frames an animation has and how far apart they are."""
+def choose_frames(span: TimeRange, options: PlotOptions, suffix: str) -> tuple[int, float, float]:
+    """Return the number of frames of a film, the step from one to the next, s of the scenario, and the frames a second.
 
-    frames: int
-    step_s: float  # of the scenario from frame to frame
-    start_s: float  # time of the first frame
-    fps: float  # frames that are shown a second
-
-
-def choose_frame_timing(span: TimeRange, options: PlotOptions, suffix: str) -> FrameTiming:
-    """Choose the frames of a film: in real time, or faster where it would take longer than `MAX_REAL_TIME_S`."""
+    In real time, or faster where it would take longer than `MAX_REAL_TIME_S`.
+    """
     fps = FPS[suffix] if options.fps is None else options.fps
     if suffix == ".gif":
         fps = 100 / round(100 / fps)  # a .gif states the time of a frame in hundredths of a second
     if options.speed is not None:
-        frames = int(span.duration_s * fps / options.speed + 1e-6) + 1
-        return FrameTiming(frames, options.speed / fps, span.start_s, fps)
+        return int(span.duration_s * fps / options.speed + 1e-6) + 1, options.speed / fps, fps
     frames = max(round(min(span.duration_s, MAX_REAL_TIME_S[suffix]) * fps), 0) + 1
-    return FrameTiming(frames, span.duration_s / (frames - 1) if frames > 1 else 1.0 / fps, span.start_s, fps)
+    return frames, span.duration_s / (frames - 1) if frames > 1 else 1.0 / fps, fps
 
 
 def write_animation(
@@ -165,22 +151,20 @@ def write_animation(
     layout, step_s, charts, _ = draw_base(scenario, roles, overlays, moving=True)
     drawing.draw_tracks(layout.ax, roles, layout.view, step_s, alpha=TRACK_ALPHA, faint=True)
     layout.set_width_px((overlays.options.size_px or (WIDTH_PX[suffix], 0))[0])
-    timing = choose_frame_timing(overlays.span_of(scenario), overlays.options, suffix)
-    artists = AnimatedArtists(layout, roles, overlays, timing.step_s * timing.fps, charts, scenario.signals)
+    span = overlays.span_of(scenario)
+    count, frame_s, fps = choose_frames(span, overlays.options, suffix)
+    artists = AnimatedArtists(layout, roles, overlays, frame_s * fps, charts, scenario.signals)
+
+    def frames() -> Iterator[Image]:  # RGB (H, W, 3); static artists are drawn once
+        canvas: Any = layout.figure.canvas  # its methods have no type hints
+        canvas.draw()
+        background = canvas.copy_from_bbox(layout.figure.bbox)
+        for k in range(count):
+            canvas.restore_region(background)
+            artists.show(span.start_s + k * frame_s)
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            progress("draw", k + 1, count)
+
     with replaced(film.path) as temporary:
         write = film.write or partial(write_gif, colors=[role.color for role in roles.movers] + [ALARM])
-        write(draw_frames(layout, artists, timing, progress), temporary, timing.fps)
-
-
-def draw_frames(
-    layout: FigureLayout, artists: AnimatedArtists, timing: FrameTiming, progress: Progress
-) -> Iterator[Image]:
-    """Yield RGB frames (H, W, 3); static artists are drawn once."""
-    canvas: Any = layout.figure.canvas  # its methods have no type hints
-    canvas.draw()
-    background = canvas.copy_from_bbox(layout.figure.bbox)
-    for k in range(timing.frames):
-        canvas.restore_region(background)
-        artists.show(timing.start_s + k * timing.step_s)
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        progress("draw", k + 1, timing.frames)
+        write(frames(), temporary, fps)

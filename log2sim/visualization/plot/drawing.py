@@ -3,48 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array
+from log2sim.road.ground_map import GroundMap
 from log2sim.visualization.plot import viewport
 from log2sim.visualization.plot.style import COLLISION_MARK, INK, PAPER, PARKED_EDGE, PARKED_FACE
-from log2sim.visualization.plot.viewport import (
-    AgentRole,
-    AgentRoles,
-    Viewport,
-    centers_xy,
-    is_moving,
-    paint_of,
-)
+from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, is_moving, paint_of
 
 BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, REPLAY, BOX, LABEL = range(1, 9)  # z-order, from the bottom up
 
 
-class Background(Protocol):
-    """Bird's-eye view of the ground, such as `mapping.ground_map.GroundMap`."""
-
-    @property
-    def image_bgr(self) -> NDArray[np.uint8]:
-        """Return the image (R, C, 3), row 0 in the north."""
-
-    @property
-    def alpha(self) -> NDArray[np.uint8]:
-        """Return the opacity (R, C), 0 where nothing is known."""
-
-    @property
-    def extent_m(self) -> tuple[float, float, float, float]:
-        """Return x0, x1, y0, y1 of the outer edges, m, map frame."""
-
-
-def draw_background(ax: Axes, picture: Background) -> None:
+def draw_background(ax: Axes, picture: GroundMap) -> None:
     """Draw a top-down picture below everything, lightened so that tracks stand out."""
     pale = 0.62 * picture.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
     rgba = np.dstack([np.rint(pale).astype(np.uint8), (picture.alpha * 0.95).astype(np.uint8)])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -53,20 +54,16 @@ class FilmFile:
 
 def choose_film_file(requested: Path) -> FilmFile:
     """Choose the encoder for an .mp4 or .webm: what is installed of PyAV's, else a .webm by OpenCV."""
-    av = _import_av()
     suffix = requested.suffix.lower()
-    if suffix == ".mp4" and _can_encode(av, H264):
+    if suffix == ".mp4" and _can_encode(H264):
         return FilmFile(requested, lambda frames, path, fps: write_with_av(frames, path, fps, H264, "mp4"))
     path = requested if suffix == ".webm" else requested.with_suffix(".webm")
     note = None
     if suffix == ".mp4":
-        why = (
-            f"needs the extra 'video' ({install_command('video')})"
-            if av is None
-            else "needs H.264, which this PyAV lacks"
-        )
+        missing = f"needs the extra 'video' ({install_command('video')})"
+        why = "needs H.264, which this PyAV lacks" if find_spec("av") else missing
         note = f"{requested.name} {why}; written as {path.name}"
-    if _can_encode(av, VP9):
+    if _can_encode(VP9):
         return FilmFile(path, lambda frames, path, fps: write_with_av(frames, path, fps, VP9, "webm"), note)
     return FilmFile(path, write_with_opencv, note)
 
@@ -126,13 +123,28 @@ def write_gif(frames: Iterator[Image], path: Path, fps: float, colors: Sequence[
     from PIL import Image as Pillow
 
     first = next(frames)
-    palette = Pillow.fromarray(_with_swatches(first, colors)).quantize(CLEAR, dither=Pillow.Dither.NONE)
+    # A palette is chosen by area, so that the frame is widened by swatches of the agents' colors.
+    full = np.array([to_rgb(color) for color in colors])
+    mixes = [alpha * full + (1 - alpha) * np.array(to_rgb(PAPER)) for alpha in (1.0, TAIL_ALPHA, TRACK_ALPHA)]
+    rgb = np.rint(255 * np.concatenate(mixes)).astype(np.uint8)
+    row = np.arange(len(first)) * len(rgb) // len(first)
+    wide = np.concatenate([first, np.repeat(rgb[row][:, None], SWATCH_PX, axis=1)], axis=1)
+    palette = Pillow.fromarray(wide).quantize(CLEAR, dither=Pillow.Dither.NONE)
     settings = {"loop": 0, "duration": round(1000 / fps), "disposal": 1, "transparency": CLEAR}
     before: NDArray[np.uint8] | None = None
     with path.open("wb") as file:
         for frame in itertools.chain([first], frames):
             now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
-            (top, left), shown = _changed_part(now, before)
+            (top, left), shown = (0, 0), now
+            if (
+                before is not None
+            ):  # the part that is not as before, its unchanged pixels transparent: several times smaller
+                changed = now != before
+                rows, columns = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
+                top, bottom = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 1)
+                left, right = (int(columns[0]), int(columns[-1]) + 1) if len(columns) else (0, 1)
+                part = np.s_[top:bottom, left:right]
+                shown = np.where(changed[part], now[part], np.uint8(CLEAR))
             picture = Pillow.fromarray(shown)
             picture.putpalette(palette.getpalette() or ())
             if before is None:
@@ -142,37 +154,12 @@ def write_gif(frames: Iterator[Image], path: Path, fps: float, colors: Sequence[
         file.write(b";")
 
 
-def _changed_part(
-    now: NDArray[np.uint8], before: NDArray[np.uint8] | None
-) -> tuple[tuple[int, int], NDArray[np.uint8]]:
-    """Return row and column of the part of a frame that is not as before, and that with unchanged pixels made transparent.
-
-    Both make the file several times smaller.
-    """
-    if before is None:
-        return (0, 0), now
-    changed = now != before
-    rows, columns = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
-    top, bottom = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 1)
-    left, right = (int(columns[0]), int(columns[-1]) + 1) if len(columns) else (0, 1)
-    part = np.s_[top:bottom, left:right]
-    return (top, left), np.where(changed[part], now[part], np.uint8(CLEAR))
-
-
-def _import_av() -> Any:
+def _can_encode(codec: str) -> bool:
     try:
         import av
-    except ImportError:
-        return None
-    return av
 
-
-def _can_encode(av: Any, codec: str) -> bool:
-    if av is None:
-        return False
-    try:
         av.codec.Codec(codec, "w")
-    except ValueError:  # UnknownCodecError is one
+    except (ImportError, ValueError):  # UnknownCodecError is one
         return False
     return True
 
@@ -202,12 +189,3 @@ def _replace_track_number(path: Path) -> None:
         for found in re.finditer(rb"[\x73\x63]\xc5\x88.{8}", head, re.DOTALL):
             file.seek(found.end() - 8)
             file.write((1).to_bytes(8, "big"))
-
-
-def _with_swatches(frame: Image, colors: Sequence[str]) -> Image:
-    """Widen a frame by swatches of the agents' colors, since a palette is chosen by area."""
-    full = np.array([to_rgb(color) for color in colors])
-    mixes = [alpha * full + (1 - alpha) * np.array(to_rgb(PAPER)) for alpha in (1.0, TAIL_ALPHA, TRACK_ALPHA)]
-    rgb = np.rint(255 * np.concatenate(mixes)).astype(np.uint8)
-    row = np.arange(len(frame)) * len(rgb) // len(frame)
-    return np.concatenate([frame, np.repeat(rgb[row][:, None], SWATCH_PX, axis=1)], axis=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,11 +26,11 @@ from log2sim.datatypes import (
     explain_doubt,
 )
 from log2sim.geometry import Array
-from log2sim.simulation.expected_motion import ends_of
+from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.visualization.plot import viewport
-from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, Background, add_lines, add_polygons
+from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, add_lines, add_polygons
 from log2sim.visualization.plot.selection import NO_OPTIONS, PlotOptions, TimeRange
 from log2sim.visualization.plot.style import (
     BORDER_COLOR,
@@ -53,11 +53,6 @@ from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport,
 
 STEP_S = 0.1  # between the points of a line: ends observe at the rate of their LiDARs
 WIDTH_PT, BESIDE_PT = 1.3, 3.4  # width of a line, and how far to the right of the track it is
-
-
-def tells_ends(scenario: Scenario) -> bool:
-    """Whether both ends of a cooperative log observed somebody, so that there is something to distinguish."""
-    return len(ends_of(scenario)) > 1
 
 
 def draw_observers(ax: Axes, roles: AgentRoles, view: Viewport) -> None:
@@ -128,13 +123,6 @@ ELLIPSE_ALPHA, ELLIPSE_EDGE_ALPHA = 0.14, 0.6
 _CIRCLE = np.exp(2j * np.pi * np.arange(36) / 36)
 
 
-class Expected(NamedTuple):
-    """A prediction to draw."""
-
-    path_m: Array  # (H + 1, 2) from where the agent is to where it is expected to be
-    ellipse_m: Array  # (V, 2) one standard deviation about the end
-
-
 class PredictedPaths:
     """Predictions of the agents of a scenario, to be drawn at times."""
 
@@ -143,8 +131,11 @@ class PredictedPaths:
         self._found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
         self._rows = {a.id: self._found.rows_of(a.id) for a in scenario.agents}
 
-    def at(self, agent: str, t_s: float) -> Expected | None:
-        """Return what was expected of an agent at the last tick up to a time; None when it is absent or stands."""
+    def at(self, agent: str, t_s: float) -> tuple[Array, Array] | None:
+        """Return what was expected of an agent at the last tick up to a time; None when it is absent or stands.
+
+        The path (H + 1, 2), m, from where it is to where it is expected to be, and the ellipse (V, 2) of one standard deviation there.
+        """
         found, rows = self._found, self._rows[agent]
         table, ticks = found.table, found.tick[rows]
         k = int(np.searchsorted(table.t_s[ticks], t_s + 1e-6, side="right")) - 1
@@ -156,7 +147,7 @@ class PredictedPaths:
         path = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
         along, across = forecast.sigma_m[row, -1]
         rim = path[-1] + forecast.course[row, -1] * (along * _CIRCLE.real + 1j * across * _CIRCLE.imag)
-        return Expected(*(np.column_stack([z.real, z.imag]) for z in (path, rim)))
+        return np.column_stack([path.real, path.imag]), np.column_stack([rim.real, rim.imag])
 
     def times_of(self, agent: str) -> Array:
         """Choose the times (K,), s, at which a still picture shows what was expected of an agent.
@@ -189,12 +180,14 @@ def draw_predictions(ax: Axes, roles: AgentRoles, paths: PredictedPaths) -> None
         ax.add_collection(artist, autolim=False)
 
 
-def show_expected(lines: LineCollection, ellipses: PolyCollection, shown: list[tuple[AgentRole, Expected]]) -> None:
+def show_expected(
+    lines: LineCollection, ellipses: PolyCollection, shown: list[tuple[AgentRole, tuple[Array, Array]]]
+) -> None:
     """Set paths and ellipses in the colors of the agents."""
     colors = [role.color for role, _ in shown]
-    lines.set_segments([expected.path_m for _, expected in shown])
+    lines.set_segments([path for _, (path, _) in shown])
     lines.set_color([to_rgba(color) for color in colors])
-    ellipses.set_verts([expected.ellipse_m for _, expected in shown])
+    ellipses.set_verts([ellipse for _, (_, ellipse) in shown])
     ellipses.set_facecolor([to_rgba(color, ELLIPSE_ALPHA) for color in colors])
     ellipses.set_edgecolor([to_rgba(color, ELLIPSE_EDGE_ALPHA) for color in colors])
 
@@ -205,7 +198,7 @@ class Overlays:
 
     replay: Any = None  # drawn over the scenario, with charts below the map
     truth: Scenario | None = None  # in the time and map of the scenario
-    background: Background | None = None  # A picture of the ground, drawn below everything
+    background: GroundMap | None = None  # A picture of the ground, drawn below everything
     predicted: PredictedPaths | None = None
     title: str | None = None  # none for the name of the scenario
     span: TimeRange | None = None  # range of time that is shown; None for the whole scenario
@@ -331,23 +324,19 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
     if features is None:
         return
     if not over_picture:
-        faces = [lane_outline(lane) for lane in features.lanes]
-        add_polygons(ax, faces, facecolors=LANE_FACE, edgecolors="none", zorder=LANES)
+        outlines = [lane_outline(lane) for lane in features.lanes]
+        add_polygons(ax, outlines, facecolors=LANE_FACE, edgecolors="none", zorder=LANES)
     arrows = [arrow for lane in features.lanes for arrow in lane_arrows(lane)]
     add_polygons(ax, arrows, facecolors=LANE_ARROW, zorder=LANES + 0.1)
     borders = [border.points_m[:, :2] for border in features.borders]
     add_lines(ax, borders, colors=BORDER_COLOR, linewidths=BORDER_PT, zorder=LINES - 0.1)
-    _draw_markings(ax, features.markings, view)
-
-
-def _draw_markings(ax: Axes, markings: Sequence[Marking], view: Viewport) -> None:
-    """Draw lines along their middle, dashed ones with dashes, and outlines of crosswalks and symbols; doubtful ones are pale."""
-    areas = [m for m in markings if m.kind in ("crosswalk", "other")]
+    # Lines along their middle, dashed ones with dashes, and outlines of crosswalks and symbols.
+    areas = [m for m in features.markings if m.kind in ("crosswalk", "other")]
     faces, edges = ([_shade(m, alpha) for m in areas] for alpha in (0.25, 0.9))
     style: dict[str, Any] = {"linewidths": 0.6, "hatch": "////", "zorder": LINES}
     add_polygons(ax, [m.points_m[:, :2] for m in areas], facecolors=faces, edgecolors=edges, **style)
     for dashed in (False, True):
-        lines = [m for m in markings if m not in areas and (m.kind == "dashed") is dashed]
+        lines = [m for m in features.markings if m not in areas and (m.kind == "dashed") is dashed]
         widths = [max(m.width_m / view.m_per_pt, MIN_LINE_PT) for m in lines]
         style = {"linestyles": [DASHES]} if dashed else {"capstyle": "butt"}
         points, colors = [m.points_m[:, :2] for m in lines], [_shade(m, 1.0) for m in lines]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
-from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from log2sim.datatypes import STANDSTILL_MPS, Agent, explain_doubt
@@ -90,9 +89,17 @@ def place_labels(
     Short labels of all movers get their places before any is replaced by the full one, so that the long texts of some do not
     take the room of the others.
     """
+    # Labels keep clear of boxes, points along the leading tracks, and sensors.
+    taken = [_bounds(agent, len(agent.waypoints) // 2) for agent in roles.stationary]
+    r = 1.2 * view.m_per_pt
+    for role in roles.movers:
+        taken.append(_bounds(role.agent, -1))
+        if role.leading:
+            taken.append(_bounds(role.agent, 0))
+            taken.extend((x - r, y - r, x + r, y + r) for x, y in _points_of(role.agent))
     mark = SENSOR_PT / 2 * view.m_per_pt
-    marks = [(s["x_m"] - mark, s["y_m"] - mark, s["x_m"] + mark, s["y_m"] + mark) for s in sensors]
-    room = LabelRoom(view, [*_occupied(roles, view), *marks])
+    taken += [(s["x_m"] - mark, s["y_m"] - mark, s["x_m"] + mark, s["y_m"] + mark) for s in sensors]
+    room = LabelRoom(view, taken)
     tracks = {role.agent.id: _points_of(role.agent) for role in roles.movers}
     labels, told = list[MapLabel](), set[str]()
 
@@ -101,15 +108,28 @@ def place_labels(
         labels.extend([] if place is None else [MapLabel(text, MUTED, place, DETAIL_PT, bold=False)])
         return place is not None
 
-    def place_mover(role: AgentRole, text: str) -> Array | None:
-        anchors = itertools.chain(_end_of(role.agent), _along(role.agent))
-        return room.place(text, MOVER_PT, anchors, _belongs_to(role.agent, tracks))
+    def gap_m(
+        xy_m: Array, place: Array, half: Array
+    ) -> float:  # from the rectangle of a label to the nearest of points (N, 2)
+        return float(np.hypot(*np.maximum(np.abs(xy_m - place) - half, 0.0).T).min(initial=np.inf))
+
+    def place_mover(role: AgentRole, text: str) -> Array | None:  # closer to its own track than to any other
+        id, xy = role.agent.id, centers_xy(role.agent)
+        others = np.concatenate([np.zeros((0, 2)), *(xy for other, xy in tracks.items() if other != id)])
+        half = np.full(2, role.agent.size_m[1] / 2)
+        along = [(xy[round(share * (len(xy) - 1))], half) for share in ALONG_TRACK]  # the latest first
+        return room.place(
+            text,
+            MOVER_PT,
+            [_end_of(role.agent), *along],
+            lambda at, h: gap_m(tracks[id], at, h) <= gap_m(others, at, h),
+        )
 
     leading, short_places = [role for role in roles.movers if role.leading], dict[str, Array | None]()
     for role in leading:
         short = short_label(role)
         place = place_mover(role, short)
-        place = room.place(short, MOVER_PT, _end_of(role.agent)) if place is None else place
+        place = room.place(short, MOVER_PT, [_end_of(role.agent)]) if place is None else place
         short_places[role.agent.id] = place
     for role in leading:  # by the full one if there is room for it
         id, short = role.agent.id, short_label(role)
@@ -200,42 +220,10 @@ class LabelRoom:
         )
 
 
-def _belongs_to(agent: Agent, tracks: Mapping[str, Array]) -> Callable[[Array, Array], bool]:
-    """Make a test whether a place for a label is closer to the track of its agent than to any other."""
-    own = tracks[agent.id]
-    others = np.concatenate([np.zeros((0, 2)), *(xy for id, xy in tracks.items() if id != agent.id)])
-    return lambda place, half: _gap_m(own, place, half) <= _gap_m(others, place, half)
-
-
-def _gap_m(xy_m: Array, place: Array, half: Array) -> float:
-    """Compute the distance from the rectangle of a label to the nearest of points (N, 2); infinite without any."""
-    outside = np.maximum(np.abs(xy_m - place) - half, 0.0)
-    return float(np.hypot(*outside.T).min(initial=np.inf))
-
-
-def _end_of(agent: Agent) -> Iterator[Anchor]:
-    """Yield the last box of a mover."""
+def _end_of(agent: Agent) -> Anchor:
+    """Return the last box of a mover."""
     xy_m = centers_xy(agent)[-1]
-    yield xy_m, np.ptp(viewport.footprints(agent, xy_m, agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
-
-
-def _along(agent: Agent) -> Iterator[Anchor]:
-    """Yield places along the track of a mover, the latest first."""
-    xy = centers_xy(agent)
-    for share in ALONG_TRACK:
-        yield xy[round(share * (len(xy) - 1))], np.full(2, agent.size_m[1] / 2)
-
-
-def _occupied(roles: AgentRoles, view: Viewport) -> list[Bounds]:
-    """Collect the bounds of boxes and of points along the leading tracks, which labels keep clear of."""
-    out = [_bounds(agent, len(agent.waypoints) // 2) for agent in roles.stationary]
-    r = 1.2 * view.m_per_pt
-    for role in roles.movers:
-        out.append(_bounds(role.agent, -1))
-        if role.leading:
-            out.append(_bounds(role.agent, 0))
-            out.extend((x - r, y - r, x + r, y + r) for x, y in _points_of(role.agent))
-    return out
+    return xy_m, np.ptp(viewport.footprints(agent, xy_m, agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
 
 
 def _points_of(agent: Agent) -> Array:
@@ -269,7 +257,12 @@ class MovingLabels:
 
     def __init__(self, ax: Axes, view: Viewport, roles: AgentRoles) -> None:
         self._ax, self._view, self._named = ax, view, names_fit(roles)
-        self._texts = {role.agent.id: _hidden_text(ax, role) for role in roles.movers if role.leading}
+        style: dict[str, Any] = {
+            "fontsize": MOVER_PT, "family": FONT, "fontweight": "bold", "parse_math": False, "animated": True, "clip_on": True,
+            "ha": "center", "va": "center_baseline", "zorder": 9,
+        }  # fmt: skip
+        leading = [role for role in roles.movers if role.leading]
+        self._texts = {r.agent.id: ax.text(0, 0, "", color=r.color, path_effects=halo(), **style) for r in leading}
         self._side: dict[str, tuple[int, int]] = {}
 
     def show(self, present: list[tuple[AgentRole, Array, float]]) -> None:
@@ -281,31 +274,16 @@ class MovingLabels:
                 continue
             moves = self._named and abs(speed_mps) >= STANDSTILL_MPS
             text.set_text(short_label(role) + f" · {abs(speed_mps) * 3.6:.0f} km/h" * moves)
-            place = self._place(role.agent.id, text.get_text(), corners, room)
-            if place is not None:
-                text.set_position((place[0], place[1]))
-                self._ax.draw_artist(text)
-
-    def _place(self, id: str, text: str, corners: Array, room: LabelRoom) -> Array | None:
-        """Reserve room for a label, at the side where it was if that is free; None without."""
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        half = room.half_size(text, MOVER_PT)
-        before = self._side.get(id)
-        for side in (before, *MOVING_SIDES) if before is not None else MOVING_SIDES:
-            place = (low + high) / 2 + np.array(side) * ((high - low) / 2 + half + GAP_PT * self._view.m_per_pt)
-            if room.is_free(place, half):
-                room.taken.append((*(place - half), *(place + half)))
-                self._side[id] = side
-                return np.asarray(place)
-        return None
-
-
-def _hidden_text(ax: Axes, role: AgentRole) -> Text:
-    style: dict[str, Any] = {"family": FONT, "fontweight": "bold", "parse_math": False, "animated": True}
-    return ax.text(
-        0, 0, "", color=role.color, fontsize=MOVER_PT, path_effects=halo(), clip_on=True, ha="center",
-        va="center_baseline", zorder=9, **style,
-    )  # fmt: skip
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            half, before = room.half_size(text.get_text(), MOVER_PT), self._side.get(role.agent.id)
+            for side in (before, *MOVING_SIDES) if before is not None else MOVING_SIDES:
+                place = (low + high) / 2 + np.array(side) * ((high - low) / 2 + half + GAP_PT * self._view.m_per_pt)
+                if room.is_free(place, half):
+                    room.taken.append((*(place - half), *(place + half)))
+                    self._side[role.agent.id] = side
+                    text.set_position((place[0], place[1]))
+                    self._ax.draw_artist(text)
+                    break
 
 
 WIDTH_IN = 10.0
@@ -409,10 +387,17 @@ def legend_rows(
     if roles.movers:
         present = mark_step_s is None and not listed  # an animation whose labels tell the speed
         rows.append((_line("none"), "km/h: speed at this time" if present else "km/h: highest speed of each"))
-    for role in sorted(roles.movers, key=_reading_order):
-        if role.leading and role.agent.id not in told:
-            marker = "s" if role.is_ego else role.marker
-            rows.append((_line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6), _name(role)))
+    numbered = []  # the ego first, then ids by their number: car-2 before car-10
+    for role in roles.movers:
+        name = role.agent.id.rstrip("0123456789")
+        numbered.append((not role.is_ego, name, int(role.agent.id[len(name) :] or 0), role.agent.id, role))
+    for *_, id, role in sorted(numbered, key=lambda entry: entry[:4]):
+        if role.leading and id not in told:
+            marker, category = "s" if role.is_ego else role.marker, role.agent.category
+            name = "ego" if role.is_ego else printable_label(id, 20)
+            name += "" if role.is_ego or id.startswith(category) else f" · {category}"
+            line = _line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6)
+            rows.append((line, f"{name} · {speed_text(role.agent)}"))
     rest = sum(not r.leading for r in roles.movers)
     if rest:
         rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther away"))
@@ -458,18 +443,6 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
         column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=INK, ec=INK, lw=0.8))
         column.add_patch(Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=PAPER, ec=INK, lw=0.8))
         column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
-
-
-def _reading_order(role: AgentRole) -> tuple[bool, str, int, str]:
-    """Sort the ego first, then ids by their number: car-2 before car-10."""
-    name, digits = role.agent.id.rstrip("0123456789"), role.agent.id[len(role.agent.id.rstrip("0123456789")) :]
-    return (not role.is_ego, name, int(digits) if digits else 0, role.agent.id)
-
-
-def _name(role: AgentRole) -> str:
-    name, moving = "ego" if role.is_ego else printable_label(role.agent.id, 20), speed_text(role.agent)
-    known = role.is_ego or role.agent.id.startswith(role.agent.category)
-    return f"{name} · {moving}" if known else f"{name} · {role.agent.category} · {moving}"
 
 
 def _line(color: str, **style: Any) -> Line2D:

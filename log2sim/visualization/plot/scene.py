@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from log2sim.datatypes import ENDS, Scenario
+from log2sim.road.ground_map import GroundMap
+from log2sim.simulation.expected_motion import ends_of
 from log2sim.visualization.plot import drawing, layers
 from log2sim.visualization.plot.layout import (
     SIDE_IN,
@@ -44,7 +45,7 @@ Rows = list[tuple[Any, str]]  # handles and texts of a legend
 
 def draw_base(
     scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays, *, moving: bool = False
-) -> tuple[FigureLayout, float, TimelineCharts | None, tuple[MapLabel, ...]]:
+) -> tuple[FigureLayout, float, TimelineCharts | None, list[MapLabel]]:
     """Draw what stills and animations share.
 
     Returns the layout, the seconds between time marks, charts of a replay with a driven agent, and the labels of a still picture,
@@ -63,7 +64,21 @@ def draw_base(
             foot_in=charts_height_in(timeline), aspect=None if size is None else size[1] / size[0],
         )  # fmt: skip
 
-    layout, rows, labels = _fit_labels(scenario, roles, overlays, lay_out, None if moving else step_s)
+    # What finds no room on the map is in the legend, for which the figure grows.
+    leading = {role.agent.id for role in roles.movers if role.leading}
+    labels: list[MapLabel] = []
+    if moving:
+        rows = _legend(scenario, roles, overlays, None, leading if names_fit(roles) else set())
+        layout = lay_out(rows)
+    else:
+        static, sensors = overlays.options.label_static, scenario.sensors
+        told = leading | {agent.id for agent in roles.stationary}
+        layout = lay_out(_legend(scenario, roles, overlays, step_s, told))
+        labels, said = place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
+        if not told <= said | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
+            layout = lay_out(_legend(scenario, roles, overlays, step_s, said))
+            labels, said = place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
+        rows = _legend(scenario, roles, overlays, step_s, said)
     signals_s = None if moving else span.stop_s
     draw_standing(layout.ax, scenario, roles, layout.view, overlays.background, signals_s=signals_s)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
@@ -119,28 +134,6 @@ def _view_of(roles: AgentRoles, options: PlotOptions) -> Viewport:
     return Viewport(min(x0, x1), max(x0, x1), min(y0, y1), max(y0, y1))
 
 
-def _fit_labels(
-    scenario: Scenario,
-    roles: AgentRoles,
-    overlays: layers.Overlays,
-    lay_out: Callable[[Rows], FigureLayout],
-    mark_step_s: float | None,
-) -> tuple[FigureLayout, Rows, tuple[MapLabel, ...]]:
-    """Lay out a figure and place the labels on its map; what found no room there is in the legend, for which the figure grows."""
-    leading = {role.agent.id for role in roles.movers if role.leading}
-    if mark_step_s is None:
-        rows = _legend(scenario, roles, overlays, None, leading if names_fit(roles) else set())
-        return lay_out(rows), rows, ()
-    static, sensors = overlays.options.label_static, scenario.sensors
-    told = leading | {agent.id for agent in roles.stationary}
-    layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, told))
-    labels, said = place_labels(roles, layout.view, mark_step_s, static=static, sensors=sensors)
-    if not told <= said | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
-        layout = lay_out(_legend(scenario, roles, overlays, mark_step_s, said))
-        labels, said = place_labels(roles, layout.view, mark_step_s, static=static, sensors=sensors)
-    return layout, _legend(scenario, roles, overlays, mark_step_s, said), tuple(labels)
-
-
 def _legend(
     scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays, mark_step_s: float | None, told: set[str]
 ) -> Rows:
@@ -155,7 +148,7 @@ def _legend(
     if overlays.predicted is not None and roles.movers:
         dots = Line2D([0, 1], [0, 1], color=MUTED, lw=1.3, ls=(0, (1.0, 1.3)))
         rows.append((dots, f"predicted for {overlays.predicted.horizon_s:g} s, 1 sigma"))
-    if layers.tells_ends(scenario) and mark_step_s is not None:
+    if len(ends_of(scenario)) > 1 and mark_step_s is not None:
         lines = [Line2D([0, 1], [0, 1], color=END_COLOR[end], lw=layers.WIDTH_PT) for end in ENDS]
         rows += [(line, f"observed by the {end} alone") for line, end in zip(lines, ENDS)]
     if layers.warned_events(overlays.replay) and mark_step_s is not None:
@@ -191,7 +184,7 @@ def plot(
     *,
     replay: Any = None,
     truth: Scenario | None = None,
-    background: drawing.Background | None = None,
+    background: GroundMap | None = None,
     legend: bool | None = None,
 ) -> Axes:
     """Draw a scenario from above.
@@ -222,7 +215,18 @@ def plot(
 
         ax = plt.subplots(figsize=SIZE_IN, layout="constrained")[1]
     roles = assign_view_roles(scenario)
-    view = _set_view(ax, roles)
+    # The view is that of axes that show something, else the agents'.
+    extent, per_pt = ax.get_window_extent(), 72 / ax.figure.dpi
+    size_pt = max(extent.width * per_pt, 1.0), max(extent.height * per_pt, 1.0)
+    if ax.has_data():
+        (x0, x1), (y0, y1) = sorted(ax.get_xlim()), sorted(ax.get_ylim())
+        view = Viewport(x0, x1, y0, y1, max((x1 - x0) / size_pt[0], (y1 - y0) / size_pt[1]))
+    else:
+        view = choose_viewport(roles).fitted(*size_pt)
+        ax.set_aspect("equal", adjustable="box")
+        style_axes(ax, grid=False)
+        ax.set_xlabel("x of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
+        ax.set_ylabel("y of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
     step_s = time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
     draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
@@ -235,18 +239,3 @@ def plot(
         rows = legend_rows(roles, step_s, told, collisions=collisions, outside=0, **overlays)
         fill_legend(ax, [*rows, *layers.doubt_rows(roles, told), *layers.road_rows(scenario)], (1.01, 1.0))
     return ax
-
-
-def _set_view(ax: Axes, roles: AgentRoles) -> Viewport:
-    """Style axes, and return the part of the map that they show: theirs where they show something, else the agents'."""
-    extent, per_pt = ax.get_window_extent(), 72 / ax.figure.dpi
-    size_pt = max(extent.width * per_pt, 1.0), max(extent.height * per_pt, 1.0)
-    if ax.has_data():
-        (x0, x1), (y0, y1) = sorted(ax.get_xlim()), sorted(ax.get_ylim())
-        return Viewport(x0, x1, y0, y1, max((x1 - x0) / size_pt[0], (y1 - y0) / size_pt[1]))
-    view = choose_viewport(roles).fitted(*size_pt)
-    ax.set_aspect("equal", adjustable="box")
-    style_axes(ax, grid=False)
-    ax.set_xlabel("x of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
-    ax.set_ylabel("y of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
-    return view

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Scenario
+from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 
@@ -58,7 +58,7 @@ class PlotOptions:
         if self.speed is not None and not 1 / MAX_SPEED <= self.speed <= MAX_SPEED:
             raise ConfigError(f"speed: {self.speed:g}, expected {1 / MAX_SPEED:g} to {MAX_SPEED:g} times real time")
         if self.size_px is not None:
-            width, height = self.size_px or (0, 0)
+            width, height = self.size_px
             if suffix not in IN_PIXELS:
                 raise ConfigError(f"size: {name} has no pixels; choose a name that ends in {_listed(IN_PIXELS)}")
             if not (MIN_SIDE_PX <= width <= MAX_SIDE_PX and MIN_SIDE_PX <= height <= MAX_SIDE_PX):
@@ -191,7 +191,19 @@ def cut_scenario(scenario: Scenario, span: TimeRange) -> Scenario:
     """Return a scenario with what is within a range of its time; times stay, and agents that are not there go."""
     if span.start_s <= 0.0 and span.stop_s >= scenario.duration_s:
         return scenario
-    agents = [cut for agent in scenario.agents if (cut := _cut_agent(agent, span)) is not None]
+    agents = []
+    for agent in scenario.agents:
+        w = agent.waypoints
+        first, last = max(span.start_s, float(w.t_s[0])), min(span.stop_s, float(w.t_s[-1]))
+        if agent.is_permanent:
+            agents.append(agent)
+        elif first <= last:  # its waypoints within the range, and interpolated ones at the ends
+            inside = w.t_s[(w.t_s > first + SAME_TIME_S) & (w.t_s < last - SAME_TIME_S)]
+            t_s = np.concatenate([[first], inside, [last] if last > first else []])
+            taken = w.take(np.searchsorted((w.t_s[1:] + w.t_s[:-1]) / 2, t_s))  # the nearest ones
+            states = agent.at(t_s)
+            exact = {name: getattr(states, name) for name in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")}
+            agents.append(replace(agent, waypoints=replace(taken, t_s=t_s, **exact)))
     return replace(scenario, agents=tuple(agents), duration_s=span.stop_s)
 
 
@@ -199,38 +211,20 @@ def cut_replay(replay: Any, span: TimeRange, scenario: Scenario) -> Any:
     """Return a replay with what is within a range of the scenario's time."""
     if replay is None or (span.start_s <= 0.0 and span.stop_s >= scenario.duration_s):
         return replay
-    agents = [cut for agent in replay.agents if (cut := _cut_states(agent, span)) is not None]
+    agents = []
+    for agent in replay.agents:
+        keep, t_s = span.holds(agent.t_s), agent.t_s
+        if keep.any():
+            commands = agent.commands
+            if commands is not None:
+                commands = replace(commands, **{name: getattr(commands, name)[keep] for name in commands.COLUMNS})
+            columns = {name: getattr(agent, name) for name in (*agent.COLUMNS, *agent.ERRORS)}
+            kept = {name: None if column is None else column[keep] for name, column in columns.items()}
+            agents.append(replace(agent, commands=commands, **kept))
+        elif len(t_s) and t_s[0] < span.start_s and t_s[-1] > span.stop_s:  # what stands has a state at each end
+            agents.append(agent)
     there = {agent.id for agent in agents}
     events = [e for e in replay.metrics.get("collisions", ()) if span.holds(e["t_s"]) and set(e["agents"]) <= there]
     warned = () if replay.warnings is None else (w for w in replay.warnings.events if w.warned is not None)
-    kept = [w for w in warned if span.holds(w.warned.t_s) and {w.driver, w.agent} <= there]
-    return _with(replay, agents, events, kept)
-
-
-def _cut_agent(agent: Agent, span: TimeRange) -> Agent | None:
-    """Return an agent with the waypoints within a range and interpolated ones at its ends; None when it is not there."""
-    w = agent.waypoints
-    if agent.is_permanent:
-        return agent
-    first, last = max(span.start_s, float(w.t_s[0])), min(span.stop_s, float(w.t_s[-1]))
-    if first > last:
-        return None
-    inside = w.t_s[(w.t_s > first + SAME_TIME_S) & (w.t_s < last - SAME_TIME_S)]
-    t_s = np.concatenate([[first], inside, [last] if last > first else []])
-    taken = w.take(np.searchsorted((w.t_s[1:] + w.t_s[:-1]) / 2, t_s))  # the nearest ones
-    states = agent.at(t_s)
-    exact = {name: getattr(states, name) for name in ("x_m", "y_m", "z_m", "yaw_rad", "speed_mps")}
-    return replace(agent, waypoints=replace(taken, t_s=t_s, **exact))
-
-
-def _cut_states(agent: Any, span: TimeRange) -> Any:
-    """Return the states of a replayed agent within a range; None when it is not there."""
-    keep = span.holds(agent.t_s)
-    if not keep.any():  # what stands has a state at the start and one at the end
-        return agent if len(agent.t_s) and agent.t_s[0] < span.start_s and agent.t_s[-1] > span.stop_s else None
-    commands = agent.commands
-    if commands is not None:
-        commands = replace(commands, **{name: getattr(commands, name)[keep] for name in commands.COLUMNS})
-    columns = {name: getattr(agent, name) for name in (*agent.COLUMNS, *agent.ERRORS)}
-    kept = {name: None if column is None else column[keep] for name, column in columns.items()}
-    return replace(agent, commands=commands, **kept)
+    in_time = [w for w in warned if span.holds(w.warned.t_s) and {w.driver, w.agent} <= there]
+    return _with(replay, agents, events, in_time)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,26 +28,18 @@ from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 KMH = 3.6
 
 
-@dataclass(frozen=True, eq=False)
-class TimeCurve:
-    """One curve of a chart."""
-
-    label: str
-    # t_s, values: (T,)
-    t_s: Array
-    values: Array
-    # {"thin", "ribbon", "muted"}, a ribbon is the reference of the thin line over it; muted curves are secondary.
-    style: str = "thin"
+# A curve of a chart: label, times and values (T,), and "thin", "muted" where it is secondary, or "ribbon" where it is the reference
+# of the thin line over it.
+Curve = tuple[str, Array, Array, str]
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+class Chart(NamedTuple):
     """Curves that share axes."""
 
     name: str
     unit: str
     min_span: float  # smallest range of the value axis, in `unit`
-    lines: tuple[TimeCurve, ...]  # an animation shows the present value of the last one
+    lines: tuple[Curve, ...]  # an animation shows the present value of the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +71,7 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
     out = [
         Chart(
             "speed", "km/h", 4.0,
-            (TimeCurve("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), TimeCurve("replay", t, agent.speed_mps * KMH)),
+            (("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), ("replay", t, agent.speed_mps * KMH, "thin")),
         )
     ]  # fmt: skip
     if agent.commands is not None:
@@ -87,19 +79,14 @@ def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
         # The pedal acts along the gear's direction, which in reverse is against the heading.
         response = agent.accel_mps2 * commands.gear
         out += [
-            Chart("pedal", "m/s²", 1.0, (TimeCurve("command", t, commands.pedal_mps2, "ribbon"), TimeCurve("response", t, response))),
+            Chart("pedal", "m/s²", 1.0, (("command", t, commands.pedal_mps2, "ribbon"), ("response", t, response, "thin"))),
             Chart(
                 "steering", "°", 2.0,
-                (
-                    TimeCurve("command", t, np.degrees(commands.steer_rad), "ribbon"),
-                    TimeCurve("response", t, np.degrees(agent.steer_rad)),
-                ),
+                (("command", t, np.degrees(commands.steer_rad), "ribbon"), ("response", t, np.degrees(agent.steer_rad), "thin")),
             ),
         ]  # fmt: skip
-    lines = (
-        TimeCurve("along (+ ahead)", t, agent.along_track_m, "muted"),
-        TimeCurve("across (+ left)", t, agent.cross_track_m),
-    )
+    along, across = agent.along_track_m, agent.cross_track_m
+    lines = (("along (+ ahead)", t, along, "muted"), ("across (+ left)", t, across, "thin"))
     return (*out, Chart("tracking error", "m", 0.1, lines))
 
 
@@ -127,9 +114,9 @@ class TimelineCharts:
     def show(self, t_s: float) -> None:
         """Draw the cursor and the values at `t_s` over the static artists."""
         for ax, chart, cursor, dot, value in self.moving:
-            line = chart.lines[-1]
-            there = line.t_s[0] - 1e-6 <= t_s <= line.t_s[-1] + 1e-6
-            now = float(np.interp(t_s, line.t_s, line.values))
+            _, times_s, values, _ = chart.lines[-1]
+            there = times_s[0] - 1e-6 <= t_s <= times_s[-1] + 1e-6
+            now = float(np.interp(t_s, times_s, values))
             cursor.set_xdata([t_s, t_s])
             dot.set_data([t_s] if there else [], [now] if there else [])
             value.set_text(_number(now, chart) if there else "")
@@ -180,11 +167,17 @@ def _draw_strip(
         "thin": {"color": color, "lw": 1.2},
     }
     ax.set(xlim=span_s, facecolor="#FBFCFD")
-    ax.set_ylim(*_limits(chart))
+    everything = np.concatenate([values for _, _, values, _ in chart.lines])
+    low, high = min(float(everything.min()), 0.0), max(float(everything.max()), 0.0)
+    missing = max(chart.min_span - (high - low), 0.0)
+    # A value that is never negative keeps zero at the bottom.
+    below = 0.0 if low == 0.0 and high >= chart.min_span else missing / 2
+    pad = 0.08 * max(high - low, chart.min_span)
+    ax.set_ylim(low - below - pad, high + missing - below + pad)
     ax.axhline(0.0, color=FRAME, lw=0.8, zorder=1)
     for t in timeline.collisions_s:
         ax.axvline(t, color=ALARM, lw=1.0, zorder=2)
-    handles = [ax.plot(line.t_s, line.values, zorder=3, **styles[line.style])[0] for line in chart.lines]
+    handles = [ax.plot(t_s, values, zorder=3, **styles[style])[0] for _, t_s, values, style in chart.lines]
     style_axes(ax, size_pt=6.5, length_pt=2.0)
     ax.yaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 5, 10]))
     for axis in (ax.xaxis, ax.yaxis):
@@ -192,9 +185,9 @@ def _draw_strip(
     ax.tick_params(labelbottom=last)
     if last:
         ax.set_xlabel("time (s)", fontsize=7.5, color=MUTED, family=FONT)
-    labels = [line.label for line in chart.lines]
+    labels = [label for label, *_ in chart.lines]
     if not moving:
-        largest = [float(line.values[np.argmax(np.abs(line.values))]) for line in chart.lines]
+        largest = [float(values[np.argmax(np.abs(values))]) for _, _, values, _ in chart.lines]
         labels = [f"{label} · max {_number(value, chart)}" for label, value in zip(labels, largest)]
     legend = ax.legend(
         handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
@@ -210,16 +203,6 @@ def _beside(ax: Axes, inches: float) -> float:
     figure = ax.get_figure(root=True)
     assert figure is not None
     return 1.0 + inches / (ax.get_position().width * figure.get_figwidth())
-
-
-def _limits(chart: Chart) -> tuple[float, float]:
-    values = np.concatenate([line.values for line in chart.lines])
-    low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
-    missing = max(chart.min_span - (high - low), 0.0)
-    # A value that is never negative keeps zero at the bottom.
-    below = 0.0 if low == 0.0 and high >= chart.min_span else missing / 2
-    pad = 0.08 * max(high - low, chart.min_span)
-    return low - below - pad, high + missing - below + pad
 
 
 def _number(value: float, chart: Chart) -> str:

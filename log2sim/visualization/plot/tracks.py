@@ -10,7 +10,9 @@ import matplotlib
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
-from log2sim.visualization.plot import drawing, layers, selection
+from log2sim.road.ground_map import GroundMap
+from log2sim.simulation.expected_motion import ends_of
+from log2sim.visualization.plot import layers, selection
 from log2sim.visualization.plot.encoding import FilmFile, choose_film_file
 from log2sim.visualization.plot.layout import FigureLayout, draw_labels
 from log2sim.visualization.plot.scene import draw_base, draw_moving
@@ -23,7 +25,7 @@ def plot_tracks(
     *,
     replay: Any = None,
     truth: Scenario | None = None,
-    background: drawing.Background | None = None,
+    background: GroundMap | None = None,
     predict_s: float | None = None,
     title: str | None = None,
     options: selection.PlotOptions = selection.NO_OPTIONS,
@@ -62,7 +64,11 @@ def plot_tracks(
         write_animation(scenario, roles, film, overlays, progress)
     else:
         layout = still(scenario, roles, overlays)
-        _save(layout, film.path, layout.figure.dpi if options.size_px else dpi)
+        # The same scenario gives the same bytes: no random element names, no dates.
+        left_out: Any = {{".svg": "Date", ".pdf": "CreationDate", ".png": "Software"}[suffix]: None}
+        dots = layout.figure.dpi if options.size_px else dpi
+        with replaced(film.path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
+            layout.figure.savefig(temporary, format=suffix.removeprefix("."), dpi=dots, metadata=left_out)
     return film.path
 
 
@@ -71,7 +77,7 @@ def still(scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays = lay
     layout, step_s, _, labels = draw_base(scenario, roles, overlays)
     ax, replay = layout.ax, overlays.replay
     draw_moving(ax, roles, layout.view, step_s, truth=overlays.truth, replay=replay, ghosts=True)
-    if layers.tells_ends(scenario):
+    if len(ends_of(scenario)) > 1:
         layers.draw_observers(ax, roles, layout.view)
     layers.draw_warnings(ax, replay)
     if overlays.predicted is not None:
@@ -94,11 +100,3 @@ def resolve_picture(requested: Path) -> FilmFile:
             f"not in '{requested.suffix}'"
         )
     return choose_film_file(requested) if suffix in (".mp4", ".webm") else FilmFile(requested)
-
-
-def _save(layout: FigureLayout, path: Path, dpi: float) -> None:
-    # The same scenario gives the same bytes: no random element names, no dates.
-    kind = path.suffix.lower().removeprefix(".")
-    left_out: Any = {{"svg": "Date", "pdf": "CreationDate", "png": "Software"}[kind]: None}
-    with replaced(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "log2sim"}):
-        layout.figure.savefig(temporary, format=kind, dpi=dpi, metadata=left_out)

@@ -138,17 +138,23 @@ def choose_viewport(roles: AgentRoles) -> Viewport:
     movers = [centers_xy(role.agent) for role in roles.movers]
     stationary = np.concatenate([centers_xy(a)[:1] for a in roles.stationary]) if roles.stationary else np.zeros((0, 2))
     if not movers:
-        points = stationary if len(stationary) else np.zeros((1, 2))
-        core = np.median(points, axis=0)[None]
-        return _around(_near(points, core, _limit(points, core)))
-    few = [p[np.linspace(0, len(p) - 1, min(len(p), 24)).round().astype(int)] for p in movers]
-    ego = roles.movers[0].is_ego
-    core = few[0] if ego else np.median(np.concatenate(few), axis=0)[None]
-    everything = np.concatenate(movers)
-    kept = _near(everything, core, _limit(np.concatenate(few), core, crowd=len(movers) > MAX_UNCROWDED_MOVERS))
-    if ego:
-        kept = np.concatenate([kept, _near(stationary, core, STATIONARY_REACH_M)])
-    return _around(kept)
+        kept = stationary if len(stationary) else np.zeros((1, 2))
+        away = _distance(kept, np.median(kept, axis=0)[None])
+        kept = kept[away <= max(REACH_M, 3 * float(np.percentile(away, 75)))]
+    else:
+        few = [p[np.linspace(0, len(p) - 1, min(len(p), 24)).round().astype(int)] for p in movers]
+        ego = roles.movers[0].is_ego
+        core = few[0] if ego else np.median(np.concatenate(few), axis=0)[None]
+        everything, away = np.concatenate(movers), _distance(np.concatenate(few), core)
+        crowd = len(movers) > MAX_UNCROWDED_MOVERS
+        limit_m = max(REACH_M, 2 * float(np.median(away)) if crowd else 3 * float(np.percentile(away, 75)))
+        kept = everything[_distance(everything, core) <= limit_m]
+        if ego:
+            kept = np.concatenate([kept, stationary[_distance(stationary, core) <= STATIONARY_REACH_M]])
+    low, high = kept.min(axis=0), kept.max(axis=0)
+    half = np.maximum((high - low) * 0.54 + MARGIN_M, MIN_SIDE_M / 2)
+    cx, cy = (low + high) / 2
+    return Viewport(cx - half[0], cx + half[0], cy - half[1], cy + half[1])
 
 
 def nice_step(target: float) -> float:
@@ -164,28 +170,12 @@ def time_step_s(duration_s: float, movers: int, speed_mps: float, m_per_pt: floa
     return next((s for s in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0) if s >= min_step_s), 600.0)
 
 
-def _limit(points: Array, core: Array, *, crowd: bool = False) -> float:
-    distance = _distance(points, core)
-    return max(REACH_M, 2 * float(np.median(distance)) if crowd else 3 * float(np.percentile(distance, 75)))
-
-
-def _near(points: Array, core: Array, limit_m: float) -> Array:
-    return points[_distance(points, core) <= limit_m]
-
-
 def _distance(points: Array, core: Array) -> Array:
     """Compute the distance (N,) to the nearest point of the core."""
     nearest = np.full(len(points), np.inf)
     for c in core:
         np.minimum(nearest, np.hypot(points[:, 0] - c[0], points[:, 1] - c[1]), out=nearest)
     return nearest
-
-
-def _around(points: Array) -> Viewport:
-    low, high = points.min(axis=0), points.max(axis=0)
-    half = np.maximum((high - low) * 0.54 + MARGIN_M, MIN_SIDE_M / 2)
-    cx, cy = (low + high) / 2
-    return Viewport(cx - half[0], cx + half[0], cy - half[1], cy + half[1])
 
 
 # Bounds the time for a track that extends far beyond the view.
