@@ -222,8 +222,11 @@ def _opened(index: Index, row: Row, number: int, out: Path | None) -> str:
 
 def _hits(found: Found) -> Sequence[Row]:
     """Return the rows of what was found; where there are none, raise `ConfigError` that says what was closest."""
+    from log2sim.scenarios.logical import TIMING
+
     if not found.rows:
-        raise ConfigError("; ".join(("condition: nothing fulfils it", *found.closest)))
+        said = ("condition: nothing fulfils it", *found.closest, f"what can be varied is {', '.join(TIMING)}")
+        raise ConfigError("; ".join(said))
     return found.rows
 
 
