@@ -11,7 +11,7 @@ import pytest
 from log2sim.geometry import CHI2_2DOF_99, apply_homography, rotation_from_rpy
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
-from log2sim.perception.homography.fit import HomographyFit, ground_covariances
+from log2sim.perception.homography.fit import HomographyFit, draw_samples, ground_covariances, solve_samples
 from log2sim.perception.homography.normalized import (
     NormalizedCorrespondences,
     linearize,
@@ -21,7 +21,6 @@ from log2sim.perception.homography.normalized import (
     scale_free_basis,
     squared_errors,
 )
-from log2sim.perception.homography.ransac import draw_samples, solve_samples
 
 K = np.array([[2050.0, 0.0, 960.0], [0.0, 2050.0, 640.0], [0.0, 0.0, 1.0]])
 HEIGHT_M = 2.1

@@ -12,8 +12,7 @@ from log2sim.datatypes import Log, Measurements, Stream
 from log2sim.geometry import Camera, PoseTrack, apply, apply_homography, inverse, project, rotation_from_rpy, transform
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.rig import Rig, rotation_of
-from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.homography.rig import Rig, RigFit, fit_rig, rotation_of
 from log2sim.perception.homography_stage import fit_homographies
 from log2sim.plan import HomographyScope, Plan
 

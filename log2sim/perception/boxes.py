@@ -6,7 +6,6 @@ All functions work in the length and width axes of the boxes; leading dimensions
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import fields
 from itertools import pairwise
 from typing import Any
@@ -40,8 +39,6 @@ def fit_yaws(xy_m: Array, count: NDArray[np.intp]) -> tuple[Array, Array]:
     Returns `yaw_rad`: (M,): in [0, pi/2); `contrast`: (M,): score of the best direction over the median score, less 1: 0
     for a round or shapeless cluster; below about `MIN_CONTRAST` the yaw carries no information.
 
-    Notes
-    -----
     Closeness criterion of Zhang, Xu, Dong & Dolan, "Efficient L-Shape Fitting for Vehicle Detection Using Laser
     Scanners" (IV 2017), section III-B: a point scores the inverse of its distance to the nearer side. Cost O(45 N), with
     the points of a cluster limited to `MAX_FIT_POINTS` by an even subsample.
@@ -79,45 +76,30 @@ def _contrast(score: Array, best: NDArray[np.intp]) -> Array:
 
 def _closeness(xy: Array, count: NDArray[np.intp], angles: Array, most: int) -> Array:
     """Score (M, K) directions of a rectangle's sides, K for each cluster, by how near its points, at most so many, are to them."""
-    out = np.empty(angles.shape)
-    for rows, points, valid in _chunks(xy, count, most, 2 * angles.shape[1]):
+    out, directions_count = np.empty(angles.shape), 2 * angles.shape[1]
+    start, place, first = np.cumsum(count) - count, np.arange(most), 0
+    # Single precision does for distances within a cluster, which directions tell whatever point they are measured from.
+    columns = np.ascontiguousarray((xy - np.repeat(xy[start], count, axis=0)).T, dtype=np.float32)
+    while first < len(count):
+        # So many clusters at a time that they fit into a cache: points (m, 2, W), evenly spaced in their order.
+        size = max(MAX_OFFSETS // (directions_count * min(int(count[first:].max()), most)), 1)
+        rows = slice(first, first + size)
+        first, width = first + size, min(int(count[rows].max()), most)
+        spaced = np.round(place[:width] * ((count[rows, None] - 1) / (most - 1))).astype(np.intp)
+        chosen = np.where(count[rows, None] > most, spaced, place[:width])
+        valid = place[:width] < count[rows, None]
+        points = columns[:, start[rows, None] + np.where(valid, chosen, 0)].transpose(1, 0, 2)
         c, s = np.cos(angles[rows]), np.sin(angles[rows])
         # Length axes, then width axes: (m, 2 K, 2).
         directions = np.concatenate([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1, dtype=np.float32)
-        distance = _edge_distance(directions @ points, valid)
+        # Distance of every point to the nearer end of all, without one stray point at each.
+        offsets = directions @ points
+        low, high = _lower_end(offsets, valid)[:, :, None], -_lower_end(-offsets, valid)[:, :, None]
+        distance = np.minimum(np.abs(offsets - low), np.abs(high - offsets))
         nearer = np.minimum(distance[:, : angles.shape[1]], distance[:, angles.shape[1] :])
         score = np.reciprocal(np.maximum(nearer, np.float32(MIN_EDGE_DISTANCE_M))) * valid[:, None]
         out[rows] = score.sum(axis=2) / valid.sum(axis=1)[:, None]
     return out
-
-
-def _chunks(
-    xy: Array, count: NDArray[np.intp], most: int, directions: int
-) -> Iterator[tuple[slice, NDArray[np.float32], NDArray[np.bool_]]]:
-    """Divide clusters so that each part fits into a cache: rows, points (m, 2, W), and which of these are points (m, W).
-
-    Points are evenly spaced in their order, at most `most` of a cluster.
-    """
-    start, place = np.cumsum(count) - count, np.arange(most)
-    # Single precision does for distances within a cluster, which directions tell whatever point they are measured from.
-    columns = np.ascontiguousarray((xy - np.repeat(xy[start], count, axis=0)).T, dtype=np.float32)
-    first = 0
-    while first < len(count):
-        size = max(MAX_OFFSETS // (directions * min(int(count[first:].max()), most)), 1)
-        rows = slice(first, first + size)
-        width = min(int(count[rows].max()), most)
-        spaced = np.round(place[:width] * ((count[rows, None] - 1) / (most - 1))).astype(np.intp)
-        chosen = np.where(count[rows, None] > most, spaced, place[:width])
-        valid = place[:width] < count[rows, None]
-        yield rows, columns[:, start[rows, None] + np.where(valid, chosen, 0)].transpose(1, 0, 2), valid
-        first += size
-
-
-def _edge_distance(offsets: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Measure the distance (M, K, W) of every valid value (M, W) to the nearer end of its row, without one stray value at each."""
-    low = _lower_end(offsets, valid)[:, :, None]
-    high = -_lower_end(-offsets, valid)[:, :, None]
-    return np.asarray(np.minimum(np.abs(offsets - low), np.abs(high - offsets)))
 
 
 def _lower_end(offsets: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -255,14 +237,12 @@ def azimuth_step_rad(xy: Array) -> float:
     turned = rotate(xy, -float(np.arctan2(middle[1], middle[0])))
     steps = np.diff(np.sort(np.arctan2(turned[:, 1], turned[:, 0])))
     steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
-    return _median(steps) if len(steps) else 0.0
-
-
-def _median(values: Array) -> float:
-    """Return the median of values (N,), N > 0; `np.median` takes several times as long for a few hundred."""
-    k = len(values) // 2
-    ordered = np.partition(values, k)
-    return float(ordered[k]) if len(values) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
+    if not len(steps):
+        return 0.0
+    # The median; `np.median` takes several times as long for a few hundred.
+    k = len(steps) // 2
+    ordered = np.partition(steps, k)
+    return float(ordered[k]) if len(steps) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
 
 
 def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -271,8 +251,6 @@ def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp],
     `range_m`: (N,), m: distances from the sensor of the points of the first cluster, then those of the next. `count`: (R,):
     number of points of each cluster, at least 1.
 
-    Notes
-    -----
     A ray stands for a surface that grows with the square of the distance. Of every n-th point hardly one would be on
     the far end of a long vehicle beside the sensor.
     """
@@ -339,8 +317,6 @@ def swapped_log_odds(extents_m: Array, whole: NDArray[np.bool_], sigma_m: Array,
     `extents_m`: (2,): of what was seen along both axes. `whole`: (2,): whether that is the whole side; else the side may be
     longer. `sigma_m`: (2,): standard deviation of the extents.
 
-    Notes
-    -----
     The logarithm of a side is normal, with the limits of the category two standard deviations off its middle.
     """
     low, high = (np.log(np.array(t[category][:2])) for t in (MIN_SIZE_M, MAX_SIZE_M))
@@ -398,8 +374,6 @@ def real_ends(
     Returns `real`: (..., 2, 2): for each axis, the kind of its lower and upper end: `FACING_END` for a side that faces the
     sensor, `SIDE_END` for one observed from the side, 0 where the box may extend beyond the points.
 
-    Notes
-    -----
     A side that faces the sensor is real. A side seen at a flat angle shows its near end only; otherwise its ends are the
     right and left ends of the points.
     """
@@ -436,8 +410,6 @@ def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.
     `step_rad`: (...), rad: angle between neighboring rays, from `azimuth_step_rad`. `low`, `high`: (..., 2), m:
     ends of the extents along the length and the width, relative to the sensor. `real`: (..., 2, 2): from `real_ends`.
 
-    Notes
-    -----
     Rays that are a small angle apart meet a side at distance d from the sensor's foot point on it, which is c away, at
     points angle x (c^2 + d^2) / c apart.
     """
@@ -465,8 +437,6 @@ def complete_box(
 
     Returns `center`: (..., 2), m; `sigma_m`: (..., 2): its standard deviation along each axis.
 
-    Notes
-    -----
     The box is aligned with its better real end; between two equally good ones it is centered, nearer to the one where rays
     are closer together, and without any it is centered on the points.
     """
@@ -491,14 +461,10 @@ def corner_correction(
 
     The corner is too round to be hit, and on average it is half the distance `gap_m` between two rays beyond the last one.
     """
-    outward = np.where(real == SIDE_END, _rounding(width_m) + np.asarray(gap_m) / 2, 0.0)
-    return np.asarray(low - outward[..., 0]), np.asarray(high + outward[..., 1])
-
-
-def _rounding(width_m: Array | float) -> Array:
-    """Return how far inside the corner of a box of a width (...) its outermost point is: (..., 1, 1), m."""
     width = np.asarray(width_m)[..., None, None]
-    return np.asarray(np.where(width < MIN_BOX_WIDTH_M, CORNER_ROUNDING_SHARE, BOX_CORNER_ROUNDING_SHARE) * width)
+    rounding = np.where(width < MIN_BOX_WIDTH_M, CORNER_ROUNDING_SHARE, BOX_CORNER_ROUNDING_SHARE) * width
+    outward = np.where(real == SIDE_END, rounding + np.asarray(gap_m) / 2, 0.0)
+    return np.asarray(low - outward[..., 0]), np.asarray(high + outward[..., 1])
 
 
 def oriented_covariance(sigma_m: Array, yaw_rad: Array | float) -> Array:

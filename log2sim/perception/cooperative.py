@@ -220,8 +220,6 @@ def take_off_offset(a: SeenBoxes, b: SeenBoxes, b_all: SeenBoxes) -> SeenBoxes:
 
     `a`, `b`: of the vehicle and of the road, row by row the same objects. `b_all`: N SeenBoxes: of the road.
 
-    Notes
-    -----
     A shift and a turn about the sensor by weighted least squares. Their prior is what registration leaves: a single pair says
     little, and many move the boxes where they agree to. Cauchy's weights make single wrong pairs harmless (Holland & Welsch,
     "Robust regression using iteratively reweighted least-squares", 1977).
@@ -229,16 +227,6 @@ def take_off_offset(a: SeenBoxes, b: SeenBoxes, b_all: SeenBoxes) -> SeenBoxes:
     if not len(a) or b_all.sensor_m is None:
         return b_all
     pivot = b_all.sensor_m[:2]
-    shift, turn = _estimate(a, b, pivot)
-    boxes = b_all.boxes
-    away = boxes.center_m[:, :2] - pivot
-    moved = boxes.center_m.copy()
-    moved[:, :2] += shift + turn * np.column_stack([-away[:, 1], away[:, 0]])
-    return replace(b_all, boxes=replace(boxes, center_m=moved, yaw_rad=boxes.yaw_rad + turn))
-
-
-def _estimate(a: SeenBoxes, b: SeenBoxes, pivot: Array) -> tuple[Array, float]:
-    """Estimate shift (2,), m, and turn, rad, of the road's boxes b."""
     away = b.boxes.center_m[:, :2] - pivot
     difference = a.boxes.center_m[:, :2] - b.boxes.center_m[:, :2]
     precision = np.linalg.inv(a.center_covariance + b.center_covariance + motion_covariance(a, b))
@@ -259,7 +247,10 @@ def _estimate(a: SeenBoxes, b: SeenBoxes, pivot: Array) -> tuple[Array, float]:
         normal[2, 2] += (weight * of_yaw).sum()
         right[2] += (weight * of_yaw * turned).sum()
         x = np.linalg.solve(normal, right)
-    return x[:2], float(x[2])
+    boxes, away, turn = b_all.boxes, b_all.boxes.center_m[:, :2] - pivot, float(x[2])
+    moved = boxes.center_m.copy()
+    moved[:, :2] += x[:2] + turn * np.column_stack([-away[:, 1], away[:, 0]])
+    return replace(b_all, boxes=replace(boxes, center_m=moved, yaw_rad=boxes.yaw_rad + turn))
 
 
 # Lower and upper side of the one box, then of the other.
@@ -322,29 +313,65 @@ def merge_by_covariance(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
 
     Pairs that contradict each other, in their axes or their sides, take the box whose sides are better known as a whole.
     """
-    axes, apart_rad = _join_axes(a, b)
-    first, second = (_in_axes(seen, axes, a.boxes.center_m[:, :2]) for seen in (a, b))
+    # The share of the second box in what has no error of its own, by the variance of the sides.
+    variance_a, variance_b = ((seen.sigma_m**2).sum(axis=(1, 2)) for seen in (a, b))
+    weight = variance_a / (variance_a + variance_b)
+    # The mean axis and heading; the axes of pedestrians say little: the surer one is taken, and none is said to be off.
+    better, walking = _choose(weight > 0.5, b, a), is_walking(a.boxes)
+    apart_rad = wrap_angle(2 * (b.boxes.yaw_rad - a.boxes.yaw_rad)) / 2
+    va, vb = a.sigma_rad**2, b.sigma_rad**2
+    axis = np.where(walking, better.boxes.yaw_rad, a.boxes.yaw_rad + va / (va + vb) * apart_rad)
+    ahead = sum(
+        np.sign(np.cos(seen.boxes.yaw_rad - axis)) * log_odds_of(np.clip(seen.boxes.heading_score, 0.5, MAX_SCORE))
+        for seen in (a, b)
+    )
+    ahead = np.where(walking, log_odds_of(np.clip(better.boxes.heading_score, 0.5, MAX_SCORE)), ahead)
+    yaw, apart_rad = wrap_angle(axis + np.where(ahead < 0, np.pi, 0.0)), np.where(walking, 0.0, apart_rad)
+    # Sides (P, 2, 2) along this axis relative to the centers of a, and their standard deviations.
+    sides_of = []
+    for seen in (a, b):
+        center, half = rotate(seen.boxes.center_m[:, :2] - a.boxes.center_m[:, :2], -yaw), seen.boxes.size_m[:, :2] / 2
+        turned = np.cos(seen.boxes.yaw_rad - yaw) < 0
+        sigma_m = np.where(turned[:, None, None], seen.sigma_m[..., ::-1], seen.sigma_m)
+        sides_of.append((np.stack([center - half, center + half], axis=-1), sigma_m))
+    first, second = sides_of
     # The time of those points that say most, which later stages measure again.
     t_ns = np.where(b.boxes.points > a.boxes.points, b.boxes.t_ns, a.boxes.t_ns)
     late_s = np.stack([(t - t_ns) / NS_PER_S for t in (a.boxes.t_ns, a.boxes.t_ns, b.boxes.t_ns, b.boxes.t_ns)], axis=1)
     speed = first_speeds(a.boxes)[:, None]
     moves = np.concatenate([speed, np.where(is_walking(a.boxes)[:, None], speed, 0.0)], axis=1)
-    pose_m = _pose_sigma(first, second, late_s, moves)
-    sides, covariance, misfit = _solve(first, second, late_s, moves, pose_m)
-    low, high = sides[..., 0], sides[..., 1]
-    center = rotate((low + high) / 2, axes.boxes.yaw_rad) + a.boxes.center_m[:, :2]
-    weight = _share_of_second(a, b)
-    z, height = (u + weight * (v - u) for u, v in zip(_vertical(a.boxes), _vertical(b.boxes)))
+    # How far the road's sensors are off: what the distances of all pairs show beyond the errors of their boxes, by the moment
+    # estimator of DerSimonian & Laird, "Meta-analysis in clinical trials" (1986), of all axes with equal weights.
+    off_m = second[0].mean(axis=-1) - first[0].mean(axis=-1)
+    c, difference = _covariance(first[1], second[1], late_s, moves, 0.0), np.array([-0.5, -0.5, 0.5, 0.5])
+    expected = np.einsum("i,paij,j->pa", difference, c, difference)
+    of_pair = 1 / (expected + POSE_SIGMA_M**2)
+    beyond = float((of_pair * (off_m**2 - expected)).sum() / of_pair.sum()) if of_pair.size else 0.0
+    pose_m = float(np.sqrt(max(beyond, POSE_SIGMA_M**2)))
+    # Lower and upper sides (P, 2, 2), their covariances (P, 2, 2, 2) and the squared misfit (P,), of 4 degrees of freedom.
+    observed = np.concatenate([first[0], second[0]], axis=-1)[..., None]
+    precision = np.linalg.inv(_covariance(first[1], second[1], late_s, moves, pose_m))
+    covariance = np.linalg.inv(_SIDES.T @ precision @ _SIDES)
+    sides = covariance @ _SIDES.T @ precision @ observed
+    rest = observed - _SIDES @ sides
+    misfit = (np.swapaxes(rest, -1, -2) @ precision @ rest)[..., 0, 0].sum(axis=1) + apart_rad**2 / (va + vb)
+    low, high = sides[..., 0, 0], sides[..., 1, 0]
+    center = rotate((low + high) / 2, yaw) + a.boxes.center_m[:, :2]
+    z, height = (
+        getattr(a.boxes, name)[:, 2] + weight * (getattr(b.boxes, name)[:, 2] - getattr(a.boxes, name)[:, 2])
+        for name in ("center_m", "size_m")
+    )
     merged = replace(
-        axes.boxes,
+        better.boxes,
         t_ns=t_ns,
         center_m=np.column_stack([center, z]),
         size_m=np.column_stack([np.maximum(high - low, MIN_SIZE_M), height]),
+        yaw_rad=np.asarray(yaw),
+        heading_score=np.minimum(probability_of(np.abs(ahead)), MAX_SCORE),
     )
-    misfit = misfit + apart_rad**2 / (a.sigma_rad**2 + b.sigma_rad**2)
     contradict = (np.abs(apart_rad) > MAX_TURN_RAD) | (misfit > CHI2_5DOF_999)
     variance = np.stack([covariance[..., 0, 0], covariance[..., 1, 1]], axis=-1)
-    chosen = _choose(contradict, _take_better(a, b), SeenBoxes(merged, np.sqrt(variance), axes.sigma_rad))
+    chosen = _choose(contradict, better, SeenBoxes(merged, np.sqrt(variance), np.sqrt(va * vb / (va + vb))))
     return replace(chosen, boxes=_join_evidence(chosen.boxes, a.boxes, b.boxes))
 
 
@@ -396,21 +423,6 @@ METHODS = {
 """Overlap alone is the feature-level fusion of Chen, "Intelligent Perception System for Vehicle-Road Cooperation"."""
 
 
-def _vertical(boxes: Boxes3D) -> tuple[Array, Array]:
-    return boxes.center_m[:, 2], boxes.size_m[:, 2]
-
-
-def _share_of_second(a: SeenBoxes, b: SeenBoxes) -> Array:
-    """Return the share (P,) of the second box in what has no error of its own, by the variance of the sides."""
-    va, vb = ((seen.sigma_m**2).sum(axis=(1, 2)) for seen in (a, b))
-    return np.asarray(va / (va + vb))
-
-
-def _take_better(a: SeenBoxes, b: SeenBoxes) -> SeenBoxes:
-    """Take of each pair the box whose sides are better known."""
-    return _choose(_share_of_second(a, b) > 0.5, b, a)
-
-
 def _choose(mask: NDArray[np.bool_], one: SeenBoxes, other: SeenBoxes) -> SeenBoxes:
     """Take rows (P,) of the one where the mask is set, else of the other."""
     return join([one, other]).take(np.where(mask, 0, len(one)) + np.arange(len(one)))
@@ -424,35 +436,6 @@ def _join_evidence(boxes: Boxes3D, a: Boxes3D, b: Boxes3D) -> Boxes3D:
     return replace(boxes, score=score, category=category, points=a.points + b.points, seen_by=seen_by)
 
 
-def _join_axes(a: SeenBoxes, b: SeenBoxes) -> tuple[SeenBoxes, Array]:
-    """Return boxes (P,) with the mean axis and heading of both, and the angles (P,) between their axes.
-
-    The axes of pedestrians say little: the surer one is taken, and none is said to be off.
-    """
-    better, walking = _take_better(a, b), is_walking(a.boxes)
-    apart = wrap_angle(2 * (b.boxes.yaw_rad - a.boxes.yaw_rad)) / 2
-    va, vb = a.sigma_rad**2, b.sigma_rad**2
-    axis = np.where(walking, better.boxes.yaw_rad, a.boxes.yaw_rad + va / (va + vb) * apart)
-    ahead = sum(
-        np.sign(np.cos(seen.boxes.yaw_rad - axis)) * log_odds_of(np.clip(seen.boxes.heading_score, 0.5, MAX_SCORE))
-        for seen in (a, b)
-    )
-    ahead = np.where(walking, log_odds_of(np.clip(better.boxes.heading_score, 0.5, MAX_SCORE)), ahead)
-    yaw = wrap_angle(axis + np.where(ahead < 0, np.pi, 0.0))
-    heading = np.minimum(probability_of(np.abs(ahead)), MAX_SCORE)
-    boxes = replace(better.boxes, yaw_rad=np.asarray(yaw), heading_score=heading)
-    return SeenBoxes(boxes, better.sigma_m, np.sqrt(va * vb / (va + vb))), np.where(walking, 0.0, apart)
-
-
-def _in_axes(seen: SeenBoxes, axes: SeenBoxes, origin: Array) -> tuple[Array, Array]:
-    """Return the sides (P, 2, 2) of boxes along the axes of others, relative to origins (P, 2), and their standard deviations."""
-    center = rotate(seen.boxes.center_m[:, :2] - origin, -axes.boxes.yaw_rad)
-    half = seen.boxes.size_m[:, :2] / 2
-    turned = np.cos(seen.boxes.yaw_rad - axes.boxes.yaw_rad) < 0
-    sigma = np.where(turned[:, None, None], seen.sigma_m[..., ::-1], seen.sigma_m)
-    return np.stack([center - half, center + half], axis=-1), sigma
-
-
 def _covariance(first: Array, second: Array, late_s: Array, moves: Array, pose_m: Array | float) -> Array:
     """Return the covariances (P, 2, 4, 4) of the four sides along both axes."""
     out = np.zeros((*first.shape[:2], 4, 4))
@@ -461,33 +444,6 @@ def _covariance(first: Array, second: Array, late_s: Array, moves: Array, pose_m
     out += (moves**2)[..., None, None] * late
     out += np.asarray(pose_m) ** 2 * np.outer(_OF_OTHER, _OF_OTHER)
     return out
-
-
-def _pose_sigma(first: tuple[Array, Array], second: tuple[Array, Array], late_s: Array, moves: Array) -> float:
-    """Estimate how far the road's sensors are off: what the distances of all pairs show beyond the errors of their boxes.
-
-    The moment estimator of DerSimonian & Laird, "Meta-analysis in clinical trials" (1986), of all axes with equal weights.
-    """
-    away = second[0].mean(axis=-1) - first[0].mean(axis=-1)
-    c = _covariance(first[1], second[1], late_s, moves, 0.0)
-    difference = np.array([-0.5, -0.5, 0.5, 0.5])
-    expected = np.einsum("i,paij,j->pa", difference, c, difference)
-    weight = 1 / (expected + POSE_SIGMA_M**2)
-    beyond = float((weight * (away**2 - expected)).sum() / weight.sum()) if weight.size else 0.0
-    return float(np.sqrt(max(beyond, POSE_SIGMA_M**2)))
-
-
-def _solve(
-    first: tuple[Array, Array], second: tuple[Array, Array], late_s: Array, moves: Array, pose_m: float
-) -> tuple[Array, Array, Array]:
-    """Solve for lower and upper sides (P, 2, 2): with their covariances (P, 2, 2, 2) and the squared misfit (P,), 4 degrees."""
-    observed = np.concatenate([first[0], second[0]], axis=-1)[..., None]
-    weight = np.linalg.inv(_covariance(first[1], second[1], late_s, moves, pose_m))
-    covariance = np.linalg.inv(_SIDES.T @ weight @ _SIDES)
-    sides = covariance @ _SIDES.T @ weight @ observed
-    rest = observed - _SIDES @ sides
-    misfit = (np.swapaxes(rest, -1, -2) @ weight @ rest)[..., 0, 0].sum(axis=1)
-    return sides[..., 0], covariance, misfit
 
 
 # Boxes that are no road users must not move points.
@@ -514,8 +470,17 @@ def align_parts(cloud: Cloud, before: Sequence[Boxes3D]) -> Cloud:
     xyz, t_s = cloud.xyz.copy(), cloud.t_s.copy()
     first = np.cumsum([0, *(len(part.xyz) for part in cloud.parts)])
     of_parts = [np.arange(a, b)[part.obstacles] for part, a, b in zip(cloud.parts, first, first[1:])]
-    members = [_members(boxes, speed, cloud, index) for index in of_parts]
-    axis = np.column_stack([np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)])
+    axis, members = np.column_stack([np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)]), []
+    for index in of_parts:
+        if not len(index):
+            members.append([index] * len(boxes))
+            continue
+        # The points in each box where it is at the mean time of all.
+        at_ns = cloud.stamp_ns + int(cloud.t_s[index].mean(dtype=np.float64) * NS_PER_S)
+        center = boxes.center_m - cloud.origin
+        center[:, :2] += (speed * (at_ns - boxes.t_ns) / NS_PER_S)[:, None] * axis
+        found = points_of_boxes(cloud.xyz[index], center, boxes.size_m + 2 * MARGIN_M, boxes.yaw_rad)
+        members.append([index[found.point[found.box == k]] for k in range(len(boxes))])
     for k in range(len(boxes)):
         own = [m[k] for m in members]
         most = max(own, key=len)
@@ -548,19 +513,9 @@ def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     return b.take(i[moves]), speed[moves]
 
 
-def _members(boxes: Boxes3D, speed: Array, cloud: Cloud, index: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Find those of the points at `index` that are in each box where it is at the mean time of these points."""
-    if not len(index):
-        return [index] * len(boxes)
-    at_ns = cloud.stamp_ns + int(cloud.t_s[index].mean(dtype=np.float64) * NS_PER_S)
-    on = speed * (at_ns - boxes.t_ns) / NS_PER_S
-    center = boxes.center_m - cloud.origin
-    center[:, :2] += on[:, None] * np.column_stack([np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)])
-    found = points_of_boxes(cloud.xyz[index], center, boxes.size_m + 2 * MARGIN_M, boxes.yaw_rad)
-    return [index[found.point[found.box == k]] for k in range(len(boxes))]
-
-
 AUTO = "auto"
+# LiDARs at the road do not move; poses scatter by less.
+SAME_PLACE_M = 1.0
 # What labels say is not to be moved.
 LABELS = "lidar:labels"
 
@@ -595,19 +550,19 @@ class EndsDetector:
             return refine_by_views(self.vehicle.detect(cloud, earlier), cloud.parts)
         parts = []
         for view in cloud.views:
-            before = [other for cloud in earlier for other in cloud.views if _is_same_view(view, other)]
+            # Those of the same end and, at the road, of the same place.
+            before = [
+                other
+                for other in (other for cloud in earlier for other in cloud.views if other.end == view.end)
+                if view.end != ROAD
+                or np.linalg.norm(view.sensor + view.origin - other.sensor - other.origin) < SAME_PLACE_M
+            ]
             found = (road if view.end == ROAD else self.vehicle).detect(view, before)
             found = refine_boxes(found, view) if method.refines else found
             found = replace(found, seen_by=seen_from(view.end, len(found)))
             parts.append(SeenBoxes.of(found, view.sensor.astype(np.float64) + view.origin))
         out = reduce(lambda a, b: fuse_boxes(a, b, method), parts).boxes
         return out.take(np.argsort(-out.score, kind="stable"))
-
-
-def _is_same_view(one: Cloud, other: Cloud) -> bool:
-    """Return whether two clouds are of the same end and, at the road, of the same place."""
-    moved: Array = one.sensor + one.origin - other.sensor - other.origin
-    return one.end == other.end and (one.end != ROAD or float(np.linalg.norm(moved)) < 1.0)
 
 
 def create_for_ends(log: Log, config: Config, given: LidarDetector | None = None) -> LidarDetector:

@@ -52,43 +52,13 @@ from log2sim.perception.lidar.cloud import (
     obstacles_of,
 )
 from log2sim.perception.lidar.measure import Frame as MeasuredFrame
-from log2sim.perception.lidar.measure import measure, outside_ego, project_cloud
-from log2sim.perception.lidar.projection import View, view_of
+from log2sim.perception.lidar.measure import measure, outside_ego
+from log2sim.perception.lidar.projection import View, project_points, view_of
 from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
 from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox, add_ranges
 from log2sim.plan import FusionLevel, Plan, Stage
-
-
-@dataclass(frozen=True, eq=False)
-class _Tick:
-    """What is kept of obstacles: `points` holds xyz, t_s and perhaps seen_from, `rays` end, t_s and sensor."""
-
-    stamp_ns: int
-    origin: Array
-    sensor: NDArray[np.float32]
-    viewpoints: NDArray[np.float32] | None
-    points: ArrayList
-    rays: ArrayList
-    lidars: tuple[NDArray[np.float32], NDArray[np.float32]] | None
-
-    def obstacles(self) -> Obstacles:
-        return Obstacles(
-            self.stamp_ns,
-            self.origin,
-            partial(self.points.__getitem__, 0),
-            partial(self.points.__getitem__, 1),
-            self.sensor,
-            None if self.lidars is None else self._rays,
-            self.viewpoints,
-            partial(self.points.__getitem__, 2) if len(self.points) > 2 else None,
-        )
-
-    def _rays(self) -> Rays:
-        assert self.lidars is not None
-        end, t_s, sensor = self.rays
-        return Rays(end, t_s, sensor, *self.lidars)
 
 
 class ObstacleList(Sequence["Obstacles | None"]):
@@ -102,11 +72,24 @@ class ObstacleList(Sequence["Obstacles | None"]):
 
     def __init__(self, file: ArrayFile) -> None:
         self._file = file
-        self._ticks: list[_Tick | None] = []
+        self._ticks: list[Callable[[], Obstacles | None]] = []
 
     def append(self, obstacles: Obstacles | None) -> None:
         """Add those of the next tick."""
-        self._ticks.append(None if obstacles is None else self._kept(obstacles))
+        if obstacles is None:
+            self._ticks.append(lambda: None)
+            return
+        of, free, seen_from = obstacles, obstacles.free, obstacles.seen_from
+        points, rays = (
+            ArrayList([self._file.keep(column) for column in columns if column is not None])
+            for columns in ((of.xyz, of.t_s, seen_from), () if free is None else (free.end, free.t_s, free.sensor))
+        )
+        read = partial(points.__getitem__, 0), partial(points.__getitem__, 1)
+        of_rays = (
+            None if free is None else partial(lambda *lidars: Rays(*rays, *lidars), free.position, free.velocity_mps)
+        )
+        last = None if seen_from is None else partial(points.__getitem__, 2)
+        self._ticks.append(partial(Obstacles, of.stamp_ns, of.origin, *read, of.sensor, of_rays, of.viewpoints, last))
 
     def __len__(self) -> int:
         """Return the number of ticks."""
@@ -114,19 +97,7 @@ class ObstacleList(Sequence["Obstacles | None"]):
 
     def __getitem__(self, tick: Any) -> Any:
         """Return the obstacles of a tick, a list of them for a slice."""
-        if isinstance(tick, slice):
-            return [self[k] for k in range(len(self))[tick]]
-        kept = self._ticks[tick]
-        return None if kept is None else kept.obstacles()
-
-    def _kept(self, of: Obstacles) -> _Tick:
-        points = self._keep_all([of.xyz, of.t_s] + ([] if of.seen_from is None else [of.seen_from]))
-        rays = self._keep_all([] if of.free is None else [of.free.end, of.free.t_s, of.free.sensor])
-        lidars = None if of.free is None else (of.free.position, of.free.velocity_mps)
-        return _Tick(of.stamp_ns, of.origin, of.sensor, of.viewpoints, points, rays, lidars)
-
-    def _keep_all(self, columns: Sequence[NDArray[Any]]) -> ArrayList:
-        return ArrayList([self._file.keep(column) for column in columns])
+        return [make() for make in self._ticks[tick]] if isinstance(tick, slice) else self._ticks[tick]()
 
 
 # Sweeps of each LiDAR that are kept for the next ticks, which may share some.
@@ -214,17 +185,13 @@ class CloudMaker:
     def _listed(self, keys: Sequence[Key]) -> list[tuple[str, int]]:
         return sorted({(name, i) for key in keys for name, i in zip(self._schedule.sweeps, key) if i >= 0})
 
-    def _sweep(self, name: str, i: int, records: RecordSource) -> Sweep | None:
-        sweep = self._sweeps.pop((name, i)) if (name, i) in self._sweeps else records.get(name, i)
-        self._sweeps[name, i] = sweep  # the last one in
-        return sweep
-
     def _read(self, keys: Sequence[Key], records: RecordSource) -> None:
         """Read and judge the sweeps of some clouds in their order, and forget those that only earlier ticks needed."""
         wanted, compensates = self._listed(keys), self._plan.keeps(Stage.MOTION_COMPENSATION)
         self._live = set()
         for name, i in wanted:
-            sweep = self._sweep(name, i, records)
+            sweep = self._sweeps.pop((name, i)) if (name, i) in self._sweeps else records.get(name, i)
+            self._sweeps[name, i] = sweep  # the last one in
             if sweep is None:
                 continue
             if (name, i) not in self._sketches:
@@ -336,6 +303,9 @@ class Task:
     judged: bool = False  # whether all that is to be known of the records is known already
 
 
+MAX_GROUND_POINTS_PER_FRAME = 40
+
+
 class FirstPass:
     """Detection and measurement of parts of a log; what a part holds does not depend on those that this process made before."""
 
@@ -347,13 +317,8 @@ class FirstPass:
         self.step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
         if detectors.cache is not None:
             # Of the plan what this pass looks at, so that other later stages leave the key as it is.
-            looked_at = (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)
-            planned = [
-                plan.detector_stride,
-                plan.picture_stride,
-                plan.fusion,
-                [plan.keeps(stage) for stage in looked_at],
-            ]
+            stages = [plan.keeps(s) for s in (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)]
+            planned = [plan.detector_stride, plan.picture_stride, plan.fusion, stages]
             settings = [config.measure.mode, config.measure.max_range_m, config.lidar.sweeps]
             detectors.cache.begin(log, [list(plan.cameras), planned, *settings, schedule.reference_row])
 
@@ -376,7 +341,7 @@ class FirstPass:
             return part, clock, (0, 0, None)
         with clock.stage("recall"):
             kept = cache.put(key, part)
-        return part, clock, (0, count * kept, cache.store_problem)
+        return part, clock, (0, count * kept, cache.store.problem)
 
     def _content(self, task: Task, records: RecordSource) -> bytes:
         """Return a digest of the records of some ticks, and of all else that what is seen there depends on."""
@@ -386,23 +351,18 @@ class FirstPass:
         shown = [(name, int(self.schedule.frames[name][tick])) for name in cameras for tick in looked]
         described: list[Any] = []
         for name, index in (*(key for key in shown if key[1] >= 0), *self.clouds.sweeps_of(ticks)):
-            stamp = int(self.log.streams[name].t_ns[index])
-            described.append([name, index, stamp, self._record(name, index, records)])
+            stream = self.log.streams[name]
+            try:  # its file where the log has one, which is not decoded then, else what it holds
+                of_file = None if stream.encoded is None else hashlib.blake2b(stream.encoded(index)).hexdigest()
+                digest = of_file or digest_of(records.require(name, index))
+            except RecordError as error:
+                digest = str(error)
+            described.append([name, index, int(stream.t_ns[index]), digest])
         sweeps = {name: index[:, ticks.start : ticks.stop] for name, index in self.schedule.sweeps.items()}
         before = task.before if self.plan.fusion is FusionLevel.POINTS else []
         states = [sorted(records.watch.known(s).items()) for s in self.log.streams] if task.judged else None
         described += [self.schedule.t_ns[ticks.start : ticks.stop], sweeps, before, ticks.stop == total, states]
         return bytes.fromhex(digest_of(described))
-
-    def _record(self, name: str, index: int, records: RecordSource) -> str:
-        """Return a digest of a record: of its file where the log has one, which is not decoded then, else of what it holds."""
-        stream = self.log.streams[name]
-        try:
-            if stream.encoded is None:
-                return digest_of(records.require(name, index))
-            return hashlib.blake2b(stream.encoded(index)).hexdigest()
-        except RecordError as error:
-            return str(error)
 
     def _tick(self, tick: int, records: RecordSource, clock: StageClock) -> SeenTick:
         plan, live, lights, skipped, searched = self.plan, dict[str, Detections](), list[LightBox](), list[str](), 0
@@ -443,8 +403,12 @@ class FirstPass:
     ) -> SeenTick:
         """Measure the detections of a tick, each camera's in its cloud and boxes in that of the reference."""
         reference, settings = clouds[self.schedule.reference_row], self.config.measure
-        # Where clouds were searched, a camera's objects are sought in what its own end sees.
-        parts = {(id(c), end): c if boxes is None else _seen_from_end(c, end) for c in clouds for end in ENDS}
+        # Where clouds were searched, a camera's objects are sought in what its own end sees, if it sees anything.
+        parts = {(id(c), end): c for c in clouds for end in ENDS}
+        for cloud in clouds if boxes is not None else ():
+            if cloud is not None and cloud.parts:
+                for end in ENDS:
+                    parts[id(cloud), end] = join_parts([part for part in cloud.parts if part.end == end]) or cloud
         frames: dict[str, list[MeasuredFrame]] = {end: [] for end in ENDS}
         for camera, cloud in zip(self.schedule.frames, clouds):
             if camera in found and (view := self._view(camera, tick)) is not None:
@@ -457,14 +421,25 @@ class FirstPass:
         with np.errstate(invalid="ignore"):  # of rows without a position, which a homography may still place
             far = np.hypot(*(rows.center_m[:, :2] - origin[:2]).T) > settings.max_range_m
         out = SeenTick(rows.take(~far))
-        if self.plan.keeps(Stage.HOMOGRAPHY):
-            for view, _, cloud in chain(*frames.values()):
-                # Where the ego is when a line is read, one homography maps all lines of a rolling shutter to the ground.
-                name, at_ns = view.camera.name, line_stamps_ns(view.camera, view.t_ns, feet_of_boxes(rows.box_px))
-                ego_T_map = inverse(base_poses(self.log, at_ns))
-                out.feet[name] = foot_points(view.camera, rows, ego_T_map, tick)
-                if cloud is not None:
-                    out.ground[name] = _ground_points(self.log, view, cloud, tick)
+        for view, _, cloud in shown if self.plan.keeps(Stage.HOMOGRAPHY) else ():
+            # Where the ego is when a line is read, one homography maps all lines of a rolling shutter to the ground.
+            sensor = view.camera
+            ego_T_map = inverse(base_poses(self.log, line_stamps_ns(sensor, view.t_ns, feet_of_boxes(rows.box_px))))
+            out.feet[sensor.name] = foot_points(sensor, rows, ego_T_map, tick)
+            if cloud is None:
+                continue
+            # The LiDAR's ground points that the camera sees, some, evenly.
+            seen = project_points(view, cloud.origin, cloud.columns.take(cloud.ground_sample, axis=1))
+            if not len(seen.index):
+                continue
+            count = min(MAX_GROUND_POINTS_PER_FRAME, len(seen.index))
+            some = np.linspace(0, len(seen.index) - 1, count).round().astype(np.intp)
+            uv = np.stack([seen.u, seen.v], axis=1)[some].astype(np.float64)
+            points = cloud.xyz[cloud.ground_sample[seen.index[some]]].astype(np.float64) + cloud.origin
+            ego_T_map = inverse(base_poses(self.log, line_stamps_ns(sensor, view.t_ns, uv)))
+            xy = ((ego_T_map[:, :3, :3] @ points[:, :, None])[:, :, 0] + ego_T_map[:, :3, 3])[:, :2]
+            number = np.full(count, tick, dtype=np.int64)
+            out.ground[sensor.name] = Correspondences(undistorted_pixels(sensor, uv), xy, number)
         return out
 
     def _view(self, camera: str, tick: int) -> View | None:
@@ -473,31 +448,9 @@ class FirstPass:
         return view_of(self.log, camera, t_ns)
 
 
-MAX_GROUND_POINTS_PER_FRAME = 40
-
-
-def _seen_from_end(cloud: Cloud | None, end: str) -> Cloud | None:
-    """Return the parts of a cloud that an end sees; the whole cloud where it has no parts or the end sees none of them."""
-    if cloud is None or not cloud.parts:
-        return cloud
-    return join_parts([part for part in cloud.parts if part.end == end]) or cloud
-
-
 def base_poses(log: Log, t_ns: NDArray[np.int64]) -> Array:
     """Poses (N, 4, 4) at stamps (N,) of what carries the cameras: the ego, or the map itself for a roadside log."""
     return np.tile(np.eye(4), (len(t_ns), 1, 1)) if log.ego is None else log.ego.at(t_ns)[0]
-
-
-def _ground_points(log: Log, view: View, cloud: Cloud, tick: int) -> Correspondences:
-    """Sample the LiDAR's ground points that the camera sees evenly."""
-    visible, uv, _ = project_cloud(view, cloud, cloud.ground_sample)
-    if len(visible) == 0:
-        return Correspondences.join([])
-    step = np.linspace(0, len(visible) - 1, min(MAX_GROUND_POINTS_PER_FRAME, len(visible))).round().astype(np.intp)
-    points = cloud.xyz[cloud.ground_sample[visible[step]]].astype(np.float64) + cloud.origin
-    ego_T_map = inverse(base_poses(log, line_stamps_ns(view.camera, view.t_ns, uv[step])))
-    xy = ((ego_T_map[:, :3, :3] @ points[:, :, None])[:, :, 0] + ego_T_map[:, :3, 3])[:, :2]
-    return Correspondences(undistorted_pixels(view.camera, uv[step]), xy, np.full(len(step), tick, dtype=np.int64))
 
 
 def observe(
@@ -518,8 +471,6 @@ def observe(
     are searched as one. `jobs`: processes that share the ticks. The result is the same for any number; with fusion of
     points each cloud needs the one before, so that one process does all.
 
-    Notes
-    -----
     Whether a record repeats another depends on all before it. A part is made with what is known when it begins; its records are
     judged again when all before are known, and it is made again, by then in this process, where that changes anything.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Protocol, TypeVar
@@ -100,7 +101,7 @@ class FrameDetector:
         self, tick: int, cameras: Iterable[str], reader: RecordSource, clock: StageClock
     ) -> dict[str, PictureFindings]:
         """Search a tick's frames of some cameras, each once; those that have none or cannot be read are left out."""
-        frames, thumbnails = dict[str, Frame](), dict[str, Thumbnail | None]()
+        frames, thumbnails = dict[str, Frame](), dict[str, Thumbnail]()
         for name in cameras:
             index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
             if index >= 0 and (name, tick) not in self._known:
@@ -109,9 +110,11 @@ class FrameDetector:
                 frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with clock.stage("decode"):
-                thumbnails = {name: _thumbnail_of(frame) for name, frame in frames.items()}
-            self._known |= {(name, tick): None for name, small in thumbnails.items() if small is None}
-            frames = {name: frame for name, frame in frames.items() if thumbnails[name] is not None}
+                for name, frame in frames.items():
+                    with suppress(RecordError):
+                        thumbnails[name] = shrink(frame.image())
+            self._known |= {(name, tick): None for name in frames if name not in thumbnails}
+            frames = {name: frame for name, frame in frames.items() if name in thumbnails}
         with clock.stage("detect"):
             searched = detect_all(self._detector, list(frames.values()))
             for (name, frame), boxes in zip(frames.items(), searched, strict=True):
@@ -119,14 +122,6 @@ class FrameDetector:
                 cut = crop_lights(name, frame.t_ns, frame.image(), lights) if len(lights) else []
                 self._known[name, tick] = PictureFindings(boxes, thumbnails.get(name), tuple(cut))
         return {name: found for name in cameras if (found := self._known.get((name, tick))) is not None}
-
-
-def _thumbnail_of(frame: Frame) -> Thumbnail | None:
-    """Decode a frame and return a small copy; None where it cannot be read."""
-    try:
-        return shrink(frame.image())
-    except RecordError:
-        return None
 
 
 class PictureConsumer(Protocol):

@@ -45,23 +45,8 @@ def fuse_tick(measurements: Measurements, *, across: bool = True) -> Measurement
         -measurements.score * np.where(measurements.truncated, TRUNCATED_SCORE_FACTOR, 1.0), kind="stable"
     )
     rows = measurements.take(order)
-    owner = np.full(len(rows), -1)
-    possible = _gated_pairs(rows)
-    for i in range(len(rows)):
-        for j in np.flatnonzero(possible[i, :i]).tolist():
-            if owner[j] == j and _share_points(rows, i, j):
-                owner[i] = j
-                break
-        else:
-            owner[i] = i
-    leaders = np.flatnonzero(owner == np.arange(len(rows)))
-    out = _join_all(rows, leaders, owner) if across else rows.take(leaders)
-    return out.take(~_is_driver(out))
-
-
-def _gated_pairs(rows: Measurements) -> NDArray[np.bool_]:
-    """Gate the pairs (M, M) of one group: by distance if both have points, else by the covariances of two cameras."""
-    group = np.array([GROUP_OF[str(c)] for c in rows.category])
+    # Pairs (M, M) of one group are gated: by distance if both have points, else by the covariances of two cameras.
+    group = np.array([GROUP_OF[c] for c in rows.category.tolist()], dtype=str)
     with_points, placed = _has_points(rows), rows.source != ""
     reach = provisional_sizes(rows).sum(axis=1) / 2
     dx, dy = (rows.center_m[:, None, axis] - rows.center_m[:, axis] for axis in range(2))
@@ -71,23 +56,45 @@ def _gated_pairs(rows: Measurements) -> NDArray[np.bool_]:
     squared = c[..., 1, 1] * dx**2 - 2 * c[..., 0, 1] * dx * dy + c[..., 0, 0] * dy**2
     other_camera = (rows.camera[:, None] != rows.camera) & placed[:, None] & placed
     same_place = other_camera & (squared <= CHI2_2DOF_99 * determinant)
-    gated = np.where(with_points[:, None] & with_points, near, same_place) & (group[:, None] == group)
+    possible = np.where(with_points[:, None] & with_points, near, same_place) & (group[:, None] == group)
     # Boxes that a detector found in one sweep are different objects.
-    from_sweep = rows.camera == ""
-    gated &= ~(from_sweep[:, None] & from_sweep)
-    return np.asarray(gated, dtype=bool)
+    possible &= ~((rows.camera[:, None] == "") & (rows.camera == ""))
+    owner = np.arange(len(rows))
+    for i in range(len(rows)):
+        for j in np.flatnonzero(possible[i, :i]).tolist():
+            # Without points their positions suffice.
+            alike = not len(rows.cluster[i]) or not len(rows.cluster[j])
+            if owner[j] == j and (
+                alike or max(_share_inside(rows, *of) for of in ((i, j), (j, i))) >= MIN_SHARED_POINTS
+            ):
+                owner[i] = j
+                break
+    leaders = np.flatnonzero(owner == np.arange(len(rows)))
+    out = rows.take(leaders)
+    if across:  # with the LiDAR evidence that other cameras have
+        seen_by = np.array([rows.seen_by[owner == leader].any(axis=0) for leader in leaders], dtype=bool)
+        out = replace(out, seen_by=seen_by.reshape(-1, rows.seen_by.shape[1]))
+        usable = with_points & with_points[owner] & (rows.camera != rows.camera[owner])
+        joined = {}
+        for k in np.flatnonzero(np.isin(leaders, owner[usable])).tolist():
+            members = [int(leaders[k]), *np.flatnonzero(usable & (owner == leaders[k])).tolist()]
+            joined[k] = _join(rows, out.take([k]), members)
+        if joined:
+            others = [k for k in range(len(leaders)) if k not in joined]
+            out = Measurements.join([out.take(others), *joined.values()]).take(np.argsort([*others, *joined]))
+    # People whose points are inside a vehicle's extents are dropped.
+    group, with_points = np.array([GROUP_OF[c] for c in out.category.tolist()], dtype=str), _has_points(out)
+    drop, length_m = np.zeros(len(out), dtype=bool), provisional_sizes(out)[:, 0]
+    people, vehicles = (np.flatnonzero((group == name) & with_points) for name in ("pedestrian", "vehicle"))
+    apart = out.center_m[people, None, :2] - out.center_m[vehicles, :2]
+    for k, n in np.argwhere(np.hypot(apart[..., 0], apart[..., 1]) < length_m[vehicles]).tolist():
+        drop[people[k]] |= _share_inside(out, int(people[k]), int(vehicles[n])) >= MIN_DRIVER_SHARE
+    return out.take(~drop)
 
 
 def _has_points(rows: Measurements) -> NDArray[np.bool_]:
     """Mark the rows (M,) with LiDAR points."""
     return np.asarray((rows.source == "lidar") & (rows.kept_points > 0))
-
-
-def _share_points(rows: Measurements, i: int, j: int) -> bool:
-    """Decide whether two gated rows share points; without points their positions suffice."""
-    if not len(rows.cluster[i]) or not len(rows.cluster[j]):
-        return True
-    return _share_inside(rows, i, j) >= MIN_SHARED_POINTS or _share_inside(rows, j, i) >= MIN_SHARED_POINTS
 
 
 def _share_inside(rows: Measurements, i: int, j: int) -> float:
@@ -98,30 +105,18 @@ def _share_inside(rows: Measurements, i: int, j: int) -> float:
     return float(((points >= low) & (points <= high)).all(axis=1).mean())
 
 
-def _join_all(rows: Measurements, leaders: NDArray[np.intp], owner: NDArray[np.intp]) -> Measurements:
-    """Return one row for each leader, with the LiDAR evidence that other cameras have of its object; each row (M,) has an owner."""
-    with_points = _has_points(rows)
-    seen_by = np.array([rows.seen_by[owner == leader].any(axis=0) for leader in leaders], dtype=bool)
-    out = replace(rows.take(leaders), seen_by=seen_by.reshape(-1, rows.seen_by.shape[1]))
-    usable = with_points & with_points[owner] & (rows.camera != rows.camera[owner])
-    joined = {}
-    for k in np.flatnonzero(np.isin(leaders, owner[usable])).tolist():
-        joined[k] = _join(
-            rows, out.take([k]), [int(leaders[k]), *np.flatnonzero(usable & (owner == leaders[k])).tolist()]
-        )
-    if not joined:
-        return out
-    others = [k for k in range(len(leaders)) if k not in joined]
-    place = np.argsort([*others, *joined])
-    return Measurements.join([out.take(others), *joined.values()]).take(place)
-
-
 def _join(rows: Measurements, row: Measurements, merged: list[int]) -> Measurements:
     """Return a leader's row with the points that it, the first of `merged`, and other cameras have of its object."""
     leader = merged[0]
     boxed = rows.take([next((m for m in merged if np.isfinite(rows.box_yaw_rad[m])), leader)])
     row = replace(row, **{column: getattr(boxed, column) for column in BOX_COLUMNS})
-    cluster = _timed_from(rows, merged, int(row.t_ns[0]))
+    # The points (n, 4) of all, with their times after the leader's stamp.
+    parts = []
+    for m in merged:
+        points, late_s = rows.cluster[m], (int(rows.t_ns[m]) - int(row.t_ns[0])) / NS_PER_S
+        timed = np.column_stack([points, np.zeros(len(points))]) if points.shape[1] == 3 else points
+        parts.append(timed + np.array([0.0, 0.0, 0.0, late_s]))
+    cluster = np.concatenate(parts)
     xy, box_yaw = cluster[:, :2] - row.sensor_m[0, :2], float(row.box_yaw_rad[0])
     typical = np.array(TYPICAL_SIZE_M[str(row.category[0])])
     yaw, low, high = fit_extents(xy, typical, None if np.isnan(box_yaw) else box_yaw)
@@ -132,23 +127,3 @@ def _join(rows: Measurements, row: Measurements, merged: list[int]) -> Measureme
         ends_visible=np.asarray(rows.ends_visible[merged].any(axis=0, keepdims=True)),
         truncated=np.array([rows.truncated[merged].all()]), points=rows.points[merged].max(keepdims=True),
     ))  # fmt: skip
-
-
-def _timed_from(rows: Measurements, members: Sequence[int], t_ns: int) -> NDArray[np.float64]:
-    """Return the points (n, 4) of several rows, with their times after a common stamp."""
-    parts = [
-        np.column_stack([c, np.zeros(len(c))]) if c.shape[1] == 3 else c for c in (rows.cluster[m] for m in members)
-    ]
-    late_s = [[0.0, 0.0, 0.0, (int(rows.t_ns[m]) - t_ns) / NS_PER_S] for m in members]
-    return np.concatenate([part + late for part, late in zip(parts, late_s)])
-
-
-def _is_driver(rows: Measurements) -> NDArray[np.bool_]:
-    """Mark the rows (M,) of people whose points are inside a vehicle's extents."""
-    group, with_points = np.array([GROUP_OF[c] for c in rows.category.tolist()], dtype=str), _has_points(rows)
-    drop, length_m = np.zeros(len(rows), dtype=bool), provisional_sizes(rows)[:, 0]
-    people, vehicles = (np.flatnonzero((group == name) & with_points) for name in ("pedestrian", "vehicle"))
-    apart = rows.center_m[people, None, :2] - rows.center_m[vehicles, :2]
-    for k, n in np.argwhere(np.hypot(apart[..., 0], apart[..., 1]) < length_m[vehicles]).tolist():
-        drop[people[k]] |= _share_inside(rows, int(people[k]), int(vehicles[n])) >= MIN_DRIVER_SHARE
-    return drop

@@ -23,9 +23,8 @@ from log2sim.perception.homography.estimate import (
     place_obstacle,
     spanned_height_m,
 )
-from log2sim.perception.homography.fit import HomographyFit, RoadSlope, refused_fit
-from log2sim.perception.homography.rig import SAMPLES, Rig
-from log2sim.perception.homography.rig_fit import RigFit, fit_rig
+from log2sim.perception.homography.fit import HomographyFit, refused_fit
+from log2sim.perception.homography.rig import SAMPLES, Rig, RigFit, fit_rig
 from log2sim.perception.homography.slope import fit_slope, slope_homography
 from log2sim.perception.lidar.measure import BORDER_PX
 from log2sim.plan import HomographyScope, Plan
@@ -67,48 +66,43 @@ def fit_homographies(
     if plan.homography is HomographyScope.NONE:
         return {}
     options = EstimationOptions(config.method, hypotheses=config.hypotheses or None)
-    wanted = set(plan.cameras) if plan.homography is HomographyScope.ALL_CAMERAS else _cameras_in_need(log, observed)
-    joins = bool(wanted) and config.rig == "together" and config.method in STREAM_METHODS
-    together, why_apart = _fit_together(log, observed, plan, options, rng) if joins else ({}, {})
-    apart = {c: _fit_one(log, observed, c, options, rng) for c in plan.cameras if c in wanted and c not in together}
-    apart = {
-        c: replace(g, source=f"{g.source} (apart: {why_apart[c]})") if why_apart.get(c) else g for c, g in apart.items()
-    }
-    found = {c: together[c] if c in together else apart[c] for c in plan.cameras if c in wanted}
-    return {c: _with_slope(log, observed, g) for c, g in found.items()} if config.method in STREAM_METHODS else found
-
-
-def _with_slope(log: Log, observed: Observations, ground: CameraHomography) -> CameraHomography:
-    """Fit a second plane of the road to what the homography of a camera was fitted to, the feet of obstacles where they were many."""
-    name = ground.camera.name
-    stamps = {k: m.t_ns[m.camera == name] for k, m in enumerate(observed.measurements)}
-    map_T_base = {k: base_poses(log, t_ns[:1])[0] for k, t_ns in stamps.items() if len(t_ns)}
-    feet = Correspondences.join(observed.feet.get(name, []))
-    fit = fit_slope(ground.fit, feet, ground.camera.K, map_T_base, FOOT_SIGMA_PX, FOOT_SIGMA_M)
-    return replace(ground, fit=fit)
-
-
-def _fit_together(
-    log: Log, observed: Observations, plan: Plan, options: EstimationOptions, rng: np.random.Generator
-) -> tuple[dict[str, CameraHomography], dict[str, str]]:
-    """Fit the cameras of each rig together; returns their homographies, and why the others are fitted apart, by camera."""
-    found = {}
-    rigs, why_apart = list_rigs(log, plan.cameras)
-    for names in rigs:
-        rig = Rig.of({c: log.cameras[c] for c in names}, log.ground_z_ego_m)
-        feet, ground = (
-            {c: Correspondences.join(o.get(c, [])) for c in names} for o in (observed.feet, observed.ground)
-        )
-        fitted = fit_rig(rig, feet, ground, rng=rng, samples=options.hypotheses or SAMPLES)
-        for c in names:
-            fit = fitted.fits.get(c)
-            if fit is not None and fit.ok:
-                found[c] = CameraHomography(
-                    log.cameras[c], fit, f"obstacles and ground of {len(names)} cameras", "", fitted
-                )
-            else:
-                why_apart[c] = fitted.reason if fit is None else fit.reason
-    return found, why_apart
+    wanted, of_stream = set(plan.cameras), config.method in STREAM_METHODS
+    if plan.homography is not HomographyScope.ALL_CAMERAS:
+        rows = [(str(m.camera[k]), m.box_px[k]) for m in observed.measurements for k in np.flatnonzero(m.source == "")]
+        wanted = {name for name, box_px in rows if _has_foot(log.cameras[name], box_px)}
+    feet, ground = (
+        {c: Correspondences.join(of.get(c, [])) for c in plan.cameras} for of in (observed.feet, observed.ground)
+    )
+    found, why_apart = dict[str, CameraHomography](), dict[str, str]()
+    if wanted and config.rig == "together" and of_stream:
+        rigs, why_apart = list_rigs(log, plan.cameras)
+        for names in rigs:
+            rig = Rig.of({c: log.cameras[c] for c in names}, log.ground_z_ego_m)
+            fitted = fit_rig(rig, feet, ground, rng=rng, samples=options.hypotheses or SAMPLES)
+            for c in names:
+                fit = fitted.fits.get(c)
+                if fit is not None and fit.ok:
+                    source = f"obstacles and ground of {len(names)} cameras"
+                    found[c] = CameraHomography(log.cameras[c], fit, source, "", fitted)
+                else:
+                    why_apart[c] = fitted.reason if fit is None else fit.reason
+    for name in plan.cameras:
+        if name in wanted and name not in found:
+            camera = log.cameras[name]
+            fit, source = fit_camera(feet[name], ground[name], replace(options, K=camera.K), rng=rng)
+            refusal, calibrated = fit.reason, None if fit.ok else calibrated_homography(log, camera)
+            if not fit.ok:
+                fit, source = (fit, "none") if calibrated is None else (calibrated, "calibration and flat ground")
+            source += f" (apart: {why_apart[name]})" if why_apart.get(name) else ""
+            found[name] = CameraHomography(camera, fit, source, refusal)
+    out = {name: found[name] for name in plan.cameras if name in wanted}
+    for name, one in out.items() if of_stream else ():
+        # A second plane of the road, by the feet of obstacles where they were many.
+        stamps = {k: m.t_ns[m.camera == name] for k, m in enumerate(observed.measurements)}
+        map_T_base = {k: base_poses(log, t_ns[:1])[0] for k, t_ns in stamps.items() if len(t_ns)}
+        fit = fit_slope(one.fit, feet[name], one.camera.K, map_T_base, FOOT_SIGMA_PX, FOOT_SIGMA_M)
+        out[name] = replace(one, fit=fit)
+    return out
 
 
 def list_rigs(log: Log, cameras: Sequence[str]) -> tuple[list[list[str]], dict[str, str]]:
@@ -125,7 +119,9 @@ def list_rigs(log: Log, cameras: Sequence[str]) -> tuple[list[list[str]], dict[s
         elif (camera.mount == "ego") == (log.ego is None):
             left_out[name] = "it does not move with the ground positions"
         else:
-            own = [rig for rig in rigs if _in_one_place(log.cameras[rig[0]], camera)]
+            # On the vehicle, or on one pole.
+            apart_m = [log.cameras[rig[0]].mount_T_cam[:2, 3] - camera.mount_T_cam[:2, 3] for rig in rigs]
+            own = [rig for rig, a in zip(rigs, apart_m) if camera.mount == "ego" or np.hypot(*a) < MAX_POLE_M]
             if not own:
                 rigs.append([])
             (own or rigs[-1:])[0].append(name)
@@ -133,34 +129,9 @@ def list_rigs(log: Log, cameras: Sequence[str]) -> tuple[list[list[str]], dict[s
     return [rig for rig in rigs if len(rig) > 1], left_out
 
 
-def _in_one_place(a: Camera, b: Camera) -> bool:
-    """Return whether two cameras are on one vehicle or on one pole."""
-    return a.mount == "ego" or float(np.hypot(*(a.mount_T_cam - b.mount_T_cam)[:2, 3])) < MAX_POLE_M
-
-
-def _cameras_in_need(log: Log, observed: Observations) -> set[str]:
-    rows = [(str(m.camera[k]), m.box_px[k]) for m in observed.measurements for k in np.flatnonzero(m.source == "")]
-    return {name for name, box_px in rows if _has_foot(log.cameras[name], box_px)}
-
-
 def _has_foot(camera: Camera, box_px: Array) -> bool:
     """Return whether the obstacle in a box (4,) touches the ground inside the image."""
     return bool(box_px[3] <= camera.height_px - BORDER_PX)
-
-
-def _fit_one(
-    log: Log, observed: Observations, name: str, options: EstimationOptions, rng: np.random.Generator
-) -> CameraHomography:
-    camera = log.cameras[name]
-    feet = Correspondences.join(observed.feet.get(name, []))
-    ground = Correspondences.join(observed.ground.get(name, []))
-    fit, source = fit_camera(feet, ground, replace(options, K=camera.K), rng=rng)
-    if fit.ok:
-        return CameraHomography(camera, fit, source)
-    calibrated = calibrated_homography(log, camera)
-    if calibrated is None:
-        return CameraHomography(camera, fit, "none", fit.reason)
-    return CameraHomography(camera, calibrated, "calibration and flat ground", fit.reason)
 
 
 def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
@@ -182,60 +153,49 @@ def place_by_homography(
     log: Log, observed: Observations, homographies: Mapping[str, CameraHomography]
 ) -> list[Measurements]:
     """Place the measurements without LiDAR points by their camera's homography, where it is able to, at every tick."""
-    out = []
+    out, ground_z_m = [], log.ground_z_ego_m
     for tick, (m, obstacles) in enumerate(zip(observed.measurements, observed.obstacles, strict=True)):
-        fits = {name: homography.fit for name, homography in homographies.items()}
-        found = {
-            name: (h, f.covariance_at(tick), f.slope) for name, f in fits.items() if (h := f.at_tick(tick)) is not None
-        }
-        out.append(_place_tick(log, m, obstacles, found))
-    return out
-
-
-def _place_tick(
-    log: Log,
-    m: Measurements,
-    obstacles: Obstacles | None,
-    homographies: Mapping[str, tuple[Array, Array | None, RoadSlope | None]],
-) -> Measurements:
-    missing = np.flatnonzero(m.source == "")
-    if len(missing) == 0:
-        return m
-    columns: dict[str, Any] = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in vars(m).items()}
-    poses: dict[tuple[str, int], tuple[Array, Array]] = {}
-    for k in missing:
-        camera = log.cameras.get(str(m.camera[k]))
-        if camera is None or camera.name not in homographies or not _has_foot(camera, m.box_px[k]):
-            continue
-        # Seen in its line of a rolling shutter from where the camera was then.
-        frame = camera.name, int(line_stamps_ns(camera, int(m.t_ns[k]), feet_of_boxes(m.box_px[[k]]))[0])
-        if frame not in poses:
-            map_T_base = base_poses(log, np.array(frame[1:]))[0]
-            on_map = camera.mount == "map" and log.ego is not None
-            poses[frame] = map_T_base, inverse(map_T_base) @ camera.mount_T_cam if on_map else camera.mount_T_cam
-        (map_T_base, base_T_cam), (h, uncertainty, slope) = poses[frame], homographies[camera.name]
-        if slope is not None:
-            foot_px = undistorted_pixels(camera, feet_of_boxes(m.box_px[[k]]))[0]
-            bent = slope_homography(slope, h, camera.K, map_T_base, foot_px)
-            if bent is not None:
-                h, by_slope = bent
-                uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
-        placed = place_obstacle(h, camera, m.box_px[k], str(m.category[k]), base_T_cam[:2, 3], uncertainty)
-        if placed is None:
-            continue
-        if obstacles is not None:
-            beyond, stopped = count_rays(obstacles, map_T_base, placed, log.ground_z_ego_m, str(m.category[k]))
-            if beyond >= MIN_RAYS and stopped < MAX_STOPPED_SHARE * beyond:
+        missing = np.flatnonzero(m.source == "")
+        columns: dict[str, Any] = vars(m)
+        if len(missing):
+            columns = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in columns.items()}
+        poses: dict[tuple[str, int], tuple[Array, Array]] = {}
+        for k in missing:
+            name, box_px, category = str(m.camera[k]), m.box_px[k], str(m.category[k])
+            fit = homographies[name].fit if name in homographies and name in log.cameras else None
+            h = None if fit is None else fit.at_tick(tick)
+            if fit is None or h is None or not _has_foot(log.cameras[name], box_px):
                 continue
-            if beyond + stopped >= MIN_RAYS:
-                columns["score"][k] *= UNCONFIRMED_SCORE
-        xy, covariance = placed
-        foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], log.ground_z_ego_m]) + map_T_base[:3, 3]
-        columns["center_m"][k] = foot + np.array([0, 0, TYPICAL_SIZE_M[str(m.category[k])][2] / 2])
-        columns["bottom_m"][k], columns["source"][k] = foot[2], "topdown"
-        columns["covariance"][k] = map_T_base[:2, :2] @ covariance @ map_T_base[:2, :2].T
-        columns["height_px_m"][k] = spanned_height_m(h, camera, m.box_px[k], base_T_cam)
-    return Measurements(**columns)
+            camera, foot_px = log.cameras[name], feet_of_boxes(box_px[None])
+            # Seen in its line of a rolling shutter from where the camera was then.
+            frame = name, int(line_stamps_ns(camera, int(m.t_ns[k]), foot_px)[0])
+            if frame not in poses:
+                map_T_base = base_poses(log, np.array(frame[1:]))[0]
+                on_map = camera.mount == "map" and log.ego is not None
+                poses[frame] = map_T_base, inverse(map_T_base) @ camera.mount_T_cam if on_map else camera.mount_T_cam
+            (map_T_base, base_T_cam), uncertainty = poses[frame], fit.covariance_at(tick)
+            if fit.slope is not None:
+                bent = slope_homography(fit.slope, h, camera.K, map_T_base, undistorted_pixels(camera, foot_px)[0])
+                if bent is not None:
+                    h, by_slope = bent
+                    uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
+            placed = place_obstacle(h, camera, box_px, category, base_T_cam[:2, 3], uncertainty)
+            if placed is None:
+                continue
+            if obstacles is not None:
+                beyond, stopped = count_rays(obstacles, map_T_base, placed, ground_z_m, category)
+                if beyond >= MIN_RAYS and stopped < MAX_STOPPED_SHARE * beyond:
+                    continue
+                if beyond + stopped >= MIN_RAYS:
+                    columns["score"][k] *= UNCONFIRMED_SCORE
+            xy, covariance = placed
+            foot = map_T_base[:3, :3] @ np.array([xy[0], xy[1], ground_z_m]) + map_T_base[:3, 3]
+            columns["center_m"][k] = foot + np.array([0, 0, TYPICAL_SIZE_M[category][2] / 2])
+            columns["bottom_m"][k], columns["source"][k] = foot[2], "topdown"
+            columns["covariance"][k] = map_T_base[:2, :2] @ covariance @ map_T_base[:2, :2].T
+            columns["height_px_m"][k] = spanned_height_m(h, camera, box_px, base_T_cam)
+        out.append(Measurements(**columns) if len(missing) else m)
+    return out
 
 
 def count_rays(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Finding, Log, Sweep, Treatment
 from log2sim.errors import LogError, RecordError
 from log2sim.files.images import decode_image
-from log2sim.geometry import MIN_DEPTH_M, NS_PER_S, Array, Camera
+from log2sim.geometry import MIN_DEPTH_M, NS_PER_S
 
 Motion = Literal["drives", "stands", "unclear"]
 
@@ -59,26 +59,6 @@ def _spans(t_ns: NDArray[np.int64], at_fault: NDArray[np.bool_]) -> list[NDArray
     rows = np.flatnonzero(at_fault)
     cuts = np.flatnonzero(np.diff(t_ns[rows]) > JOINED_S * NS_PER_S) + 1
     return np.split(rows, cuts if len(cuts) < MAX_SPANS else cuts[:0]) if len(rows) else []
-
-
-def gaps_of(t_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-    """Find the gaps of a stream (F,) between two stamps that are much longer than its period: stamps where they start and end."""
-    if len(t_ns) < MIN_STAMPS:
-        return []
-    shortest_ns = max(MIN_GAP_PERIODS * float(np.median(np.diff(t_ns))), MIN_GAP_S * NS_PER_S)
-    around = np.concatenate([[start_ns], t_ns[(t_ns > start_ns) & (t_ns < end_ns)], [end_ns]])
-    return [(int(around[k]), int(around[k + 1])) for k in np.flatnonzero(np.diff(around) > shortest_ns)]
-
-
-def missing_records(log: Log, sensors: Iterable[str], start_ns: int, end_ns: int) -> Iterator[Finding]:
-    """List the interruptions of the streams of sensors between two stamps."""
-    for name in sensors:
-        gaps = gaps_of(log.streams[name].t_ns, start_ns, end_ns)
-        kind = "missing_images" if name in log.cameras else "missing_sweeps"
-        for some in [gaps] if len(gaps) > MAX_SPANS else [[gap] for gap in gaps]:
-            start_s, end_s = ((t_ns - start_ns) / NS_PER_S for t_ns in (some[0][0], some[-1][1]))
-            values = {"gaps": float(len(some)), "longest_s": max(b - a for a, b in some) / NS_PER_S}
-            yield Finding(kind, name, "kept", start_s, end_s, values)
 
 
 # Cells along the longer side. A cell of a camera for vehicles covers about a hundred pixels, whose noise averages out.
@@ -126,24 +106,25 @@ def quantile_of_change(change: NDArray[np.float32]) -> float:
     return float(np.partition(values, k)[k])
 
 
-def changed_share(before: Thumbnail, after: Thumbnail) -> float:
-    """Return the share of the cells that changed at all, by however little."""
-    return float((before != after).mean())
-
-
 def shows_nothing(thumbnail: Thumbnail) -> bool:
     """Return whether a picture holds nothing but noise and a smooth shade: black, of one color, saturated, or covered.
 
-    Notes
-    -----
     What a scene shows is as strong in a coarse copy as in a fine one, since images of scenes have the same contrast at every
     scale (Field, J. Opt. Soc. Am. A 4, 1987); independent noise falls with the number of cells averaged. Second
     differences leave out the shade of a covered lens. A scene at night has at least one cell that stands out, a lamp.
     """
-    coarse = _averaged(thumbnail)
-    if min(coarse.shape) < 3:
+    height, width = (n // COARSE_FACTOR for n in thumbnail.shape)
+    if min(height, width) < 3:
         return bool(np.ptp(thumbnail) < MIN_STRUCTURE_LEVELS)
-    fine_detail, coarse_detail = _second_differences(thumbnail), _second_differences(coarse)
+    blocks = thumbnail[: height * COARSE_FACTOR, : width * COARSE_FACTOR]
+    coarse = blocks.reshape(height, COARSE_FACTOR, width, COARSE_FACTOR).mean(axis=(1, 3))
+    # The Laplacian at the inner cells, scaled to the standard deviation of independent noise.
+    fine_detail, coarse_detail = (
+        (
+            (a[:-2, 1:-1] + a[2:, 1:-1] + a[1:-1, :-2] + a[1:-1, 2:] - 4 * a[1:-1, 1:-1]) / np.sqrt(LAPLACIAN_NORM)
+        ).astype(np.float64)
+        for a in (thumbnail, coarse)
+    )
     noise = float((fine_detail**2).mean()) / COARSE_FACTOR**2
     if float((coarse_detail**2).mean()) > max(MAX_NOISE_RATIO * noise, MIN_STRUCTURE_LEVELS**2):
         return False
@@ -152,40 +133,25 @@ def shows_nothing(thumbnail: Thumbnail) -> bool:
     return bool(size.max() <= OUTSTANDING_SIGMAS * sigma + MIN_OUTSTANDING_LEVELS)
 
 
-def _averaged(thumbnail: Thumbnail) -> Thumbnail:
-    height, width = (n - n % COARSE_FACTOR for n in thumbnail.shape)
-    blocks = thumbnail[:height, :width].reshape(
-        height // COARSE_FACTOR, COARSE_FACTOR, width // COARSE_FACTOR, COARSE_FACTOR
-    )
-    return np.asarray(blocks.mean(axis=(1, 3)))
-
-
-def _second_differences(thumbnail: Thumbnail) -> Array:
-    """Return the Laplacian at the inner cells, scaled to the standard deviation of independent noise."""
-    inner = thumbnail[1:-1, 1:-1]
-    around = thumbnail[:-2, 1:-1] + thumbnail[2:, 1:-1] + thumbnail[1:-1, :-2] + thumbnail[1:-1, 2:]
-    return np.asarray((around - 4 * inner) / np.sqrt(LAPLACIAN_NORM), dtype=np.float64)
-
-
 # What is not ground is assumed as far away as this, so that no more motion is expected than there is at least; houses and
 # trees along a road are nearer.
 FAR_M = 50.0
 
 
-def expect_change(
-    picture: Thumbnail, camera: Camera, map_T_before: Array, map_T_after: Array, ground_z_m: float
-) -> float:
-    """Return by how many gray levels a picture changes where nothing but its camera moves: the 95 % quantile over the cells.
+def expect_change(picture: Thumbnail, log: Log, name: str, before_ns: int, after_ns: int) -> float:
+    """Return by how many gray levels a picture (h, w) of a camera changes between two stamps where nothing but the camera moves.
 
-    `picture`: (h, w): the earlier picture. `camera`: its lens distortion is left out; it changes where things are in a
-    picture, not how far they move. `map_T_before`, `map_T_after`: (4, 4): poses of the camera. `ground_z_m`: height of flat
-    ground in the map.
+    That is the 95 % quantile over the cells; 0 where the poses are not known. The distortion of the lens is left out; it changes
+    where things are in a picture, not how far they move.
 
-    Notes
-    -----
-    Every cell of the later picture is followed to the ground or to `FAR_M`, and from there to the earlier picture. A picture
+    Every cell of the later picture is followed to flat ground or to `FAR_M`, and from there to the earlier picture. A picture
     without texture, as in fog, is expected not to change.
     """
+    camera, (poses, known) = log.cameras[name], log.map_T_sensor(name, np.array([before_ns, after_ns]))
+    if log.ego is None or not known.all():
+        return 0.0
+    map_T_before, map_T_after = poses
+    ground_z_m = (log.ego.at(after_ns)[0][0] @ [0.0, 0.0, log.ground_z_ego_m, 1.0])[2]
     height, width = picture.shape
     K = np.diag([width / camera.width_px, height / camera.height_px, 1.0]) @ camera.K
     v, u = np.mgrid[0.5:height, 0.5:width]
@@ -232,57 +198,38 @@ def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
     """Return the sketch of a sweep of a LiDAR.
 
     Of many points those are looked at whose cells along x are of one slice in `SLICES`, the same in every sweep.
+
+    The finalizer of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) spreads neighboring cells evenly over the hashes.
     """
-    xyz = sweep.xyz_m
+    xyz, lidar = sweep.xyz_m, log.lidars[name]
     if len(xyz) > SLICES * MIN_SLICED_POINTS:
         xyz = xyz.take(np.flatnonzero(np.floor(xyz[:, 0] / CELL_M).astype(np.int64) % SLICES == 0), axis=0)
-    obstacles = xyz[_is_obstacle(log, name, sweep, xyz)]
-    return SweepSketch(len(sweep.xyz_m), len(obstacles), _smallest(_hash_cells(obstacles)))
-
-
-def _smallest(hashes: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the smallest of hashes (N,) that differ, sorted, at most `SKETCH_SIZE`."""
-    few = 4 * SKETCH_SIZE  # points share cells, mostly two at a time
-    chosen = np.unique(np.partition(hashes, few)[:few] if len(hashes) > few else hashes)
-    return chosen[:SKETCH_SIZE] if len(chosen) >= SKETCH_SIZE else np.unique(hashes)[:SKETCH_SIZE]
-
-
-def _is_obstacle(log: Log, name: str, sweep: Sweep, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Mark points (N, 3) well above flat ground under the ego, and not on the ego; all of a LiDAR that stands."""
-    lidar = log.lidars[name]
-    if lidar.mount == "map":
-        return np.ones(len(xyz), dtype=bool)
-    above_ground_m = float(lidar.mount_T_lidar[2, 3]) - log.ground_z_ego_m
-    if sweep.frame == "lidar":
-        up, position = lidar.mount_T_lidar[2, :3], np.zeros(3)
-    else:
-        map_T_lidar, known = log.map_T_sensor(name, sweep.stamp_ns)
-        up, position = np.array([0.0, 0.0, 1.0]), map_T_lidar[0][:3, 3] if known[0] else np.median(xyz, axis=0)
-    kind = xyz.dtype.type
-    height = xyz @ up.astype(kind) + kind(above_ground_m - up @ position)
-    x, y = (xyz[:, axis] - kind(position[axis]) for axis in range(2))
-    return np.asarray((height > MIN_HEIGHT_M) & (x * x + y * y > MIN_DISTANCE_M**2))
-
-
-def _hash_cells(xyz: NDArray[np.floating]) -> NDArray[np.uint64]:
-    """Return a hash (N,) of the cell of each point (N, 3).
-
-    Notes
-    -----
-    The finalizer of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) spreads neighboring cells evenly.
-    """
+    if lidar.mount != "map":
+        # Well above flat ground under the ego, and not on the ego; all points of a LiDAR that stands.
+        above_ground_m = float(lidar.mount_T_lidar[2, 3]) - log.ground_z_ego_m
+        if sweep.frame == "lidar":
+            up, position = lidar.mount_T_lidar[2, :3], np.zeros(3)
+        else:
+            map_T_lidar, known = log.map_T_sensor(name, sweep.stamp_ns)
+            up, position = np.array([0.0, 0.0, 1.0]), map_T_lidar[0][:3, 3] if known[0] else np.median(xyz, axis=0)
+        kind = xyz.dtype.type
+        height = xyz @ up.astype(kind) + kind(above_ground_m - up @ position)
+        x, y = (xyz[:, axis] - kind(position[axis]) for axis in range(2))
+        xyz = xyz[(height > MIN_HEIGHT_M) & (x * x + y * y > MIN_DISTANCE_M**2)]
     i = np.floor(xyz / CELL_M).astype(np.int64).astype(np.uint64) & np.uint64((1 << AXIS_BITS) - 1)
     z = (i[:, 0] << np.uint64(2 * AXIS_BITS)) | (i[:, 1] << np.uint64(AXIS_BITS)) | i[:, 2]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(z ^ (z >> np.uint64(31)))
+    hashes = z ^ (z >> np.uint64(31))
+    few = 4 * SKETCH_SIZE  # points share cells, mostly two at a time
+    chosen = np.unique(np.partition(hashes, few)[:few] if len(hashes) > few else hashes)
+    smallest = chosen[:SKETCH_SIZE] if len(chosen) >= SKETCH_SIZE else np.unique(hashes)[:SKETCH_SIZE]
+    return SweepSketch(len(sweep.xyz_m), len(xyz), smallest)
 
 
 def common_share(a: SweepSketch, b: SweepSketch) -> float:
     """Estimate the share of the obstacle points of two sweeps that both have; 0 without any.
 
-    Notes
-    -----
     The smallest hashes are a sample of all cells, the same for both (Broder, "On the resemblance and containment of
     documents", 1997). With the Jaccard index J of two sets of one size the share is 2 J / (1 + J).
     """
@@ -309,15 +256,6 @@ MIN_STILL_PAIRS = 5
 MIN_NOISY_SHARE = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    """A picture, and the stamp of the first in a row that are identical to it."""
-
-    t_ns: int
-    since_ns: int
-    thumbnail: Thumbnail
-
-
 @dataclass(eq=False)
 class CameraWatch:
     """Judge the pictures of one camera in the order of their stamps."""
@@ -325,7 +263,8 @@ class CameraWatch:
     log: Log  # its poses tell how the camera moves
     name: str  # of the camera
     states: dict[int, PictureState] = field(default_factory=dict)  # what was found, by stamp, rising
-    _last: _Picture | None = None
+    # The last picture, its stamp, and that of the first in a row that are identical to it
+    _last: tuple[Thumbnail, int, int] | None = None
     _frozen: bool = False
     _steps_without_change: int = 0
     _still_shares: list[float] = field(default_factory=list)
@@ -335,61 +274,39 @@ class CameraWatch:
 
         `thumbnail`: (h, w). `found`: whether a detector found something in it: then it does show something.
 
-        Notes
-        -----
         Identical pictures are harmless as long as the camera has not moved since the first of them enough to change them: they
         show what it sees of all that stands. Pictures that are nearly identical are copies where the poses say at every step
         that they cannot be; poses that drift or scatter while the ego stands do not.
         """
         if t_ns in self.states:
             return self.states[t_ns]
-        last = self._last
         if not found and shows_nothing(thumbnail):
-            state: PictureState = "black"
-        elif last is None or last.thumbnail.shape != thumbnail.shape:
-            state, self._last = "live", _Picture(t_ns, t_ns, thumbnail)
-        else:
-            self._frozen = self._is_copy(last, t_ns, thumbnail)
-            same = not changed_share(last.thumbnail, thumbnail)
-            state = "frozen" if self._frozen else "live"
-            self._last = _Picture(t_ns, last.since_ns if same else t_ns, thumbnail)
-        self.states[t_ns] = state
-        return state
-
-    def assume_unchanged(self, t_ns: int) -> PictureState:
-        """Return the state of a picture that was not looked at: that of the one before it."""
-        return self.states.setdefault(t_ns, next(reversed(self.states.values()), "live"))
-
-    def _is_copy(self, last: _Picture, t_ns: int, thumbnail: Thumbnail) -> bool:
-        """Compare a picture with the one before it."""
-        change = quantile_of_change(np.abs(thumbnail - last.thumbnail))
-        share = changed_share(last.thumbnail, thumbnail)
-        if change > MAX_CHANGED_SHARE * float(last.thumbnail.max() - last.thumbnail.min()):
-            self._steps_without_change = 0
-            return False  # no motion changes it by five times as much
-        if self._frozen and change < MAX_COPY_LEVELS:
-            return True
-        before_ns = last.since_ns if share == 0 else last.t_ns
-        motion = motion_of(self.log, self.name, before_ns, t_ns)
-        expected = self._expected(before_ns, t_ns, last.thumbnail) if motion == "drives" else 0.0
-        noisy = len(self._still_shares) >= MIN_STILL_PAIRS and min(self._still_shares) > MIN_NOISY_SHARE
-        if share == 0 and (expected >= MAX_COPY_LEVELS or noisy):
-            return True
-        if motion == "stands":
-            self._still_shares.append(share)
-        without_change = expected >= MIN_EXPECTED_LEVELS and change < MAX_CHANGED_SHARE * expected
-        self._steps_without_change = self._steps_without_change + 1 if without_change else 0
-        return self._steps_without_change >= MIN_STEPS_WITHOUT_CHANGE
-
-    def _expected(self, before_ns: int, after_ns: int, thumbnail: Thumbnail) -> float:
-        """Return by how many levels a picture should change between two stamps; 0 where the poses are not known."""
-        log, ego = self.log, self.log.ego
-        poses, known = log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
-        if ego is None or not known.all():
-            return 0.0
-        map_T_ego = ego.at(after_ns)[0][0]
-        ground_z_m = float((map_T_ego @ [0.0, 0.0, log.ground_z_ego_m, 1.0])[2])
-        return expect_change(thumbnail, log.cameras[self.name], poses[0], poses[1], ground_z_m)
+            return self.states.setdefault(t_ns, "black")
+        since_ns, copy = t_ns, False
+        if self._last is not None and self._last[0].shape == thumbnail.shape:
+            before, last_ns, last_since_ns = self._last
+            change, share = quantile_of_change(np.abs(thumbnail - before)), float((before != thumbnail).mean())
+            since_ns = t_ns if share else last_since_ns
+            if change > MAX_CHANGED_SHARE * float(before.max() - before.min()):
+                self._steps_without_change = 0  # no motion changes it by five times as much
+            elif self._frozen and change < MAX_COPY_LEVELS:
+                copy = True
+            else:
+                before_ns = last_ns if share else last_since_ns
+                motion = motion_of(self.log, self.name, before_ns, t_ns)
+                drives = motion == "drives"
+                expected = expect_change(before, self.log, self.name, before_ns, t_ns) if drives else 0.0
+                noisy = len(self._still_shares) >= MIN_STILL_PAIRS and min(self._still_shares) > MIN_NOISY_SHARE
+                copy = share == 0 and (expected >= MAX_COPY_LEVELS or noisy)
+                if not copy:
+                    if motion == "stands":
+                        self._still_shares.append(share)
+                    unchanged = expected >= MIN_EXPECTED_LEVELS and change < MAX_CHANGED_SHARE * expected
+                    self._steps_without_change = self._steps_without_change + 1 if unchanged else 0
+                    copy = self._steps_without_change >= MIN_STEPS_WITHOUT_CHANGE
+            self._frozen = copy
+        self._last = thumbnail, t_ns, since_ns
+        return self.states.setdefault(t_ns, "frozen" if copy else "live")
 
 
 # A sweep that has this share of its obstacle points in common with another is a copy of it: rounded to millimeters one has
@@ -406,14 +323,6 @@ MAX_USUAL_SHARE = 0.3
 MIN_OBSTACLES = 20
 
 
-@dataclass(frozen=True, eq=False)
-class _Sweep:
-    """A sweep, and the stamp of the first in a row that have their points in common with it."""
-
-    since_ns: int
-    sketch: SweepSketch
-
-
 @dataclass(eq=False)
 class LidarWatch:
     """Judge the sweeps of one LiDAR in the order of their stamps."""
@@ -422,45 +331,38 @@ class LidarWatch:
     name: str  # of the LiDAR
     repeated: dict[int, bool] = field(default_factory=dict)  # whether a sweep repeats an earlier one, by stamp, ns
     points: dict[int, int] = field(default_factory=dict)  # number of points, by stamp
-    _last: _Sweep | None = None
+    # The last sweep, and the stamp of the first in a row that have their points in common with it
+    _last: tuple[SweepSketch, int] | None = None
     _shares: dict[Motion, list[float]] = field(default_factory=lambda: {"stands": [], "drives": [], "unclear": []})
 
     def is_repeated(self, t_ns: int, sketch: SweepSketch) -> bool:
         """Return whether a sweep repeats the one before it, and remember it.
 
-        Notes
-        -----
         A LiDAR that stands in a synthetic world without noise gives the same points again and again, and rightly so. Hence a
         sweep is a copy where the LiDAR moved meanwhile, or where its sweeps are known to differ even from one place.
         """
         if t_ns in self.repeated:
             return self.repeated[t_ns]
         self.points[t_ns] = sketch.points
-        last, same, copy = self._last, False, False
-        if last is not None and min(sketch.obstacles, last.sketch.obstacles) >= MIN_OBSTACLES:
-            share = common_share(last.sketch, sketch)
-            same = share >= MIN_COPIED_SHARE
-            motion = self._motion(last.since_ns, t_ns)
-            copy = (motion == "drives" and share >= MIN_IDENTICAL_SHARE) or (same and self._usually_differ(motion))
+        since_ns, copy = t_ns, False
+        if self._last is not None and min(sketch.obstacles, self._last[0].obstacles) >= MIN_OBSTACLES:
+            before, last_since_ns = self._last
+            share, motion = common_share(before, sketch), motion_of(self.log, self.name, last_since_ns, t_ns)
+            if motion == "drives":  # only where all points of structures are in other cells
+                poses, _ = self.log.map_T_sensor(self.name, np.array([last_since_ns, t_ns]))
+                moved_m = np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3])
+                motion = "drives" if moved_m > MIN_MOTION_M else "unclear"
+            copy = motion == "drives" and share >= MIN_IDENTICAL_SHARE
+            if share >= MIN_COPIED_SHARE:
+                since_ns = last_since_ns
+                # Sweeps may be known to have few points in common: even from one place, or while the LiDAR drives as now.
+                known = [self._shares["stands"], self._shares["drives"] if motion == "drives" else []]
+                copy |= any(len(of) >= MIN_PAIRS and float(np.median(of)) < MAX_USUAL_SHARE for of in known)
             if not copy:
                 self._shares[motion].append(share)
-        self._last = _Sweep(last.since_ns if same and last is not None else t_ns, sketch)
+        self._last = sketch, since_ns
         self.repeated[t_ns] = copy
         return copy
-
-    def _usually_differ(self, motion: Motion) -> bool:
-        """Return whether sweeps are known to have few points in common: even from one place, or while the LiDAR drives as now."""
-        kinds: tuple[Motion, ...] = ("stands", "drives") if motion == "drives" else ("stands",)
-        known = [self._shares[kind] for kind in kinds if len(self._shares[kind]) >= MIN_PAIRS]
-        return any(float(np.median(shares)) < MAX_USUAL_SHARE for shares in known)
-
-    def _motion(self, before_ns: int, after_ns: int) -> Motion:
-        """Return how the LiDAR moved between two stamps; it drives where all points of structures are in other cells."""
-        motion = motion_of(self.log, self.name, before_ns, after_ns)
-        if motion != "drives":
-            return motion
-        poses, _ = self.log.map_T_sensor(self.name, np.array([before_ns, after_ns]))
-        return "drives" if np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]) > MIN_MOTION_M else "unclear"
 
 
 # What sweeps of this LiDAR usually have: this quantile of the numbers of points, so that many with none do not lower it.
@@ -527,7 +429,8 @@ class RecordWatch:
             return "repeated" if self.lidars[look.sensor].is_repeated(look.t_ns, look.shown) else "live"
         camera = self.cameras[look.sensor]
         if look.shown is None:
-            return camera.assume_unchanged(look.t_ns)
+            # A picture that was not looked at is as the one before it.
+            return camera.states.setdefault(look.t_ns, next(reversed(camera.states.values()), "live"))
         return camera.judge(look.t_ns, look.shown, found=look.found)
 
     def is_live(self, camera: str, t_ns: int, image: NDArray[np.uint8]) -> bool:
@@ -561,7 +464,21 @@ class RecordWatch:
             for rows in _spans(t_ns, points < MAX_SPARSE_SHARE * usual) if some else [np.arange(len(t_ns))]:
                 values = {"most_points": float(points[rows].max())} | ({"usual_points": usual} if some else {})
                 add("sparse_sweeps", lidar.name, t_ns, rows, values=values, case="some" if some else "all")
-        return (*found, *missing_records(self._log, sensors, start_ns, end_ns))
+        for name in sensors:
+            t_ns = self._log.streams[name].t_ns
+            if len(t_ns) < MIN_STAMPS:
+                continue
+            around = np.concatenate([[start_ns], t_ns[(t_ns > start_ns) & (t_ns < end_ns)], [end_ns]])
+            shortest_ns = max(MIN_GAP_PERIODS * float(np.median(np.diff(t_ns))), MIN_GAP_S * NS_PER_S)
+            gaps = np.flatnonzero(np.diff(around) > shortest_ns)
+            for rows in [gaps] if len(gaps) > MAX_SPANS else gaps[:, None]:
+                start_s, end_s = ((around[[rows[0], rows[-1] + 1]] - start_ns) / NS_PER_S).tolist()
+                longest_s = float(np.diff(around)[rows].max()) / NS_PER_S
+                kind = "missing_images" if name in self.cameras else "missing_sweeps"
+                found.append(
+                    Finding(kind, name, "kept", start_s, end_s, {"gaps": float(len(rows)), "longest_s": longest_s})
+                )
+        return tuple(found)
 
 
 # A picture is shrunk where it is wider than asked for by more than this: less is not worth the time.

@@ -142,7 +142,7 @@ class FirstPassCache:
     """
 
     def __init__(self, store: DiskCache, name: str, cache_key: str) -> None:
-        self._store = store
+        self.store = store  # its `problem` says why nothing more is kept by this process
         self._detectors = _digest(cache_key.encode(), software_key().encode())
         word = re.sub(r"[^A-Za-z0-9_-]+", "-", name)[:MAX_NAME_CHARACTERS] or "detector"
         self._group = f"{word}.{self._detectors.hex()[:8]}"
@@ -156,7 +156,7 @@ class FirstPassCache:
 
     def get(self, of: bytes, classes: Collection[type]) -> Any | None:
         """Return what was kept of a part by what it depends on besides, None where it is not known."""
-        content = self._store.get(self._name_of(of))
+        content = self.store.get(self._name_of(of))
         try:
             return None if content is None else unpack(content, classes)
         except ValueError:
@@ -164,20 +164,15 @@ class FirstPassCache:
 
     def put(self, of: bytes, part: Any) -> bool:
         """Keep a part; return whether that succeeded."""
-        return self._store.put(self._name_of(of), pack(part))
+        return self.store.put(self._name_of(of), pack(part))
 
     def count(self, found: int, kept: int, problem: str | None) -> None:
         """Count ticks of a part, which another process may have made."""
         self.found, self.kept, self.problem = self.found + found, self.kept + kept, self.problem or problem
 
-    @property
-    def store_problem(self) -> str | None:
-        """Why nothing more is kept by this process."""
-        return self._store.problem
-
     def finish(self) -> None:
         """Keep the limit of the cache, and note there what this run did; at the end of a run."""
-        self._store.finish({"found": self.found, "kept": self.kept})
+        self.store.finish({"found": self.found, "kept": self.kept})
 
     def figures(self) -> dict[str, Any]:
         """Return what the report says: ticks found and kept, and why nothing more was kept."""
@@ -219,21 +214,10 @@ def software_key(sources: Collection[str] = SOURCES) -> str:
     for pattern in sources:
         for source in sorted(package.glob(pattern)):
             value.update(source.read_bytes())
-    parts = (
-        np.__version__,
-        scipy.__version__,
-        cv2.__version__,
-        simplejpeg.__version__,
-        platform.machine(),
-        _instructions(),
-    )
-    return "\n".join((value.hexdigest(), *parts))
-
-
-def _instructions() -> str:
-    """Return the instructions that the processor has: libraries choose their code by them, and sums differ in the last bits."""
-    try:
+    try:  # the instructions that the processor has: libraries choose their code by them, and sums differ in the last bits
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # not on Linux
-        return platform.processor()
-    return next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
+        lines = []
+    instructions = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
+    versions = (library.__version__ for library in (np, scipy, cv2, simplejpeg))
+    return "\n".join((value.hexdigest(), *versions, platform.machine(), instructions))

@@ -14,9 +14,8 @@ from log2sim.files import plugins
 from log2sim.files.cache import DiskCache
 from log2sim.files.plugins import DETECT_IN_CLOUD, find_call_defect
 from log2sim.perception.cooperative import create_for_ends
-from log2sim.perception.detect.detectors import CheckedDetector, Detector, FunctionDetector, checked, create_detector
+from log2sim.perception.detect.detectors import CheckedDetector, Detector, FunctionDetector, create_detector
 from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
-from log2sim.perception.detect3d.detectors import checked as checked_lidar
 from log2sim.perception.run_cache import FirstPassCache, open_cache
 
 EXPECTED = (
@@ -53,13 +52,26 @@ def sort_detectors(
     images: Detector | None = None
     sweeps: LidarDetector | None = None
     for part in parts:
+        detect, label = getattr(part, "detect", None), f"detector '{getattr(part, 'name', type(part).__name__)}'"
         if isinstance(part, str):
             kind, name = "sweeps" if part.startswith(LIDAR_PREFIX) else "images", part
-        elif _searches_clouds(part):
-            sweeps = checked_lidar(part, _say(part))
+        # Detectors for pictures have a default score, and their `detect` takes one frame.
+        elif (
+            callable(detect)
+            and not hasattr(part, "default_min_score")
+            and not find_call_defect(detect, DETECT_IN_CLOUD)
+        ):
+            sweeps = CheckedLidarDetector(part, label)
             kind, name = "sweeps", f"{LIDAR_PREFIX}{GIVEN_PREFIX}{sweeps.name}"
         else:
-            images = _in_images(part, config.detect.min_score)
+            if hasattr(part, "detect"):
+                images = CheckedDetector(part, label)
+            elif callable(part):
+                of_function = str(getattr(part, "__name__", type(part).__name__)).strip("<>")
+                searching = FunctionDetector(part, config.detect.min_score, of_function)
+                images = CheckedDetector(searching, f"detector '{of_function}'")
+            else:
+                raise TypeError(f"detector: a {type(part).__name__}, expected {EXPECTED}")
             kind, name = "images", f"{GIVEN_PREFIX}{images.name}"
         if kind in names:
             raise TypeError(f"detector: two for {kind}, {names[kind]} and {name}; expected {EXPECTED}")
@@ -68,29 +80,6 @@ def sort_detectors(
         raise TypeError(f"detector: an empty list, expected {EXPECTED}")
     joined = "+".join(names[kind] for kind in ("images", "sweeps") if kind in names)
     return GivenDetectors(config.changed(detect={"name": joined}), images, sweeps)
-
-
-def _searches_clouds(given: Any) -> bool:
-    """Whether an object is a detector for clouds: those for pictures have a default score, and `detect` takes one frame."""
-    detect = getattr(given, "detect", None)
-    return (
-        callable(detect)
-        and not hasattr(given, "default_min_score")
-        and find_call_defect(detect, DETECT_IN_CLOUD) is None
-    )
-
-
-def _in_images(given: Any, min_score: float) -> Detector:
-    if hasattr(given, "detect"):
-        return checked(given, _say(given))
-    if not callable(given):
-        raise TypeError(f"detector: a {type(given).__name__}, expected {EXPECTED}")
-    name = str(getattr(given, "__name__", type(given).__name__)).strip("<>")
-    return checked(FunctionDetector(given, min_score, name), f"detector '{name}'")
-
-
-def _say(given: Any) -> str:
-    return f"detector '{getattr(given, 'name', type(given).__name__)}'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +130,10 @@ def check_detectors(config: Config) -> None:
 
     Raises `ConfigError`, `MissingExtra`, `PluginError` as the run of a log would.
     """
-    log = _log_without_records()
+    # A log without sensors and with no box in its labels, so that `labels` takes it.
+    none, words = np.zeros(0), np.zeros(0, np.str_)
+    labels = Labels(np.zeros(0, np.int64), words, words, np.zeros((0, 3)), np.zeros((0, 3)), none)
+    log = Log("none", "none", {}, {}, {}, labels=labels)
     images, sweeps = config.detect.in_images, {config.detect.in_sweeps, config.cooperation.road_detector}
     if images not in ("", AUTO):
         if _is_of_another_package("detector", images):
@@ -158,10 +150,3 @@ def check_detectors(config: Config) -> None:
 
 def _is_of_another_package(kind: str, name: str) -> bool:
     return not plugins.is_built_in(kind, name) and name in plugins.names(kind)
-
-
-def _log_without_records() -> Log:
-    """Return a log without sensors and with no box in its labels, so that `labels` takes it."""
-    none, words = np.zeros(0), np.zeros(0, np.str_)
-    labels = Labels(np.zeros(0, np.int64), words, words, np.zeros((0, 3)), np.zeros((0, 3)), none)
-    return Log("none", "none", {}, {}, {}, labels=labels)

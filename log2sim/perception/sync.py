@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import Log, Stream, Sweep, Tick
+from log2sim.datatypes import Log, Sweep, Tick
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array, nearest_index
@@ -92,25 +93,41 @@ def synchronize(
     Raises `LogError` for a stream without records or with stamps that do not increase; `ConfigError` when the reference is
     unknown or no tick is left.
     """
-    reference = _reference(log, cameras, reference)
+    if not cameras:
+        reference = reference or max(log.lidars, key=lambda name: len(log.streams[name].t_ns))
+    else:
+        reference = reference or (log.reference_camera if log.reference_camera in cameras else "") or cameras[0]
+    kind, used = ("camera", cameras) if cameras else ("LiDAR", tuple(log.lidars))
+    if reference not in used:
+        raise ConfigError(f"sync.reference: {kind} '{reference}' is not used; used: {', '.join(used)}")
     for name in (*cameras, *log.lidars):
-        _check_stamps(log.streams[name])
+        t_ns = log.streams[name].t_ns
+        if len(t_ns) == 0:
+            raise LogError(f"stream '{name}': has no record; expected at least one, or a log without this sensor")
+        late = np.flatnonzero(np.diff(t_ns) <= 0) + 1
+        if len(late):
+            raise LogError(
+                f"stream '{name}': stamp {t_ns[late[0]]} does not follow {t_ns[late[0] - 1]}; expected strictly increasing "
+                "stamps, so sort the records and drop those that repeat one"
+            )
     ticks = log.streams[reference].t_ns
     if not cameras:
         ticks = ticks + sweep_middle_ns(log, reference)
     seconds = (ticks - ticks[0]) / NS_PER_S
-    keep = (seconds >= (start_s if start_s is not None else -np.inf)) & (
-        seconds <= (stop_s if stop_s is not None else np.inf)
-    )
+    keep = (seconds >= (-np.inf if start_s is None else start_s)) & (seconds <= (np.inf if stop_s is None else stop_s))
     if not keep.any():
         raise ConfigError(f"--start/--stop leave no frame of '{reference}', which lasts {seconds[-1]:.3f} s")
     ticks = ticks[keep]
     tolerance_ns = round(max_residual_s * NS_PER_S)
     frames, residuals = {}, {}
     for camera in cameras:
-        frames[camera], residuals[camera] = _assign_frames_once(
-            *nearest_records(log.streams[camera].t_ns, ticks, tolerance_ns)
-        )
+        index, residual_s = nearest_records(log.streams[camera].t_ns, ticks, tolerance_ns)
+        # A frame that is nearest to several ticks is kept only at the nearest of them, so that no frame counts twice.
+        order = np.lexsort((np.abs(residual_s), index))
+        first = np.zeros(len(index), dtype=bool)
+        first[order] = np.r_[True, index[order][1:] != index[order][:-1]]
+        once = first & (index >= 0)
+        frames[camera], residuals[camera] = np.where(once, index, -1), np.where(once, residual_s, np.nan)
     sweeps = {}
     for lidar in log.lidars:
         stream = log.streams[lidar]
@@ -137,30 +154,6 @@ def schedule_of(log: Log, cameras: tuple[str, ...], config: Config) -> Schedule:
     )
 
 
-def _reference(log: Log, cameras: tuple[str, ...], wanted: str) -> str:
-    """Choose the sensor that sets the ticks: a camera, or a LiDAR without cameras."""
-    if not cameras:
-        if wanted and wanted not in log.lidars:
-            raise ConfigError(f"sync.reference: LiDAR '{wanted}' is not used; used: {', '.join(log.lidars)}")
-        return wanted or max(log.lidars, key=lambda name: len(log.streams[name].t_ns))
-    reference = wanted or (log.reference_camera if log.reference_camera in cameras else "") or cameras[0]
-    if reference not in cameras:
-        raise ConfigError(f"sync.reference: camera '{reference}' is not used; used: {', '.join(cameras)}")
-    return reference
-
-
-def _check_stamps(stream: Stream) -> None:
-    """Raise `LogError` for a stream without records or with stamps that do not increase."""
-    if len(stream.t_ns) == 0:
-        raise LogError(f"stream '{stream.name}': has no record; expected at least one, or a log without this sensor")
-    late = np.flatnonzero(np.diff(stream.t_ns) <= 0) + 1
-    if len(late):
-        raise LogError(
-            f"stream '{stream.name}': stamp {stream.t_ns[late[0]]} does not follow {stream.t_ns[late[0] - 1]}; expected "
-            "strictly increasing stamps, so sort the records and drop those that repeat one"
-        )
-
-
 def nearest_records(
     stamps_ns: NDArray[np.int64], asked_ns: NDArray[np.int64], tolerance_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -168,8 +161,6 @@ def nearest_records(
 
     Returns `index`: (T,): -1 beyond the tolerance; `residual_s`: (T,): NaN beyond the tolerance.
 
-    Notes
-    -----
     The offline equivalent of the online rule of Bhardwaj & Kalra, which waits for the incoming record if it will be nearer
     than the last one. Of two equally near records the earlier is taken.
     """
@@ -177,17 +168,6 @@ def nearest_records(
     residual_ns = stamps_ns[index] - asked_ns
     near = np.abs(residual_ns) <= tolerance_ns
     return np.where(near, index, -1), np.where(near, residual_ns / NS_PER_S, np.nan)
-
-
-def _assign_frames_once(
-    index: NDArray[np.int64], residual_s: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Keep a frame that is nearest to several ticks only at the nearest of them, so that no frame counts twice."""
-    order = np.lexsort((np.abs(residual_s), index))
-    first = np.zeros(len(index), dtype=bool)
-    first[order] = np.r_[True, index[order][1:] != index[order][:-1]]
-    keep = first & (index >= 0)
-    return np.where(keep, index, -1), np.where(keep, residual_s, np.nan)
 
 
 def sweep_middle_ns(log: Log, lidar: str) -> int:
@@ -251,27 +231,26 @@ class Ticks(Sequence[Tick]):
         """Return a tick, or those of a slice."""
         if isinstance(index, slice):
             return Ticks(self._log, self._schedule, self._rows[index])
-        return self._tick(self._rows[index])
+        log, schedule, row = self._log, self._schedule, self._rows[index]
+        t_ns = int(schedule.t_ns[row])
+        frames = {name: int(index[row]) for name, index in schedule.frames.items() if index[row] >= 0}
+        near = {name: int(index[schedule.reference_row, row]) for name, index in schedule.sweeps.items()}
+        require = RecordSource(log).require
+        sweeps: Records[Sweep] = Records({name: partial(require, name, k) for name, k in near.items() if k >= 0})
+        poses, known = (None, [False]) if log.ego is None else log.ego.at(t_ns)
+        return Tick(
+            t_ns=t_ns,
+            t_s=float(t_ns - schedule.t_ns[0]) / NS_PER_S,
+            images=Records({name: partial(require, name, k) for name, k in frames.items()}),
+            sweeps=sweeps,
+            image_ns={name: int(log.streams[name].t_ns[k]) for name, k in frames.items()},
+            map_T_ego=np.asarray(poses[0]) if poses is not None and known[0] else None,
+            points=lambda: points_of(log, sweeps),
+        )
 
     def __repr__(self) -> str:
         """Return the number of ticks."""
         return f"<{len(self)} ticks of {self._log.name!r:.80}>"
-
-    def _tick(self, row: int) -> Tick:
-        log, schedule = self._log, self._schedule
-        t_ns = int(schedule.t_ns[row])
-        frames = {name: int(index[row]) for name, index in schedule.frames.items() if index[row] >= 0}
-        near = {name: int(index[schedule.reference_row, row]) for name, index in schedule.sweeps.items()}
-        sweeps: Records[Sweep] = Records({name: _reading(log, name, k) for name, k in near.items() if k >= 0})
-        return Tick(
-            t_ns=t_ns,
-            t_s=float(t_ns - schedule.t_ns[0]) / NS_PER_S,
-            images=Records({name: _reading(log, name, k) for name, k in frames.items()}),
-            sweeps=sweeps,
-            image_ns={name: int(log.streams[name].t_ns[k]) for name, k in frames.items()},
-            map_T_ego=_ego_pose(log, t_ns),
-            points=lambda: points_of(log, sweeps),
-        )
 
 
 class Records(Mapping[str, T], Generic[T]):
@@ -307,14 +286,3 @@ def points_of(log: Log, sweeps: Mapping[str, Sweep]) -> Array:
     """Return the points (N, 3), m, of sweeps in the map frame; those of a sensor whose pose is not known are left out."""
     mapped = [sweep_to_map(log, name, sweep, compensate=True) for name, sweep in sweeps.items()]
     return np.concatenate([np.zeros((0, 3)), *(xyz for found in mapped if found is not None for xyz in [found[0]])])
-
-
-def _reading(log: Log, name: str, index: int) -> Callable[[], Any]:
-    return lambda: RecordSource(log).require(name, index)
-
-
-def _ego_pose(log: Log, t_ns: int) -> Array | None:
-    if log.ego is None:
-        return None
-    map_T_ego, valid = log.ego.at(t_ns)
-    return np.asarray(map_T_ego[0]) if valid[0] else None

@@ -49,7 +49,10 @@ def crop_lights(camera: str, t_ns: int, image_bgr: NDArray[np.uint8], lights: Ar
         inside = u0 > 1 and v0 > 1 and u1 < width - 1 and v1 < height - 1
         if not inside or min(u1 - u0, v1 - v0) < MIN_SIDE_PX:
             continue
-        if any(_share_within(box, other.box_px) > MAX_OVERLAP for other in out):
+        others = np.array([light.box_px for light in out]).reshape(-1, 4)
+        common = np.clip(np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2]), 0, None).prod(axis=1)
+        smaller = np.minimum((box[2:] - box[:2]).prod(), (others[:, 2:] - others[:, :2]).prod(axis=1))
+        if (common / smaller > MAX_OVERLAP).any():
             continue
         du, dv = MARGIN * (u1 - u0), MARGIN * (v1 - v0)
         left, top, right, bottom = round(u0 - du), round(v0 - dv), round(u1 + du) + 1, round(v1 + dv) + 1
@@ -58,12 +61,6 @@ def crop_lights(camera: str, t_ns: int, image_bgr: NDArray[np.uint8], lights: Ar
         small = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else crop.copy()
         out.append(LightBox(camera, t_ns, box, score, np.asarray(small, np.uint8)))
     return out
-
-
-def _share_within(a: Array, b: Array) -> float:
-    """Return the common part of two boxes (4,) as a share of the smaller one."""
-    common = np.prod(np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0, None))
-    return float(common / min(np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])))
 
 
 def add_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[LightBox]:

@@ -206,29 +206,7 @@ class ForwardTracker:
 
     def advance(self, columns: _Columns, now_ns: int, flow_mps: Array | None = None) -> tuple[Index, Index]:
         """Do what `step` does, with the columns of a tick and the velocity of the ego (2,)."""
-        self._predict(now_ns)
-        if len(columns.row) == 0:
-            return columns.row, np.zeros(0, dtype=np.intp)
-        strong = columns.score >= self.birth_score
-        costs, flows = self._costs(columns, np.zeros(2) if flow_mps is None else flow_mps, now_ns)
-        tracks, taken = self._choose(columns, strong, costs)
-        self.mean[tracks] += flows[tracks, taken]
-        self._update(tracks, columns, taken, costs)
-        self.seen_ns[tracks] = now_ns
-        self.hits[tracks] += 1
-        self._riderless[tracks] += (columns.riderless[taken] - self._riderless[tracks]) / self.hits[tracks]
-        numbers = self.number[tracks]
-        fresh = strong.copy()
-        fresh[taken] = False
-        born = np.flatnonzero(fresh)
-        if len(born):
-            self._start(columns, born, now_ns)
-            numbers = np.concatenate([numbers, self.number[len(self.number) - len(born) :]])
-            taken = np.concatenate([taken, born])
-        return columns.row[taken], numbers
-
-    def _predict(self, now_ns: int) -> None:
-        """End the tracks without a recent measurement and predict the others to `now_ns`."""
+        # Tracks without a recent measurement end, the others are predicted.
         age_s = (now_ns - self.seen_ns) / NS_PER_S
         alive = age_s <= np.where(self.hits >= TENTATIVE_HITS, self._confirmed_age_s, self._tentative_age_s)
         if not alive.all():
@@ -240,12 +218,47 @@ class ForwardTracker:
             self.place_covariance = self.place_covariance + STANDING_DRIFT_M**2 * abs(dt_s) * np.eye(2)
             self.standing = self.standing * np.exp(-abs(dt_s) / START_TIME_S)
         self._now_ns = now_ns
+        if len(columns.row) == 0:
+            return columns.row, np.zeros(0, dtype=np.intp)
+        strong = columns.score >= self.birth_score
+        costs, flows = self._costs(columns, np.zeros(2) if flow_mps is None else flow_mps, now_ns)
+        tracks, taken = self._choose(columns, strong, costs)
+        fresh = strong.copy()
+        fresh[taken] = False
+        if len(tracks):
+            xy, r = columns.xy[taken], columns.r[taken]
+            moving, standing, prior = costs[0][tracks, taken], costs[1][tracks, taken], self.standing[tracks]
+            posterior = prior * np.exp((_joined(moving, standing, prior) - standing) / 2)
+            self.standing[tracks] = np.where(posterior < MIN_STANDING_PROBABILITY, 0.0, posterior)
+            gain = self.place_covariance[tracks] @ np.linalg.inv(self.place_covariance[tracks] + r)
+            self.place_m[tracks] += (gain @ (xy - self.place_m[tracks])[:, :, None])[..., 0]
+            self.place_covariance[tracks] -= gain @ self.place_covariance[tracks]
+            mean, covariance = self.mean[tracks] + flows[tracks, taken], self.covariance[tracks]
+            self.mean[tracks], self.covariance[tracks] = update(mean, covariance, xy, r, columns.age_s[taken])
+            self.seen_ns[tracks] = now_ns
+            self.hits[tracks] += 1
+            self._riderless[tracks] += (columns.riderless[taken] - self._riderless[tracks]) / self.hits[tracks]
+        numbers, born = self.number[tracks], np.flatnonzero(fresh)
+        if len(born):
+            count = len(born)
+            number, one = np.arange(self._born, self._born + count), np.ones(count, dtype=np.int64)
+            mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
+            mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
+            covariance[:, 2:, 2:] = columns.velocity[born]
+            prior = np.where(columns.riderless[born] > 0, RIDERLESS_STANDING_PRIOR, STANDING_PRIOR)
+            of_born = (
+                number, mean, covariance, now_ns * one, one, prior, columns.xy[born], columns.r[born],
+                columns.group[born], columns.riderless[born], columns.age_s[born],
+            )  # fmt: skip
+            for name, values in zip(COLUMNS, of_born, strict=True):
+                setattr(self, name, np.concatenate([getattr(self, name), values]))
+            self._born += count
+            numbers, taken = np.concatenate([numbers, number]), np.concatenate([taken, born])
+        return columns.row[taken], numbers
 
     def _choose(self, columns: _Columns, strong: NDArray[np.bool_], costs: _Costs) -> tuple[Index, Index]:
         """Return tracks and measurements of the likeliest assignment inside the gate, strong measurements first.
 
-        Notes
-        -----
         The cost of a pair is minus twice the logarithm of the ratio of two likelihoods: that the track was measured
         there, and that it was not detected and the measurement is another object's or nobody's (Blackman, "Multiple
         hypothesis tracking for multiple target tracking", IEEE AES Magazine 19, 2004). A pair that is less likely than
@@ -300,35 +313,6 @@ class ForwardTracker:
         )
         inside = (squared <= CHI2_2DOF_999) | (self.standing[:, None] > 0) & (squared_at_rest <= CHI2_2DOF_999)
         return (moving, squared_at_rest + log_determinant_at_rest, inside), added
-
-    def _update(self, tracks: Index, columns: _Columns, taken: Index, costs: _Costs) -> None:
-        if len(tracks) == 0:
-            return
-        moving, standing, prior = costs[0][tracks, taken], costs[1][tracks, taken], self.standing[tracks]
-        posterior = prior * np.exp((_joined(moving, standing, prior) - standing) / 2)
-        self.standing[tracks] = np.where(posterior < MIN_STANDING_PROBABILITY, 0.0, posterior)
-        gain = self.place_covariance[tracks] @ np.linalg.inv(self.place_covariance[tracks] + columns.r[taken])
-        offset = columns.xy[taken] - self.place_m[tracks]
-        self.place_m[tracks] += (gain @ offset[:, :, None])[..., 0]
-        self.place_covariance[tracks] -= gain @ self.place_covariance[tracks]
-        self.mean[tracks], self.covariance[tracks] = update(
-            self.mean[tracks], self.covariance[tracks], columns.xy[taken], columns.r[taken], columns.age_s[taken]
-        )
-
-    def _start(self, columns: _Columns, born: Index, now_ns: int) -> None:
-        count = len(born)
-        mean, covariance = np.zeros((count, 4)), np.zeros((count, 4, 4))
-        mean[:, :2], covariance[:, :2, :2] = columns.xy[born], columns.r[born]
-        covariance[:, 2:, 2:] = columns.velocity[born]
-        prior = np.where(columns.riderless[born] > 0, RIDERLESS_STANDING_PRIOR, STANDING_PRIOR)
-        number, seen_ns = np.arange(self._born, self._born + count), np.full(count, now_ns, dtype=np.int64)
-        of_born = (
-            number, mean, covariance, seen_ns, np.ones(count, dtype=np.int64), prior, columns.xy[born], columns.r[born],
-            columns.group[born], columns.riderless[born], columns.age_s[born],
-        )  # fmt: skip
-        for name, values in zip(COLUMNS, of_born, strict=True):
-            setattr(self, name, np.concatenate([getattr(self, name), values]))
-        self._born += count
 
 
 @dataclass(frozen=True, eq=False)

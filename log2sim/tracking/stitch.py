@@ -35,68 +35,41 @@ CATEGORY_END_MEASUREMENTS = 5
 def decide_category(m: Measurements, *, whole_boxes: bool = False) -> str:
     """Decide the category of a track from its measurements, which are sorted by time.
 
-    It is the one with most of the score. Without `whole_boxes`, a pedestrian faster than people run is a cyclist whose bicycle the
-    detector missed, and a bicycle that moves and sometimes shows a rider has one.
+    It is the one with most of the score of the group that has most of it; ties go to the first by name. Without `whole_boxes`, a
+    pedestrian faster than people run is a cyclist whose bicycle the detector missed, and a bicycle that moves and sometimes shows
+    a rider has one.
     """
-    category = voted_category(m)
+    category, groups = str(m.category[0]), np.array([GROUP_OF[c] for c in m.category.tolist()])
+    if (m.category != category).any():
+        group = _most_scored(groups, m.score)
+        voters = groups == group
+        # A motorcycle, a bicycle and their riders have much the same points but look different.
+        with_image = voters & (m.camera != "")
+        voters = with_image if group == "two_wheeler" and with_image.any() else voters
+        category = _most_scored(m.category[voters], m.score[voters])
     if whole_boxes:
         return category
-    if category == "pedestrian" and _speed_mps(m) > MAX_PEDESTRIAN_SPEED_MPS:
-        return "cyclist"
-    if (
-        category == "bicycle"
-        and (m.category != category).mean() >= MIN_RIDER_SHARE
-        and _displacement_m(m) > MIN_RIDDEN_M
-    ):
-        return "cyclist"
+    if category == "pedestrian":
+        # The robust maximum of the speeds over a while.
+        t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+        later = np.searchsorted(t, t + SPEED_BASELINE_S)
+        start = np.flatnonzero(later < len(t))
+        later = later[start]
+        speed_mps = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T) / (t[later] - t[start])
+        if len(start) and float(np.quantile(speed_mps, SPEED_QUANTILE)) > MAX_PEDESTRIAN_SPEED_MPS:
+            return "cyclist"
+    count = min(CATEGORY_END_MEASUREMENTS, len(m) // 2)
+    if category == "bicycle" and count and (m.category != category).mean() >= MIN_RIDER_SHARE:
+        first, last = np.median(m.center_m[:count, :2], axis=0), np.median(m.center_m[-count:, :2], axis=0)
+        if np.hypot(*(last - first)) > MIN_RIDDEN_M:
+            return "cyclist"
     return category
-
-
-def voted_category(m: Measurements) -> str:
-    """Return the category with most of the score of the group that has most of it; ties go to the first by name.
-
-    Notes
-    -----
-    A motorcycle, a bicycle and their riders have much the same points but look different: within two-wheelers the
-    measurements with an image decide, if there are any.
-    """
-    categories = m.category.tolist()
-    if len(set(categories)) == 1:
-        return str(categories[0])
-    groups = np.array([GROUP_OF[c] for c in categories])
-    group = _most_scored(groups, m.score)
-    voters = groups == group
-    with_image = voters & (m.camera != "")
-    if group == "two_wheeler" and with_image.any():
-        voters = with_image
-    return _most_scored(m.category[voters], m.score[voters])
 
 
 def _most_scored(names: NDArray[np.str_], score: Array) -> str:
     """Return the name, of names (n,), with the largest sum of scores (n,)."""
     unique, index = np.unique(names, return_inverse=True)
     return str(unique[np.argmax(np.bincount(index, weights=score))])
-
-
-def _displacement_m(m: Measurements) -> float:
-    """Return the distance between the median positions at both ends of a track."""
-    count = min(CATEGORY_END_MEASUREMENTS, len(m) // 2)
-    if count == 0:
-        return 0.0
-    first, last = np.median(m.center_m[:count, :2], axis=0), np.median(m.center_m[-count:, :2], axis=0)
-    return float(np.hypot(*(last - first)))
-
-
-def _speed_mps(m: Measurements) -> float:
-    """Return the robust maximum of the speeds over `SPEED_BASELINE_S`; 0 for a shorter track."""
-    t = (m.t_ns - m.t_ns[0]) / NS_PER_S
-    later = np.searchsorted(t, t + SPEED_BASELINE_S)
-    start = np.flatnonzero(later < len(t))
-    later = later[start]
-    if len(start) == 0:
-        return 0.0
-    distance = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T)
-    return float(np.quantile(distance / (t[later] - t[start]), SPEED_QUANTILE))
 
 
 # Largest standard deviation of the position difference; above it agreement is no evidence.
@@ -147,7 +120,12 @@ def stitch(
         for chain in chains:
             while chain[-1] in following:
                 chain.append(following[chain[-1]])
-        joined = [_concatenate([current[k] for k in c], whole_boxes=whole_boxes) for c in chains if len(c) > 1]
+        joined = []
+        for chain in chains:
+            if len(chain) > 1:
+                m = Measurements.join([current[k].measurements for k in chain])
+                ticks = np.concatenate([current[k].tick for k in chain])
+                joined.append(Track(decide_category(m, whole_boxes=whole_boxes), ticks, m))
         # Only what was joined is filtered again.
         number = iter(range(len(current), len(current) + len(joined)))
         rows = [next(number) if len(c) > 1 else c[0] for c in chains]
@@ -256,10 +234,3 @@ def _filtered(
         predicted = predict(mean[on], covariance[on], (t_ns[row] - t_ns[row - 1]) / NS_PER_S, noise[on])
         mean[on], covariance[on] = update(*predicted, xy[row], r[row], np.zeros(len(on)))
     return mean, covariance
-
-
-def _concatenate(parts: Sequence[Track], *, whole_boxes: bool) -> Track:
-    if len(parts) == 1:
-        return parts[0]
-    m = Measurements.join([p.measurements for p in parts])
-    return Track(decide_category(m, whole_boxes=whole_boxes), np.concatenate([p.tick for p in parts]), m)

@@ -20,7 +20,7 @@ from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT, require_members
 from log2sim.geometry import NS_PER_S, period_of, rectangles_overlap, wrap_angle
-from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
+from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
 
 __all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
 
@@ -55,7 +55,14 @@ class ForeignDetector:
 
 
 class CheckedDetector(ForeignDetector):
-    """A detector of somebody else; what it raises and what it returns is checked."""
+    """A detector of somebody else; what it raises and what it returns is checked.
+
+    Raises `PluginError` when it lacks a member of `Detector`, or its `detect` cannot be called.
+    """
+
+    def __post_init__(self) -> None:
+        """Check the members."""
+        require_members(self.inner, MEMBERS, DETECT, self.source)
 
     @property
     def default_min_score(self) -> float:
@@ -109,46 +116,27 @@ class FunctionDetector:
         """
         image = frame.image().copy()  # a function may draw on what it gets
         with self._lock:
-            answer = self.function(image)
-        found = answer if isinstance(answer, Detections) else detections_of(answer)
+            found = self.function(image)
+        if not isinstance(found, Detections):
+            if isinstance(found, (str, bytes)) or not isinstance(found, (Sequence, np.ndarray)):
+                raise _WrongRows(f"returned {type(found).__name__}, expected a list of rows of {ROW}, or Detections")
+            numbers, categories = np.zeros((len(found), 5)), []
+            for k, row in enumerate(found):
+                try:
+                    *values, category = row
+                    if len(values) != 5 or not isinstance(category, str):
+                        raise TypeError
+                    numbers[k] = [float(value) for value in values]
+                except (TypeError, ValueError):
+                    raise _WrongRows(f"row {k} is {row!r:.80}, expected {ROW}") from None
+                categories.append(category)
+            found = Detections(numbers[:, :4], numbers[:, 4], np.array(categories, dtype=np.str_))
         defect = find_defect(found)
         if defect is not None:
             raise _WrongRows(defect)
         order = np.argsort(-found.score, kind="stable")
         kept = found.take(order[found.score[order] >= self.min_score])
         return replace(kept, traffic_lights=found.traffic_lights)
-
-
-def checked(detector: Any, source: str) -> CheckedDetector:
-    """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
-
-    Raises `PluginError` when it lacks a member of `Detector`, or its `detect` cannot be called.
-    """
-    require_members(detector, MEMBERS, DETECT, source)
-    return CheckedDetector(detector, source)
-
-
-def detections_of(rows: Any) -> Detections:
-    """Return rows of x0, y0, x1, y1 in px, score, category as detections.
-
-    Raises `PluginError` for anything else.
-    """
-    if isinstance(rows, (str, bytes)) or not isinstance(rows, (Sequence, np.ndarray)):
-        raise _WrongRows(f"returned {type(rows).__name__}, expected a list of rows of {ROW}, or Detections")
-    if not len(rows):
-        return Detections.empty()
-    numbers, categories = [], []
-    for k, row in enumerate(rows):
-        try:
-            *values, category = row
-            numbers.append([float(value) for value in values])
-        except (TypeError, ValueError):
-            raise _WrongRows(f"row {k} is {row!r:.80}, expected {ROW}") from None
-        if len(values) != 5 or not isinstance(category, str):
-            raise _WrongRows(f"row {k} is {row!r:.80}, expected {ROW}")
-        categories.append(str(category))
-    columns = np.array(numbers)
-    return Detections(columns[:, :4], columns[:, 4], np.array(categories, dtype=np.str_))
 
 
 def find_defect(found: Detections) -> str | None:
@@ -204,8 +192,6 @@ def road_users(labels: Labels, usable: NDArray[np.bool_] | bool = True) -> tuple
 def window_ns(t_ns: NDArray[np.int64]) -> int:
     """Compute the time around a frame in which its labels are searched: one period of the labels, ns.
 
-    Notes
-    -----
     Some logs stamp all boxes of a sweep alike, others each by its own points, from which no period can be read.
     """
     stamps = np.unique(t_ns)
@@ -220,15 +206,21 @@ def interpolate_boxes(boxes: Boxes3D, t_ns: int, window: int) -> Boxes3D:
 
     `boxes`: boxes of all stamps in ascending order. `window`: from `window_ns`.
 
-    Notes
-    -----
     Partners before and after are mutual nearest neighbors in place and size: without interpolation a car at 15 m/s is
     0.75 m off between two stamps at 10 Hz. A box without a partner is kept in its place up to `MAX_AGE_S`.
     """
     low, here, high = np.searchsorted(boxes.t_ns, [t_ns - window, t_ns + 1, t_ns + window + 1])
     before = boxes.take(drop_repeated_objects(boxes, np.arange(here - 1, low - 1, -1)))
     after = boxes.take(drop_repeated_objects(boxes, np.arange(here, high)))
-    i, j = mutual_nearest(before, after)
+    i = j = np.zeros(0, np.intp)
+    if len(before) and len(after):
+        distance = np.linalg.norm(before.center_m[:, None] - after.center_m[None], axis=-1)
+        cost = distance + SIZE_WEIGHT * np.linalg.norm(before.size_m[:, None] - after.size_m[None], axis=-1)
+        reachable = distance <= MAX_SPEED_MPS * np.abs(after.t_ns[None] - before.t_ns[:, None]) / NS_PER_S
+        cost = np.where((before.category[:, None] == after.category[None]) & reachable, cost, np.inf)
+        own, partner = np.arange(len(before)), np.argmin(cost, axis=1)
+        i = np.flatnonzero(np.isfinite(cost[own, partner]) & (np.argmin(cost, axis=0)[partner] == own))
+        j = partner[i]
     first, last = (np.setdiff1d(np.arange(len(boxes)), taken) for boxes, taken in ((before, i), (after, j)))
     age = round(MAX_AGE_S * NS_PER_S)
     out = Boxes3D.join([
@@ -242,8 +234,6 @@ def interpolate_boxes(boxes: Boxes3D, t_ns: int, window: int) -> Boxes3D:
 def drop_repeated_objects(boxes: Boxes3D, index: NDArray[np.intp]) -> NDArray[np.intp]:
     """Drop rows of `index` that overlap an earlier row of another stamp: the same object once more.
 
-    Notes
-    -----
     Two objects never share ground, so boxes of different stamps that overlap are one object seen twice.
     """
     if not len(index):
@@ -270,20 +260,6 @@ def interpolate_pairs(before: Boxes3D, after: Boxes3D, t_ns: int) -> Boxes3D:
     yaw = wrap_angle(before.yaw_rad + fraction * wrap_angle(after.yaw_rad - before.yaw_rad))
     size = np.where(fraction[:, None] <= 0.5, before.size_m, after.size_m)
     return replace(before, center_m=center, size_m=size, yaw_rad=np.asarray(yaw))
-
-
-def mutual_nearest(a: Boxes3D, b: Boxes3D) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Find the indices of boxes in `a` and `b` that are mutual nearest neighbors of one category and within reach."""
-    if not len(a.t_ns) or not len(b.t_ns):
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    distance = np.linalg.norm(a.center_m[:, None] - b.center_m[None], axis=-1)
-    cost = distance + SIZE_WEIGHT * np.linalg.norm(a.size_m[:, None] - b.size_m[None], axis=-1)
-    reachable = distance <= MAX_SPEED_MPS * np.abs(b.t_ns[None] - a.t_ns[:, None]) / NS_PER_S
-    cost = np.where((a.category[:, None] == b.category[None]) & reachable, cost, np.inf)
-    partner = np.argmin(cost, axis=1)
-    own = np.arange(len(partner))
-    mutual = np.isfinite(cost[own, partner]) & (np.argmin(cost, axis=0)[partner] == own)
-    return own[mutual], partner[mutual]
 
 
 # Smaller boxes are left out, as detectors do not find them.
@@ -313,7 +289,13 @@ class LabelDetector:
         view = view_of(self.log, frame.camera.name, frame.t_ns)
         if not len(boxes.t_ns) or view is None:
             return Detections.empty()
-        return project_labels(interpolate_boxes(boxes, frame.t_ns, window), view)
+        # Occluded boxes are kept: a LiDAR on the roof often sees what the camera does not.
+        boxes = interpolate_boxes(boxes, frame.t_ns, window)
+        projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
+        kept = np.flatnonzero(projected.valid)
+        kept = kept[(projected.box_px[kept, 2:] - projected.box_px[kept, :2] >= MIN_SIDE_PX).all(axis=1)]
+        kept = kept[np.argsort(projected.range_m[kept], kind="stable")]
+        return Detections(projected.box_px[kept], boxes.score[kept], boxes.category[kept])
 
     @cached_property
     def _image_boxes(self) -> dict[str, tuple[NDArray[np.int64], Detections]]:
@@ -350,20 +332,6 @@ def create(
             f"choose another detector: {others}, or the path of an ONNX file"
         )
     return LabelDetector(log)
-
-
-def project_labels(boxes: Boxes3D, view: View) -> Detections:
-    """Project boxes into a frame; those that are large enough, nearest first.
-
-    Occluded boxes are kept: a LiDAR on the roof often sees what the camera does not.
-    """
-    projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
-    box_px = projected.box_px
-    large = projected.valid.copy()
-    large[projected.valid] = np.all(box_px[projected.valid, 2:] - box_px[projected.valid, :2] >= MIN_SIDE_PX, axis=1)
-    kept = np.flatnonzero(large)
-    kept = kept[np.argsort(projected.range_m[kept], kind="stable")]
-    return Detections(box_px[kept], boxes.score[kept], boxes.category[kept])
 
 
 MAX_OVERLAP = 0.5
@@ -430,7 +398,13 @@ def create_detector(
     Raises `ConfigError`: an unknown name, a file that is no usable model, or a setting out of range; `MissingExtra`: the
     detector's package is not installed.
     """
-    check_settings(min_score, max_overlap, tiles)
+    if min_score is not None and not 0 <= min_score <= 1:
+        raise ConfigError(f"min_score {min_score}: expected a number from 0 to 1")
+    if not 0 < max_overlap <= 1:
+        raise ConfigError(f"max_overlap {max_overlap}: expected a number above 0 and up to 1")
+    counted = isinstance(tiles, int) and not isinstance(tiles, bool)
+    if tiles != "auto" and not (counted and 1 <= int(tiles) <= MAX_TILES):
+        raise ConfigError(f"tiles {tiles!r}: expected 'auto' or a whole number from 1 to {MAX_TILES}")
     if name_or_path.lower().endswith(".onnx"):
         from log2sim.perception.detect.onnx_detector import open_onnx
 
@@ -457,15 +431,4 @@ def create_detector(
         detector: Detector = create(log, min_score=min_score, max_overlap=max_overlap, tiles=tiles)
     if plugins.is_built_in("detector", name_or_path):
         return detector
-    return checked(detector, plugins.plugin_label("detector", name_or_path))
-
-
-def check_settings(min_score: float | None, max_overlap: float, tiles: str | int) -> None:
-    """Raise `ConfigError` for a setting that is out of its range."""
-    if min_score is not None and not 0 <= min_score <= 1:
-        raise ConfigError(f"min_score {min_score}: expected a number from 0 to 1")
-    if not 0 < max_overlap <= 1:
-        raise ConfigError(f"max_overlap {max_overlap}: expected a number above 0 and up to 1")
-    counted = isinstance(tiles, int) and not isinstance(tiles, bool)
-    if tiles != "auto" and not (counted and 1 <= int(tiles) <= MAX_TILES):
-        raise ConfigError(f"tiles {tiles!r}: expected 'auto' or a whole number from 1 to {MAX_TILES}")
+    return CheckedDetector(detector, plugins.plugin_label("detector", name_or_path))

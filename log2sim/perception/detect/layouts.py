@@ -55,69 +55,34 @@ class Preprocessing:
 
     def __call__(self, image_bgr: NDArray[np.uint8], spec: InputSpec) -> tuple[NDArray[Any], Placement]:
         """Convert an image (H, W, 3) uint8 BGR to the input (1, 3, h, w) or (1, h, w, 3), with its placement there."""
+        import cv2
+
         height, width = image_bgr.shape[:2]
         size = (spec.width_px or self.default_px or width, spec.height_px or self.default_px or height)
-        image, placement = self._place(image_bgr, size)
+        image, shift, inner = image_bgr, (0, 0), size
+        if self.fit in ("corner", "center"):
+            ratio = min(size[0] / width, size[1] / height)
+            inner = (max(1, min(size[0], round(width * ratio))), max(1, min(size[1], round(height * ratio))))
+            shift = ((size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2) if self.fit == "center" else (0, 0)
+            image = np.full((size[1], size[0], 3), LETTERBOX_GRAY, dtype=np.uint8)
+            image[shift[1] : shift[1] + inner[1], shift[0] : shift[0] + inner[0]] = cv2.resize(image_bgr, inner)
+        elif self.fit == "tf1" and size != (width, height):
+            # Output pixel i samples the input at i * in / out: pixel centers are at the corner instead of the middle. SSD models
+            # of that time were trained so; other sampling moves their scores by up to 0.27.
+            source_from_target = np.array([[width / size[0], 0, 0], [0, height / size[1], 0]])
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            image = cv2.warpAffine(image, source_from_target, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[assignment]
+        elif size != (width, height):
+            image = cv2.resize(image, size)  # type: ignore[assignment]
+        placement = Placement(np.array([inner[0] / width, inner[1] / height]), np.array(shift, np.float64), size)
         if self.rgb:
-            image = reversed_channels(image)
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[assignment]  # in a tenth of the time of a NumPy copy
         if not spec.channels_last:
             image = image.transpose(2, 0, 1)
         tensor = np.ascontiguousarray(image[None], dtype=spec.dtype)
         if self.unit and spec.dtype.kind == "f":
             tensor /= 255
         return tensor, placement
-
-    def _place(self, image: NDArray[np.uint8], size: tuple[int, int]) -> tuple[NDArray[np.uint8], Placement]:
-        height, width = image.shape[:2]
-        if self.fit in ("corner", "center"):
-            return letterbox(image, size, centered=self.fit == "center")
-        placement = Placement(np.array([size[0] / width, size[1] / height]), np.zeros(2), size)
-        if size == (width, height):
-            return image, placement
-        return (resize_as_tf1 if self.fit == "tf1" else resize)(image, size), placement
-
-
-def reversed_channels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image (H, W, 3) with its channels in reverse order, copied in a tenth of the time that NumPy takes."""
-    import cv2
-
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def letterbox(
-    image: NDArray[np.uint8], size: tuple[int, int], *, centered: bool
-) -> tuple[NDArray[np.uint8], Placement]:
-    """Fit an image into (width, height) px, keep its aspect ratio, and fill the rest with gray."""
-    height, width = image.shape[:2]
-    ratio = min(size[0] / width, size[1] / height)
-    inner = (max(1, min(size[0], round(width * ratio))), max(1, min(size[1], round(height * ratio))))
-    left, top = ((size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2) if centered else (0, 0)
-    out = np.full((size[1], size[0], 3), LETTERBOX_GRAY, dtype=np.uint8)
-    out[top : top + inner[1], left : left + inner[0]] = resize(image, inner)
-    scale = np.array([inner[0] / width, inner[1] / height])
-    return out, Placement(scale, np.array([left, top], dtype=np.float64), size)
-
-
-def resize(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize to (width, height) px, bilinear, pixel centers at half."""
-    import cv2
-
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
-
-
-def resize_as_tf1(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize to (width, height) px as TensorFlow 1 did: output pixel i samples the input at i * in / out.
-
-    Pixel centers at the corner instead of the middle, border repeated. SSD models of that time were trained so: other
-    sampling moves their scores by up to 0.27.
-    """
-    import cv2
-
-    height, width = image.shape[:2]
-    source_from_target = np.array([[width / size[0], 0, 0], [0, height / size[1], 0]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpAffine(image, source_from_target, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(warped, dtype=np.uint8)
 
 
 # A train is no road user that a vehicle model could replay, and detectors see one in many a facade.
@@ -186,20 +151,13 @@ def choose_classes(names: str | None, count: int | None, default: Classes, where
     `count`: number of classes in the output, None where the output holds class ids; then `default` holds. `where`: the
     file, for messages.
     """
-    if names is not None:
-        return classes_from_names(names, where)
-    if count is None:
-        return default
-    if count not in BY_COUNT:
+    if names is None and count is not None and count not in BY_COUNT:
         raise ConfigError(
             f"{where}: {count} classes without names; expected 80, 90 or 91 (COCO), or the entry 'names' in the "
             "model's metadata, such as {0: 'car', 1: 'pedestrian'}"
         )
-    return BY_COUNT[count]
-
-
-def classes_from_names(names: str, where: str) -> Classes:
-    """Read a literal list or dict of class names; nothing in it is executed."""
+    if names is None:
+        return default if count is None else BY_COUNT[count]
     try:
         if len(names) > NAMES_LIMIT_CHARS:
             raise ValueError(f"{len(names)} characters")
@@ -210,8 +168,7 @@ def classes_from_names(names: str, where: str) -> Classes:
         raise ConfigError(f"{where}: metadata 'names' is no list or dict of class names: {error}") from None
     known = {i: CATEGORY_OF_NAME[name] for i, name in by_index.items() if name in CATEGORY_OF_NAME}
     if not set(known.values()) - {TRAFFIC_LIGHT}:
-        listed = ", ".join(list(by_index.values())[:8])
-        names_known = ", ".join(CATEGORY_OF_NAME)
+        listed, names_known = ", ".join(list(by_index.values())[:8]), ", ".join(CATEGORY_OF_NAME)
         raise ConfigError(f"{where}: none of its classes is a road user ({listed}); known: {names_known}")
     return Classes(known)
 
@@ -241,7 +198,8 @@ class Layout:
 
     name: str  # by which a user chooses it
     preprocessing: Preprocessing  # that the models were trained with
-    matches: Callable[[Outputs, Size], bool] = field(repr=False)  # whether outputs of a gray image have this layout
+    # Whether outputs of a gray image have this layout: with their `single_output_shape` and the number of cells of the input
+    matches: Callable[[Outputs, tuple[int, int], int], bool] = field(repr=False)
     class_count: Callable[[Outputs], int | None] = field(repr=False)  # None where the output holds class ids
     # Boxes of a score and higher.
     decode: Callable[[Outputs, Size, Classes, float], Candidates] = field(repr=False)
@@ -260,17 +218,19 @@ def largest_output(outputs: Outputs) -> NDArray[Any]:
     return max(outputs.values(), key=lambda a: a.size)
 
 
-def single_output_shape(outputs: Outputs) -> tuple[int, int] | None:
-    """Return the last two dimensions of a single output (1, a, b); None for other or more outputs."""
-    arrays = list(outputs.values())
-    if len(arrays) != 1 or arrays[0].ndim != 3 or arrays[0].shape[0] != 1:
-        return None
-    return arrays[0].shape[1], arrays[0].shape[2]
+def single_output_shape(outputs: Outputs) -> tuple[int, int]:
+    """Return the last two dimensions of a single output (1, a, b); zeros for other or more outputs."""
+    shapes = [array.shape for array in outputs.values()]
+    return shapes[0][1:] if len(shapes) == 1 and len(shapes[0]) == 3 and shapes[0][0] == 1 else (0, 0)
 
 
 def find_output(outputs: Outputs, name: str) -> NDArray[Any] | None:
     """Find an output by its name without TensorFlow's ":0"; None if there is none."""
     return next((array for key, array in outputs.items() if key.split(":")[0] == name), None)
+
+
+def _has(outputs: Outputs, *names: str) -> bool:
+    return all(find_output(outputs, name) is not None for name in names)
 
 
 def required_output(outputs: Outputs, name: str) -> NDArray[Any]:
@@ -302,10 +262,7 @@ def cell_count(size: tuple[int, int]) -> int:
 # YOLOX before decoding: (1, cells, 5 + C), offsets in cells, logarithms of sizes, objectness, class scores.
 
 
-def _is_yolox(outputs: Outputs, size: Size) -> bool:
-    shape = single_output_shape(outputs)
-    if shape is None or shape[0] != cell_count(size) or shape[1] < 6:
-        return False
+def _is_undecoded(outputs: Outputs) -> bool:
     return bool(np.median(np.abs(largest_output(outputs)[0, :, :2])) < MAX_OFFSET_CELLS)
 
 
@@ -314,7 +271,12 @@ def _from_yolox(outputs: Outputs, size: Size, classes: Classes, min_score: float
     if len(raw) != cell_count(size):
         raise ConfigError(f"layout yolox: expected {cell_count(size)} rows for an input of {size}; found {len(raw)}")
     row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
-    cell, stride = cell_grid(size)
+    # Cells are numbered row by row, those of fine strides first.
+    grids = [np.mgrid[: size[1] // s, : size[0] // s][::-1].reshape(2, -1).T for s in STRIDES]
+    cell, stride = (
+        np.concatenate(grids).astype(np.float64),
+        np.repeat(np.array(STRIDES, float), [len(g) for g in grids]),
+    )
     picked = raw[row].astype(np.float64)
     with np.errstate(over="ignore"):  # an infinite size is dropped with the other boxes that are not finite
         extent = np.exp(picked[:, 2:4]) * stride[row, None]
@@ -322,22 +284,7 @@ def _from_yolox(outputs: Outputs, size: Size, classes: Classes, min_score: float
     return Candidates(corners_from_centers(np.concatenate([center, extent], axis=1)), score, category)
 
 
-def cell_grid(size: Size) -> tuple[Array, Array]:
-    """Build cell indices (N, 2) u, v and strides (N,) in px, row by row, fine strides first."""
-    cell, stride = [], []
-    for s in STRIDES:
-        v, u = np.mgrid[: size[1] // s, : size[0] // s]
-        cell.append(np.stack([u.ravel(), v.ravel()], axis=1))
-        stride.append(np.full(u.size, float(s)))
-    return np.concatenate(cell).astype(np.float64), np.concatenate(stride)
-
-
 # Decoded rows (1, N, 5 + C): center, size in px of the input, objectness, class scores (YOLOv5, v6, v7, YOLOX).
-
-
-def _is_yolov5(outputs: Outputs, size: Size) -> bool:
-    shape = single_output_shape(outputs)
-    return shape is not None and shape[0] == 3 * cell_count(size) and shape[1] > 5
 
 
 def _from_rows(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
@@ -353,11 +300,6 @@ def _count_in_rows(outputs: Outputs) -> int:
 # YOLOv8, v9, 11, 12: columns (1, 4 + C, N) of center, size in px of the input, and class scores.
 
 
-def _is_yolov8(outputs: Outputs, size: Size) -> bool:
-    shape = single_output_shape(outputs)
-    return shape is not None and shape[1] == cell_count(size) and shape[0] > 4
-
-
 def _from_yolov8(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
     raw = largest_output(outputs)[0].T
     row, score, category = classes.best(raw[:, 4:], min_score)
@@ -365,11 +307,6 @@ def _from_yolov8(outputs: Outputs, size: Size, classes: Classes, min_score: floa
 
 
 # YOLOv10 and other end-to-end exports: rows (1, N, 6) of u0, v0, u1, v1 in px of the input, score, class id.
-
-
-def _is_yolov10(outputs: Outputs, size: Size) -> bool:
-    shape = single_output_shape(outputs)
-    return shape is not None and shape[1] == 6 and shape[0] not in (cell_count(size), 3 * cell_count(size))
 
 
 def _from_yolov10(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
@@ -380,10 +317,6 @@ def _from_yolov10(outputs: Outputs, size: Size, classes: Classes, min_score: flo
 
 
 # TensorFlow object detection API: boxes v0, u0, v1, u1 in 0-1, classes as COCO ids from 1, already suppressed.
-
-
-def _is_tf_od(outputs: Outputs, size: Size) -> bool:
-    return all(find_output(outputs, f"detection_{part}") is not None for part in ("boxes", "scores", "classes"))
 
 
 def _from_tf_od(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
@@ -399,7 +332,7 @@ def _from_tf_od(outputs: Outputs, size: Size, classes: Classes, min_score: float
 # The same family before its suppression: `boxes` (1, N, 4) as above and `scores` (1, N, C) after the sigmoid.
 
 
-def _is_tf_od_raw(outputs: Outputs, size: Size) -> bool:
+def _is_tf_od_raw(outputs: Outputs, shape: tuple[int, int], cells: int) -> bool:
     box, score = find_output(outputs, "boxes"), find_output(outputs, "scores")
     if box is None or score is None or box.ndim != 3 or score.ndim != 3:
         return False
@@ -420,13 +353,6 @@ def from_normalized(box_vuvu: Array, size: Size) -> Array:
 # RT-DETR: boxes as center and size in 0-1; (1, 300, 4 + C) with scores, or `pred_boxes` and `logits` apart.
 
 
-def _is_rt_detr(outputs: Outputs, size: Size) -> bool:
-    if find_output(outputs, "pred_boxes") is not None and find_output(outputs, "logits") is not None:
-        return True
-    shape = single_output_shape(outputs)
-    return shape is not None and shape[0] == 300 and shape[1] > 6
-
-
 def _from_rt_detr(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
     box, class_scores = _rt_detr_parts(outputs)
     row, score, category = classes.best(class_scores, min_score)
@@ -435,9 +361,9 @@ def _from_rt_detr(outputs: Outputs, size: Size, classes: Classes, min_score: flo
 
 
 def _rt_detr_parts(outputs: Outputs) -> tuple[NDArray[Any], NDArray[Any]]:
-    box, logits = find_output(outputs, "pred_boxes"), find_output(outputs, "logits")
-    if box is not None and logits is not None:
-        return box[0], 0.5 * (1 + np.tanh(0.5 * logits[0]))  # sigmoid without overflow
+    if _has(outputs, "pred_boxes", "logits"):
+        logits = required_output(outputs, "logits")[0]
+        return required_output(outputs, "pred_boxes")[0], 0.5 * (1 + np.tanh(0.5 * logits))  # sigmoid without overflow
     return largest_output(outputs)[0, :, :4], largest_output(outputs)[0, :, 4:]
 
 
@@ -448,30 +374,39 @@ _AS_TF1 = Preprocessing("tf1", rgb=True, unit=False, default_px=300)
 LAYOUTS: Mapping[str, Layout] = {
     layout.name: layout
     for layout in (
-        Layout("tf-od", _STRETCHED, _is_tf_od, lambda outputs: None, _from_tf_od, COCO_91),
+        Layout(
+            "tf-od", _STRETCHED,
+            lambda outputs, shape, cells: _has(outputs, "detection_boxes", "detection_scores", "detection_classes"),
+            lambda outputs: None, _from_tf_od, COCO_91,
+        ),
         Layout(
             "tf-od-raw", _AS_TF1, _is_tf_od_raw, lambda outputs: int(required_output(outputs, "scores").shape[2]),
             _from_tf_od_raw, COCO_91,
         ),
-        Layout("yolox", _CORNER, _is_yolox, _count_in_rows, _from_yolox),
-        Layout("yolov5", _CENTERED, _is_yolov5, _count_in_rows, _from_rows),
-        # Only where they are given by name.
-        Layout("yolov6", _CENTERED, lambda outputs, size: False, _count_in_rows, _from_rows),
-        Layout("yolox-decoded", _CORNER, lambda outputs, size: False, _count_in_rows, _from_rows),
         Layout(
-            "yolov8", _CENTERED, _is_yolov8, lambda outputs: int(largest_output(outputs).shape[1]) - 4, _from_yolov8
+            "yolox", _CORNER,
+            lambda outputs, shape, cells: shape[0] == cells and shape[1] > 5 and _is_undecoded(outputs),
+            _count_in_rows, _from_yolox,
         ),
-        Layout("yolov10", _CENTERED, _is_yolov10, lambda outputs: None, _from_yolov10),
         Layout(
-            "rt-detr", Preprocessing("stretch", rgb=True, unit=True), _is_rt_detr,
+            "yolov5", _CENTERED, lambda outputs, shape, cells: shape[0] == 3 * cells and shape[1] > 5, _count_in_rows,
+            _from_rows,
+        ),
+        # Only where they are given by name.
+        Layout("yolov6", _CENTERED, lambda outputs, shape, cells: False, _count_in_rows, _from_rows),
+        Layout("yolox-decoded", _CORNER, lambda outputs, shape, cells: False, _count_in_rows, _from_rows),
+        Layout(
+            "yolov8", _CENTERED, lambda outputs, shape, cells: shape[1] == cells and shape[0] > 4,
+            lambda outputs: int(largest_output(outputs).shape[1]) - 4, _from_yolov8,
+        ),
+        Layout(
+            "yolov10", _CENTERED, lambda outputs, shape, cells: shape[1] == 6 and shape[0] not in (cells, 3 * cells),
+            lambda outputs: None, _from_yolov10,
+        ),
+        Layout(
+            "rt-detr", Preprocessing("stretch", rgb=True, unit=True),
+            lambda outputs, shape, cells: _has(outputs, "pred_boxes", "logits") or (shape[0] == 300 and shape[1] > 6),
             lambda outputs: int(_rt_detr_parts(outputs)[1].shape[1]), _from_rt_detr,
         ),
     )
 }  # fmt: skip
-
-
-def named_layout(name: str) -> Layout:
-    """Return the layout of a name, or raise `ConfigError`."""
-    if name not in LAYOUTS:
-        raise ConfigError(f"unknown layout '{name}'; known: {', '.join(LAYOUTS)}")
-    return LAYOUTS[name]

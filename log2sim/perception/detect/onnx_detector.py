@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,16 +18,18 @@ from log2sim.files.inputs import read_file
 from log2sim.geometry import Array, box_iou
 from log2sim.perception.detect.layouts import (
     LAYOUTS,
+    LETTERBOX_GRAY,
     TRAFFIC_LIGHT,
     Classes,
     InputSpec,
     Layout,
     Outputs,
     Placement,
+    cell_count,
     choose_classes,
     describe_outputs,
     groups_of,
-    named_layout,
+    single_output_shape,
 )
 from log2sim.perception.detect3d.network import first_line, open_session
 
@@ -73,12 +74,7 @@ def load_model(path: Path) -> OnnxModel:
     Raises `ConfigError`: a missing, oversized or broken file, or a model whose inputs are not one image.
     """
     session = open_session(path, MAX_FILE_BYTES, "model")
-    metadata = dict(session.get_modelmeta().custom_metadata_map)
-    return OnnxModel(path, input_spec(session.get_inputs(), path), metadata, session)
-
-
-def input_spec(inputs: list[Any], path: Path) -> InputSpec:
-    """Describe the model's single image input."""
+    inputs = session.get_inputs()
     listed = ", ".join(f"'{i.name}' {i.type} {i.shape}" for i in inputs)
     if len(inputs) != 1 or len(inputs[0].shape) != 4 or inputs[0].type not in DTYPES:
         raise ConfigError(f"{path}: inputs {listed}; expected one image (1, 3, H, W) or (1, H, W, 3), float or uint8")
@@ -89,7 +85,8 @@ def input_spec(inputs: list[Any], path: Path) -> InputSpec:
         raise ConfigError(f"{path}: input {listed}; expected one image of 3 channels at a time")
     if max(height or 1, width or 1) > MAX_INPUT_SIDE_PX:
         raise ConfigError(f"{path}: input {listed}; expected sides of at most {MAX_INPUT_SIDE_PX} px")
-    return InputSpec(inputs[0].name, height, width, channels_last, np.dtype(DTYPES[inputs[0].type]))
+    spec = InputSpec(inputs[0].name, height, width, channels_last, np.dtype(DTYPES[inputs[0].type]))
+    return OnnxModel(path, spec, dict(session.get_modelmeta().custom_metadata_map), session)
 
 
 # Of more boxes the weakest are cut, since suppression takes time quadratic in their number.
@@ -136,10 +133,6 @@ class Tile:
     u1: int
     v1: int
 
-    def cut(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Crop the tile (h, w, 3) from an image (H, W, 3), without a copy."""
-        return image[self.v0 : self.v1, self.u0 : self.u1]
-
 
 def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:
     """Plan the whole image and one row of tiles from left to right, vertically centered, no higher than wide.
@@ -168,32 +161,23 @@ def auto_tile_count(width_px: int, input_px: int | None) -> int:
     return min(math.ceil(needed), MAX_AUTO_TILES)
 
 
-def is_cut_by_tile(box_px: Array, tile: Tile, width_px: int, height_px: int) -> NDArray[np.bool_]:
-    """Compute the mask (M,) of boxes (M, 4), px of the whole image, that end at a border of the tile inside the image."""
-    margin = BORDER * (tile.u1 - tile.u0)
-    return (
-        ((tile.u0 > 0) & (box_px[:, 0] < tile.u0 + margin))
-        | ((tile.v0 > 0) & (box_px[:, 1] < tile.v0 + margin))
-        | ((tile.u1 < width_px) & (box_px[:, 2] > tile.u1 - margin))
-        | ((tile.v1 < height_px) & (box_px[:, 3] > tile.v1 - margin))
-    )
-
-
 def merge(found: list[tuple[Tile, Detections]], width_px: int, height_px: int, max_overlap: float) -> Detections:
     """Merge the boxes of all tiles, in px of the whole image, into one set.
 
     A box cut by an inner border is dropped: tiles overlap, and objects larger than the overlap are detected in the whole
     image. A half box would give a wrong object, a missing box only a missing observation of a track.
     """
-    kept = [d.take(~is_cut_by_tile(d.box_px, tile, width_px, height_px)) for tile, d in found]
-    if not kept:
+    if not found:
         return Detections.empty()
-    joined = Detections(
-        np.concatenate([d.box_px for d in kept]),
-        np.concatenate([d.score for d in kept]),
-        np.concatenate([d.category for d in kept]),
-    )
-    return suppress(joined, max_overlap)
+    kept = []
+    for tile, boxes in found:
+        u0, v0, u1, v1 = boxes.box_px.T
+        margin = BORDER * (tile.u1 - tile.u0)
+        cut = ((tile.u0 > 0) & (u0 < tile.u0 + margin)) | ((tile.u1 < width_px) & (u1 > tile.u1 - margin))
+        cut |= ((tile.v0 > 0) & (v0 < tile.v0 + margin)) | ((tile.v1 < height_px) & (v1 > tile.v1 - margin))
+        kept.append(boxes.take(~cut))
+    joined = (np.concatenate([getattr(d, name) for d in kept]) for name in ("box_px", "score", "category"))
+    return suppress(Detections(*joined), max_overlap)
 
 
 # Shares of the narrower width that rider and two-wheeler have in common.
@@ -222,7 +206,16 @@ def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detection
     wheeler = np.flatnonzero(np.isin(detections.category, list(RIDDEN)))
     if not len(person) or not len(wheeler):
         return detections
-    fit = rider_fit(detections.box_px[person], detections.box_px[wheeler])
+    # The width (P, W) in [0, 1] that pairs share; 0 for those that do not fit.
+    a, b = detections.box_px[person, None], detections.box_px[None, wheeler]
+    shared = np.minimum(a[..., 2], b[..., 2]) - np.maximum(a[..., 0], b[..., 0])
+    narrow = np.minimum(a[..., 2] - a[..., 0], b[..., 2] - b[..., 0])
+    share = np.divide(shared, narrow, out=np.zeros_like(shared), where=narrow > 0)
+    height = b[..., 3] - b[..., 1]
+    rises_above = a[..., 1] < b[..., 1] - MIN_RISE * height
+    # Of a person nearer or farther than the two-wheeler the lower edge is elsewhere.
+    same_depth = np.abs(a[..., 3] - b[..., 3]) < MAX_FEET_OFFSET * height
+    fit = np.where((share >= MIN_HORIZONTAL_SHARE) & rises_above & same_depth, np.clip(share, 0, 1), 0.0)
     for weak in np.flatnonzero(detections.score[wheeler] < sure_score).tolist():
         px = detections.box_px[wheeler[weak]]
         fit[[inside_share(px[None], p)[0] > MAX_INSIDE_SHARE for p in detections.box_px[person]], weak] = 0
@@ -242,19 +235,6 @@ def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detection
     return strongest_first(Detections(box, score, category).take(kept))
 
 
-def rider_fit(person_px: Array, wheeler_px: Array) -> Array:
-    """Compute the shared width (P, W) in [0, 1] of persons (P, 4) and two-wheelers (W, 4); 0 for pairs that do not fit."""
-    p, w = person_px[:, None], wheeler_px[None]
-    shared = np.minimum(p[..., 2], w[..., 2]) - np.maximum(p[..., 0], w[..., 0])
-    narrow = np.minimum(p[..., 2] - p[..., 0], w[..., 2] - w[..., 0])
-    share = np.divide(shared, narrow, out=np.zeros_like(shared), where=narrow > 0)
-    height = w[..., 3] - w[..., 1]
-    rises_above = p[..., 1] < w[..., 1] - MIN_RISE * height
-    # Of a person nearer or farther than the two-wheeler the lower edge is elsewhere.
-    same_depth = np.abs(p[..., 3] - w[..., 3]) < MAX_FEET_OFFSET * height
-    return np.where((share >= MIN_HORIZONTAL_SHARE) & rises_above & same_depth, np.clip(share, 0, 1), 0.0)
-
-
 def inside_share(box_px: Array, outer_px: Array) -> Array:
     """Compute the share (M,) in [0, 1] of the area of boxes (M, 4) inside one other (4,); 0 for empty ones."""
     shared = np.minimum(box_px[:, 2:], outer_px[2:]) - np.maximum(box_px[:, :2], outer_px[:2])
@@ -268,8 +248,9 @@ MIN_BOX_PX = 2.0
 # score on about half of their boxes are right; they continue tracks that stronger ones began.
 # Traffic lights are small, too; they stand still, so that several weak boxes confirm each other.
 WEAK_GROUPS, WEAK_SHARE = ("pedestrian", "two_wheeler", TRAFFIC_LIGHT), 0.5
-# Side of the gray image by whose outputs a layout is recognized.
+# The gray image, and its side, by whose outputs a layout is recognized.
 PROBE_PX = 320
+PROBE = np.full((PROBE_PX, PROBE_PX, 3), LETTERBOX_GRAY, np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,45 +289,34 @@ class OnnxDetector:
 
     def detect_images(self, images: Sequence[NDArray[np.uint8]]) -> list[Detections]:
         """Detect road users and traffic lights in each of several images (H, W, 3) uint8 BGR."""
-        tiles = [self._tiles_of(image) for image in images]
-        jobs = [(image, tile) for image, planned in zip(images, tiles) for tile in planned]
-        runs = [jobs[i : i + self.together] for i in range(0, len(jobs), self.together)]
-        found = chain.from_iterable(map(self._detect_tiles, runs))
-        return [self._merged([(tile, next(found)) for tile in planned], image) for image, planned in zip(images, tiles)]
-
-    def _tiles_of(self, image: NDArray[np.uint8]) -> list[Tile]:
-        height, width = image.shape[:2]
         input_px = self.model.spec.width_px or self.layout.preprocessing.default_px
-        return plan_tiles(width, height, self.tiles, input_px)
-
-    def _merged(self, found: list[tuple[Tile, Detections]], image: NDArray[np.uint8]) -> Detections:
-        """Merge what was found in the tiles of an image, and separate the traffic lights from the road users."""
-        height, width = image.shape[:2]
-        merged = merge(found, width, height, self.max_overlap)
-        light = merged.category == TRAFFIC_LIGHT
-        users = join_riders(merged.take(~light), sure_score=self.min_score)
-        return replace(users, traffic_lights=np.column_stack([merged.box_px[light], merged.score[light]]))
-
-    def _detect_tiles(self, jobs: Sequence[tuple[NDArray[np.uint8], Tile]]) -> list[Detections]:
-        """Detect in tiles of images by one run of the model, each without duplicates."""
-        inputs = [self.layout.preprocessing(tile.cut(image), self.model.spec) for image, tile in jobs]
-        if len(inputs) == 1:
-            outputs = [self.model.run(inputs[0][0])]
-        else:
-            joined = self.model.run(np.concatenate([tensor for tensor, _ in inputs]))
-            outputs = [{name: array[k : k + 1] for name, array in joined.items()} for k in range(len(inputs))]
-        return [
-            suppress(self._boxes_of(of_tile, tile, placement), self.max_overlap)
-            for of_tile, (_, tile), (_, placement) in zip(outputs, jobs, inputs, strict=True)
-        ]
+        tiles = [plan_tiles(image.shape[1], image.shape[0], self.tiles, input_px) for image in images]
+        jobs, found = [(image, tile) for image, planned in zip(images, tiles) for tile in planned], list[Detections]()
+        for first in range(0, len(jobs), self.together):
+            run = jobs[first : first + self.together]
+            inputs = [
+                self.layout.preprocessing(image[tile.v0 : tile.v1, tile.u0 : tile.u1], self.model.spec)
+                for image, tile in run
+            ]
+            joined = self.model.run(np.concatenate([tensor for tensor, _ in inputs]) if len(run) > 1 else inputs[0][0])
+            for k, ((_, tile), (_, placement)) in enumerate(zip(run, inputs)):
+                of_tile = joined if len(run) == 1 else {name: array[k : k + 1] for name, array in joined.items()}
+                found.append(suppress(self._boxes_of(of_tile, tile, placement), self.max_overlap))
+        out, rest = [], iter(found)
+        for image, planned in zip(images, tiles):
+            merged = merge([(tile, next(rest)) for tile in planned], image.shape[1], image.shape[0], self.max_overlap)
+            light = merged.category == TRAFFIC_LIGHT
+            users = join_riders(merged.take(~light), sure_score=self.min_score)
+            lights = np.column_stack([merged.box_px[light], merged.score[light]])
+            out.append(replace(users, traffic_lights=lights))
+        return out
 
     def _boxes_of(self, outputs: Outputs, tile: Tile, placement: Placement) -> Detections:
         """Decode the outputs of one tile; boxes in px of the whole image, clipped to the tile."""
         found = self.layout.decode(outputs, placement.input_px, self.classes, min(self.min_score, self.min_weak_score))
         box = placement.to_image(found.box_input)
         finite = np.isfinite(box).all(axis=1) & np.isfinite(found.score)
-        low, high = np.zeros(2), np.array([tile.u1 - tile.u0, tile.v1 - tile.v0], dtype=np.float64)
-        box = np.clip(box, np.tile(low, 2), np.tile(high, 2))
+        box = np.clip(box, 0.0, np.tile([tile.u1 - tile.u0, tile.v1 - tile.v0], 2).astype(np.float64))
         kept = finite & np.all(box[:, 2:] - box[:, :2] >= MIN_BOX_PX, axis=1)
         weak = np.isin(groups_of(found.category), WEAK_GROUPS)
         kept &= found.score >= np.where(weak, self.min_weak_score, self.min_score)
@@ -366,19 +336,27 @@ def open_onnx(
     name: str | None = None,
 ) -> OnnxDetector:
     """Load a model, recognize its layout and classes by a gray image, and make a detector of it."""
-    chosen = named_layout(layout_name) if layout_name is not None else None
+    if layout_name is not None and layout_name not in LAYOUTS:
+        raise ConfigError(f"unknown layout '{layout_name}'; known: {', '.join(LAYOUTS)}")
     model = load_model(path)
-    layout, outputs = recognize_layout(model, chosen)
+    layout, outputs = recognize_layout(model, None if layout_name is None else LAYOUTS[layout_name])
+    spec, side = model.spec, layout.preprocessing.default_px or PROBE_PX
     try:
         count = layout.class_count(outputs)
         classes = choose_classes(model.metadata.get("names"), count, layout.default_classes, str(path))
-        layout.decode(outputs, probe_size(model, layout), classes, 0.5)
+        layout.decode(outputs, (spec.width_px or side, spec.height_px or side), classes, 0.5)
     except (IndexError, ValueError, TypeError) as error:
         raise ConfigError(
             f"{path}: outputs {describe_outputs(outputs)} do not fit the layout '{layout.name}' ({error})"
         ) from None
     if input_px is not None:
-        layout = resize_input(layout, model, input_px)
+        if spec.width_px is not None or spec.height_px is not None:
+            raise ConfigError(
+                f"{path}: input_px {input_px}: the model takes {spec.width_px} x {spec.height_px} px and nothing else; leave "
+                "input_px out"
+            )
+        layout = replace(layout, preprocessing=replace(layout.preprocessing, default_px=input_px))
+        model.run(layout.preprocessing(PROBE, spec)[0])
     score = layout.default_min_score if min_score is None else min_score
     weak = WEAK_SHARE * score if min_score is None else score
     return OnnxDetector(
@@ -395,7 +373,7 @@ def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, O
     outputs: Outputs = {}
     failure: ConfigError | None = None
     for layout in [chosen] if chosen is not None else LAYOUTS.values():
-        probe, placement = layout.preprocessing(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)
+        probe, placement = layout.preprocessing(PROBE, model.spec)
         if probe.shape not in tried:
             try:
                 tried[probe.shape] = model.run(probe)
@@ -405,7 +383,7 @@ def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, O
         if not tried[probe.shape]:
             continue
         outputs = tried[probe.shape]
-        if chosen is not None or layout.matches(outputs, placement.input_px):
+        if chosen is not None or layout.matches(outputs, single_output_shape(outputs), cell_count(placement.input_px)):
             return layout, outputs
     if failure is not None and not outputs:
         raise failure
@@ -413,21 +391,3 @@ def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, O
         f"{model.path}: outputs {describe_outputs(outputs)} are of no layout that is recognized by itself; "
         f"name one with layout=: {', '.join(LAYOUTS)}"
     )
-
-
-def resize_input(layout: Layout, model: OnnxModel, input_px: int) -> Layout:
-    """Return the layout with another side of the input, which the model is tried on."""
-    if model.spec.width_px is not None or model.spec.height_px is not None:
-        raise ConfigError(
-            f"{model.path}: input_px {input_px}: the model takes {model.spec.width_px} x {model.spec.height_px} px and "
-            "nothing else; leave input_px out"
-        )
-    changed = replace(layout, preprocessing=replace(layout.preprocessing, default_px=input_px))
-    model.run(changed.preprocessing(np.full((PROBE_PX, PROBE_PX, 3), 114, np.uint8), model.spec)[0])
-    return changed
-
-
-def probe_size(model: OnnxModel, layout: Layout) -> tuple[int, int]:
-    """Return the size (width, height) in px of the input that the gray image was resized to."""
-    side = layout.preprocessing.default_px or PROBE_PX
-    return model.spec.width_px or side, model.spec.height_px or side

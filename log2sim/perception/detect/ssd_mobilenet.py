@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -189,7 +190,23 @@ class Converter:
         self._offsets: dict[str, np.float32] = {}
         self.initializers: list[Any] = []
         self.onnx_nodes: list[Any] = []
-        self._add_picture(self.required(SCALED), self.required(SHIFTED))
+        # The picture from bytes to the values of the graph.
+        picture, shift = self.required(SCALED), self.required(SHIFTED)
+        if ranges is None:
+            self.store("zero", np.float32(0))
+            self.store("six", np.float32(6))
+            floats = self.add("Cast", ["images"], "picture/float", to=self._float)
+            scaled = self.add("Mul", [floats, self.store("picture/scale", picture)], "picture/scaled")
+            shifted = self.add("Sub", [scaled, self.store("picture/shift", shift)], "picture/shifted")
+            self.add("Transpose", [shifted], PICTURE_NCHW, perm=[0, 3, 1, 2])
+            return
+        # As levels the bytes are taken as they are; 0 is between two bytes, which a sum over weights makes up for.
+        step = np.float32(picture.item())
+        self._scales[PICTURE_NCHW] = float(step)
+        self._offsets[PICTURE_NCHW] = ZERO_BYTE * step - np.float32(shift.item())
+        levels = self.add("Transpose", ["images"], f"{PICTURE_NCHW}/rounded", perm=[0, 3, 1, 2])
+        constants = self.store(f"{PICTURE_NCHW}/step", step), self.store(f"{PICTURE_NCHW}/level", np.uint8(ZERO_BYTE))
+        self.add("DequantizeLinear", [levels, *constants], PICTURE_NCHW)
 
     def add(self, op: str, inputs: list[str], output: str, **attributes: Any) -> str:
         """Append one ONNX node and return the name of its output."""
@@ -245,27 +262,28 @@ class Converter:
 
     def translate(self, name: str) -> str:
         """Translate a node and return the name of its ONNX value."""
-        if name not in self._translated:
-            folded = self.convolution(name)
-            translated = self._translate(self._nodes[name]) if folded is None else self._add_convolution(name, folded)
-            self._translated[name] = translated
-        return self._translated[name]
-
-    def _translate(self, node: Node) -> str:
-        if node.op == "Identity":
-            return self.translate(node.inputs[0])
-        if node.op == "Add":
-            self.add("Add", [self.translate(i) for i in node.inputs], node.name)
-            return node.name if self._ranges is None else self._quantize(node.name, self._range_of(node.name))
-        if node.op == "Reshape":
+        if name in self._translated:
+            return self._translated[name]
+        node, folded, output = self._nodes[name], self.convolution(name), name
+        if folded is not None:
+            self._add_convolution(name, folded)
+        elif node.op == "Identity":
+            output = self.translate(node.inputs[0])
+        elif node.op == "Add":
+            self.add("Add", [self.translate(i) for i in node.inputs], name)
+            if self._ranges is not None:
+                self._quantize(name)
+        elif node.op == "Reshape":
             # Both heads end in one; its target shape is computed in the graph, but only the last dimension matters.
-            last = len(CLASS_NAMES) if node.name.endswith("_1") else 4
-            moved = self.add("Transpose", [self.translate(node.inputs[0])], f"{node.name}/nhwc", perm=[0, 2, 3, 1])
-            shape = self.store(f"{node.name}/shape", np.array([0, -1, last], dtype=np.int64))
-            return self.add("Reshape", [moved, shape], node.name)
-        if node.op == "ConcatV2":
-            return self.add("Concat", [self.translate(i) for i in node.inputs[:-1]], node.name, axis=1)
-        raise ValueError(f"node '{node.name}': operation {node.op} is not expected in this model")
+            last = len(CLASS_NAMES) if name.endswith("_1") else 4
+            moved = self.add("Transpose", [self.translate(node.inputs[0])], f"{name}/nhwc", perm=[0, 2, 3, 1])
+            self.add("Reshape", [moved, self.store(f"{name}/shape", np.array([0, -1, last], dtype=np.int64))], name)
+        elif node.op == "ConcatV2":
+            self.add("Concat", [self.translate(i) for i in node.inputs[:-1]], name, axis=1)
+        else:
+            raise ValueError(f"node '{name}': operation {node.op} is not expected in this model")
+        self._translated[name] = output
+        return output
 
     def convolution(self, name: str) -> Convolution | None:
         """Return the convolution that a node is the result of, with the products, sums and ReLU6 after it; None for other nodes."""
@@ -301,27 +319,7 @@ class Converter:
         by_class = constant.reshape(*constant.shape[:-1], -1, GRAPH_CLASSES)
         return by_class[..., list(CLASS_NAMES)].reshape(*constant.shape[:-1], -1)
 
-    def _add_picture(self, scale: NDArray[Any], shift: NDArray[Any]) -> None:
-        """Append the conversion of the picture from bytes to the values of the graph.
-
-        As levels the bytes are taken as they are; 0 is between two bytes, which a sum over weights makes up for.
-        """
-        if self._ranges is None:
-            self.store("zero", np.float32(0))
-            self.store("six", np.float32(6))
-            floats = self.add("Cast", ["images"], "picture/float", to=self._float)
-            scaled = self.add("Mul", [floats, self.store("picture/scale", scale)], "picture/scaled")
-            shifted = self.add("Sub", [scaled, self.store("picture/shift", shift)], "picture/shifted")
-            self.add("Transpose", [shifted], PICTURE_NCHW, perm=[0, 3, 1, 2])
-            return
-        step = np.float32(scale.item())
-        self._scales[PICTURE_NCHW] = float(step)
-        self._offsets[PICTURE_NCHW] = ZERO_BYTE * step - np.float32(shift.item())
-        levels = self.add("Transpose", ["images"], f"{PICTURE_NCHW}/rounded", perm=[0, 3, 1, 2])
-        constants = self.store(f"{PICTURE_NCHW}/step", step), self.store(f"{PICTURE_NCHW}/level", np.uint8(ZERO_BYTE))
-        self.add("DequantizeLinear", [levels, *constants], PICTURE_NCHW)
-
-    def _add_convolution(self, name: str, folded: Convolution) -> str:
+    def _add_convolution(self, name: str, folded: Convolution) -> None:
         node, source = folded.node, self.translate(folded.node.inputs[0])
         options = {
             "strides": node.integers("strides")[1:3],
@@ -334,30 +332,23 @@ class Converter:
             constants = self.store(f"{name}/weights", folded.weights), self.store(f"{name}/bias", folded.bias)
             output = f"{name}/unbounded" if folded.clipped else name
             self.add("Conv", [source, *constants], output, **options)
-            return self.add("Clip", [output, "zero", "six"], name) if folded.clipped else name
+            if folded.clipped:
+                self.add("Clip", [output, "zero", "six"], name)
+            return
         greatest = np.maximum(np.abs(folded.weights).max(axis=(1, 2, 3)), MIN_WEIGHT)
         scale = (greatest / MAX_WEIGHT).astype(np.float32)
         whole = np.rint(folded.weights / scale[:, None, None, None]).astype(np.int8)
         # Sums of products have the scales of both factors, and so has what is added to them.
         step = (scale * np.float32(self._scales[source])).astype(np.float32)
         bias = folded.bias + self._offsets.get(source, np.float32(0)) * folded.weights.sum(axis=(1, 2, 3))
-        if any(head in node.name for head in HEADS):
-            return self._add_head(name, source, whole, step, bias)
-        inputs = [
-            source,
-            self._restore(f"{name}/weights_int8", whole, scale),
-            self._restore(f"{name}/bias_int32", np.rint(bias / step).astype(np.int32), step),
-        ]
-        self.add("Conv", inputs, name, **options)
-        return self._quantize(name, RELU6_RANGE if folded.clipped else self._range_of(name))
-
-    def _add_head(
-        self, name: str, source: str, whole: NDArray[np.int8], step: NDArray[np.float32], bias: NDArray[np.float32]
-    ) -> str:
-        """Append a convolution with exact sums: one product of matrices for all places of the kernel, then shifted and added.
-
-        ONNX Runtime has fast products of bytes in convolutions whose results are bytes again, and in products of matrices.
-        """
+        if not any(head in node.name for head in HEADS):
+            weights = self._restore(f"{name}/weights_int8", whole, scale)
+            rounded = self._restore(f"{name}/bias_int32", np.rint(bias / step).astype(np.int32), step)
+            self.add("Conv", [source, weights, rounded], name, **options)
+            self._quantize(name, RELU6_RANGE if folded.clipped else None)
+            return
+        # Exact sums: one product of matrices for all places of the kernel, then shifted and added. ONNX Runtime has fast products
+        # of bytes in convolutions whose results are bytes again, and in products of matrices.
         count, channels, height, width = whole.shape
         matrix = self.store(f"{name}/weights_int8", whole.transpose(1, 2, 3, 0).reshape(channels, -1))
         rows_last = self.add("Transpose", [f"{source}/rounded"], f"{name}/nhwc", perm=[0, 2, 3, 1])
@@ -365,8 +356,7 @@ class Converter:
         value = self.add("Cast", [products], f"{name}/products_float", to=self._float)
         border = [0, height // 2, width // 2, 0]
         value = self.add("Pad", [value, self.store(f"{name}/border", np.array(border * 2))], f"{name}/padded")
-        axes = self.store(f"{name}/axes", np.array([1, 2, 3]))
-        places = []
+        axes, places = self.store(f"{name}/axes", np.array([1, 2, 3])), []
         for k, (v, u) in enumerate(np.ndindex(height, width)):
             # Ends count from the last row and column.
             start, end = (v, u, k * count), (v + 1 - height or FAR, u + 1 - width or FAR, (k + 1) * count)
@@ -375,7 +365,7 @@ class Converter:
         total = self.add("Sum", places, f"{name}/sum")
         scaled = self.add("Mul", [total, self.store(f"{name}/step", step)], f"{name}/scaled")
         moved = self.add("Add", [scaled, self.store(f"{name}/bias", bias)], f"{name}/moved")
-        return self.add("Transpose", [moved], name, perm=[0, 3, 1, 2])
+        self.add("Transpose", [moved], name, perm=[0, 3, 1, 2])
 
     def _restore(self, name: str, whole: NDArray[Any], scale: NDArray[np.float32]) -> str:
         """Append constants of integers and their scales by channel (M,); returns the name of their product."""
@@ -383,13 +373,11 @@ class Converter:
         inputs = [self.store(name, whole), self.store(f"{name}/scale", scale), self.store(f"{name}/zero", zero)]
         return self.add("DequantizeLinear", inputs, f"{name}/float", axis=0)
 
-    def _range_of(self, name: str) -> tuple[float, float]:
-        if self._ranges is None or name not in self._ranges:
+    def _quantize(self, name: str, limits: tuple[float, float] | None = None) -> None:
+        """Round the last value to levels between limits, else those known for it, under its own name for all that use it."""
+        limits = limits or (self._ranges or {}).get(name)
+        if limits is None:
             raise ValueError(f"value '{name}' has no range")
-        return self._ranges[name]
-
-    def _quantize(self, name: str, limits: tuple[float, float]) -> str:
-        """Round the last value to levels between limits, under its own name for all that use it."""
         low, high = min(limits[0], 0.0), max(limits[1], 0.0)
         step = (high - low) / LEVELS
         self._scales[name] = float(np.float32(step))
@@ -397,16 +385,7 @@ class Converter:
         zero = self.store(f"{name}/level", np.uint8(np.clip(np.rint(-low / step), 0, LEVELS)))
         self.onnx_nodes[-1].output[0] = f"{name}/float"
         self.add("QuantizeLinear", [f"{name}/float", scale, zero], f"{name}/rounded")
-        return self.add("DequantizeLinear", [f"{name}/rounded", scale, zero], name)
-
-
-def known_ranges() -> dict[str, tuple[float, float]]:
-    """Return the ranges of the values that no ReLU6 bounds, by their names in the graph."""
-    blocks = [f"FeatureExtractor/MobilenetV2/expanded_conv{f'_{k}' if k else ''}" for k in range(len(PROJECTED))]
-    return {
-        **{f"{block}/project/BatchNorm/batchnorm/add_1": limits for block, limits in zip(blocks, PROJECTED)},
-        **{f"{blocks[k]}/add": limits for k, limits in SUMS.items()},
-    }
+        self.add("DequantizeLinear", [f"{name}/rounded", scale, zero], name)
 
 
 def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
@@ -415,23 +394,16 @@ def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
     `in_bytes`: with weights and values of 8 bits; boxes and scores stay floats. Raises `ValueError` when the bytes are not that
     model's graph.
     """
+    blocks = [f"FeatureExtractor/MobilenetV2/expanded_conv{f'_{k}' if k else ''}" for k in range(len(PROJECTED))]
+    ranges = {f"{block}/project/BatchNorm/batchnorm/add_1": limits for block, limits in zip(blocks, PROJECTED)}
+    ranges |= {f"{blocks[k]}/add": limits for k, limits in SUMS.items()}
     try:
-        converter = Converter(read_graph(graph), known_ranges() if in_bytes else None)
+        converter = Converter(read_graph(graph), ranges if in_bytes else None)
         encoded, logits = converter.translate(ENCODED_BOXES), converter.translate(CLASS_LOGITS)
     except KeyError as error:
         raise ValueError(f"the graph has no node {error}") from None
     anchors = anchor_boxes()
-    decode_boxes(converter, encoded, anchors)
-    converter.add("Sigmoid", [logits], "scores")
-    shapes = {"boxes": ("N", len(anchors), 4), "scores": ("N", len(anchors), len(CLASS_NAMES))}
-    model = converter.model("ssd_mobilenet_v2_coco", INPUT_PX, shapes)
-    entry = model.metadata_props.add()
-    entry.key, entry.value = "names", repr(dict(enumerate(CLASS_NAMES.values())))
-    return model
-
-
-def decode_boxes(converter: Converter, encoded: str, anchors: NDArray[np.float32]) -> None:
-    """Append the decoding: center = c * 0.1 * anchor size + anchor center, size = exp(s * 0.2) * anchor size."""
+    # Decoding: center = c * 0.1 * anchor size + anchor center, size = exp(s * 0.2) * anchor size.
     store, add = converter.store, converter.add
     axes = store("decode/axes", np.array([2], dtype=np.int64))
     bounds = [store(f"decode/{k}", np.array([k], dtype=np.int64)) for k in (0, 2, 4)]
@@ -444,8 +416,15 @@ def decode_boxes(converter: Converter, encoded: str, anchors: NDArray[np.float32
     center = add("Add", [add("Mul", [offset, center_step], "decode/offset"), anchor_center], "decode/center")
     growth = add("Exp", [add("Mul", [growth, size_step], "decode/log_size")], "decode/growth")
     half = add("Mul", [growth, half_anchor], "decode/half")
-    low, high = add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")
-    add("Concat", [low, high], "boxes", axis=2)
+    add(
+        "Concat", [add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")], "boxes", axis=2
+    )
+    converter.add("Sigmoid", [logits], "scores")
+    shapes = {"boxes": ("N", len(anchors), 4), "scores": ("N", len(anchors), len(CLASS_NAMES))}
+    model = converter.model("ssd_mobilenet_v2_coco", INPUT_PX, shapes)
+    entry = model.metadata_props.add()
+    entry.key, entry.value = "names", repr(dict(enumerate(CLASS_NAMES.values())))
+    return model
 
 
 def anchor_boxes() -> NDArray[np.float32]:
@@ -498,11 +477,18 @@ def create(
 
 def converted_model() -> Path:
     """Return the path of the ONNX model in the cache; converts the weights if it is missing or was changed."""
-    in_bytes = adds_byte_products_exactly()
+    try:
+        lines = read_bytes(PROCESSOR, PROCESSOR_LIMIT_BYTES).decode("ascii", "replace").splitlines()
+    except OSError:
+        lines = []
+    abilities = next((line.partition(":")[2] for line in lines if line.lower().startswith(("flags", "features"))), "")
+    in_bytes = not EXACT_BYTE_PRODUCTS.isdisjoint(abilities.split())
     model = cache_folder() / f"{NAME}-{GRAPH_SHA256[:12]}-{CONVERSION}{'-int8' if in_bytes else ''}.onnx"
     digest = model.with_suffix(".sha256")
-    if model.is_file() and digest.is_file() and _states_digest_of(digest, model):
-        return model
+    with suppress(OSError):
+        stated, content = read_bytes(digest, MAX_DIGEST_BYTES), read_bytes(model, GRAPH_LIMIT_BYTES)
+        if stated == hashlib.sha256(content).hexdigest().encode():
+            return model
     graph = graph_bytes()
     if importlib.util.find_spec("onnx") is None:
         raise MissingExtra(f"detector '{NAME}'", EXTRA)
@@ -516,16 +502,6 @@ def converted_model() -> Path:
     with replaced(digest) as temporary:
         temporary.write_text(hashlib.sha256(content).hexdigest(), encoding="ascii")
     return model
-
-
-def adds_byte_products_exactly() -> bool:
-    """Return whether the processor is known to add up products of bytes without saturation."""
-    try:
-        lines = read_bytes(PROCESSOR, PROCESSOR_LIMIT_BYTES).decode("ascii", "replace").splitlines()
-    except OSError:
-        return False
-    names = next((line.partition(":")[2] for line in lines if line.lower().startswith(("flags", "features"))), "")
-    return not EXACT_BYTE_PRODUCTS.isdisjoint(names.split())
 
 
 def graph_bytes() -> bytes:
@@ -543,12 +519,3 @@ def graph_bytes() -> bytes:
             f"install the version that log2sim knows: {install_command(EXTRA)}"
         )
     return data
-
-
-def _states_digest_of(digest: Path, model: Path) -> bool:
-    """Whether one file holds the SHA-256 of the other, as hexadecimal digits."""
-    try:
-        stated, content = read_bytes(digest, MAX_DIGEST_BYTES), read_bytes(model, GRAPH_LIMIT_BYTES)
-    except OSError:
-        return False
-    return stated == hashlib.sha256(content).hexdigest().encode()

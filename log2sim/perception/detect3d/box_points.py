@@ -63,8 +63,6 @@ def points_of_boxes(
     `xyz`: (N, 3), m: points that are not finite are in no box. `center_m`, `size_m`: (M, 3), m: length, width, height.
     `yaw_rad`: (M,). `usable`: (N,): the points that count; by default all.
 
-    Notes
-    -----
     Points in cells of `CELL_M` that a box touches are sorted by cell; every box is compared with those of its own cells.
     A point within rounding, 1e-5 m at 100 m, of a face may be on either side of it.
     """
@@ -75,16 +73,41 @@ def points_of_boxes(
     half = np.asarray(size_m, np.float64) / 2
     reach = bounding_reach(size_m, yaw_rad) + MARGIN_M
     low, high = center_m[:, :2] - reach, center_m[:, :2] + reach
-    box, place, order = candidates(xyz, usable, CoarseGrid.around(low, high), low, high)
+    # Cells over all boxes; those of the last row and column are for points outside.
+    corner, kind = low.min(axis=0), xyz.dtype.type
+    extent = high.max(axis=0) - corner
+    cell_m = np.maximum(CELL_M, extent / MAX_CELLS)
+    shape = np.ceil(extent / cell_m).astype(np.intp) + 1
+    cells = []
+    for axis in range(2):
+        at, outside = (xyz[:, axis] - kind(corner[axis])) * kind(1 / cell_m[axis]), kind(shape[axis] - 1)
+        cells.append(
+            np.where((at >= 0) & (at < outside), at, outside).astype(np.uint16)
+        )  # outside, too, where it is NaN
+    code = cells[0] * np.uint16(shape[1]) + cells[1]
+    # One run of cells for each box and each of its rows.
+    first, last = (np.clip((v - corner) // cell_m, 0, shape - 2).astype(np.intp) for v in (low, high))
+    rows = last[:, 0] - first[:, 0] + 1
+    box = np.repeat(np.arange(len(low)), rows)
+    row = (first[box, 0] + ramp(rows)) * shape[1]
+    begin, end, count = row + first[box, 1], row + last[box, 1] + 1, int(shape.prod())
+    touched = np.cumsum(np.bincount(begin, minlength=count) - np.bincount(end, minlength=count)) > 0
+    counted = touched.take(code)
+    near = np.flatnonzero(counted if usable is None else counted & usable)
+    code = code.take(near)
+    order = near.take(np.argsort(code, kind="stable"))
+    edges = np.concatenate([[0], np.cumsum(np.bincount(code, minlength=count))])
+    start, length = edges[begin], edges[end] - edges[begin]
+    box, place = np.repeat(box, length), np.repeat(start, length) + ramp(length)
     # Column by column, in the points' own precision and the order of their cells: this is where the time goes.
     columns = [xyz[:, axis].take(order) for axis in range(3)]
-    center, (length, width, height) = center_m.T.astype(xyz.dtype), half.T.astype(xyz.dtype)
+    center, (long, wide, high) = center_m.T.astype(xyz.dtype), half.T.astype(xyz.dtype)
     c, s = (v.astype(xyz.dtype).take(box) for v in (c, s))
     x, y, z = (columns[axis].take(place) - center[axis].take(box) for axis in range(3))
     inside = np.flatnonzero(
-        (np.abs(x * c + y * s) <= length.take(box))
-        & (np.abs(y * c - x * s) <= width.take(box))
-        & (np.abs(z) <= height.take(box))
+        (np.abs(x * c + y * s) <= long.take(box))
+        & (np.abs(y * c - x * s) <= wide.take(box))
+        & (np.abs(z) <= high.take(box))
     )
     return PointsOfBoxes(box.take(inside), order.take(place.take(inside)), len(center_m))
 
@@ -94,8 +117,6 @@ def most_points(counts: NDArray[np.float32], low: Array, cell_m: float, center_m
 
     `low`: (2,), m: lower corner of the cells. `center_m`, `reach_m`: (M, 2), m: centers and half sides of the rectangles.
 
-    Notes
-    -----
     By a table of sums (Crow, SIGGRAPH 1984), in time that does not depend on the sizes of the rectangles.
     """
     import cv2
@@ -108,65 +129,11 @@ def most_points(counts: NDArray[np.float32], low: Array, cell_m: float, center_m
     return np.asarray(table[i1, j1] - table[i0, j1] - table[i1, j0] + table[i0, j0])
 
 
-@dataclass(frozen=True, eq=False)
-class CoarseGrid:
-    """Cells over all boxes; those of the last row and column are for points outside."""
-
-    corner: Array  # (2,), m
-    cell: Array  # (2,), m: sides of a cell
-    shape: NDArray[np.intp]  # (2,): rows along x, columns along y
-
-    @classmethod
-    def around(cls, low: Array, high: Array) -> CoarseGrid:
-        """Cover the bounding rectangles `low` to `high`, (M, 2) each."""
-        corner = low.min(axis=0)
-        extent = high.max(axis=0) - corner
-        cell = np.maximum(CELL_M, extent / MAX_CELLS)
-        return cls(corner, cell, np.ceil(extent / cell).astype(np.intp) + 1)
-
-    def index_of(self, xyz: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
-        """Find the number (N,) of the cell of each point (N, 2 or more)."""
-        place = []
-        for axis in range(2):
-            at = (xyz[:, axis] - xyz.dtype.type(self.corner[axis])) * xyz.dtype.type(1 / self.cell[axis])
-            # The comparison is false for NaN.
-            outside = xyz.dtype.type(self.shape[axis] - 1)
-            place.append(np.where((at >= 0) & (at < outside), at, outside).astype(np.uint16))
-        return np.asarray(place[0] * np.uint16(self.shape[1]) + place[1])
-
-
 def bounding_reach(size_m: Array, yaw_rad: Array) -> Array:
     """Compute half the sides (M, 2), m, of the bounding rectangles along x and y of boxes, size (M, 2 or more)."""
     c, s = np.abs(np.cos(yaw_rad)), np.abs(np.sin(yaw_rad))
     half = np.asarray(size_m, np.float64) / 2
     return np.stack([c * half[:, 0] + s * half[:, 1], s * half[:, 0] + c * half[:, 1]], axis=1)
-
-
-def candidates(
-    xyz: NDArray[np.floating[Any]], usable: NDArray[np.bool_] | None, grid: CoarseGrid, low: Array, high: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Pair each box with the usable points in the cells that its bounding rectangle `low` to `high`, (M, 2) each, touches.
-
-    Returns `box`: (K,): ascending; `place`: (K,): place of the point in `order`; `order`: (n,): indices of points, ordered
-    by cell.
-    """
-    first, last = (np.clip((v - grid.corner) // grid.cell, 0, grid.shape - 2).astype(np.intp) for v in (low, high))
-    # One run of cells for each box and each of its rows.
-    rows = last[:, 0] - first[:, 0] + 1
-    box = np.repeat(np.arange(len(low)), rows)
-    row = (first[box, 0] + ramp(rows)) * grid.shape[1]
-    begin, end = row + first[box, 1], row + last[box, 1] + 1
-    count = int(grid.shape.prod())
-    touched = np.cumsum(np.bincount(begin, minlength=count) - np.bincount(end, minlength=count)) > 0
-    code = grid.index_of(xyz)
-    inside = touched.take(code)
-    near = np.flatnonzero(inside if usable is None else inside & usable)
-    code = code.take(near)
-    order = near.take(np.argsort(code, kind="stable"))
-    edges = np.concatenate([[0], np.cumsum(np.bincount(code, minlength=count))])
-    start = edges[begin]
-    length = edges[end] - start
-    return np.repeat(box, length), np.repeat(start, length) + ramp(length), order
 
 
 def ramp(counts: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -226,8 +226,6 @@ def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> 
 
     `maps`: (C, h, w): output of the network. `low`: (2,), m: lower corner of the maps.
 
-    Notes
-    -----
     Zhou, Wang and Kraehenbuehl (2019), "Objects as Points": a cell of the greatest heat among its eight neighbors is an
     object's center. Networks are taught an object's box in the cells around its center too; the mean over those that mean
     the same object errs less than the box of a single cell.
@@ -275,49 +273,35 @@ def decode_votes(maps: NDArray[np.float32], grid: NDArray[np.float32], info: Net
     `maps`: (C, h, w): output of the network. `grid`: (12, H, W): its input, by whose greatest heights cells of the ground
     and empty ones are left out. `low`: (2,), m: lower corner of both.
 
-    Notes
-    -----
     The box is that which the network regresses around the middle of the cluster: only there is it taught, and the mean
     over all cells of the cluster is much worse.
     """
-    flat, probability = foreground(maps, grid, info)
+    # Cells of road users, and the probability (G, n) of each group.
+    segment, step = maps[info.channels.segment].reshape(len(info.groups) + 1, -1), info.stride
+    highest = np.maximum.reduce([grid[0, i::step, j::step] for i in range(step) for j in range(step)])
+    high = np.flatnonzero(highest > MIN_TOP_M / 2)
+    seen = segment.take(high, axis=1)
+    flat = high[seen[1:].max(axis=0) > seen[0]]
+    logits = segment[:, flat].astype(np.float64)
+    weight = np.exp(logits - logits.max(axis=0))
+    probability = weight[1:] / weight.sum(axis=0)
     cells = MapCells.at(maps, flat, info, low)
     vote = cells.middle_m + np.clip(cells.values[info.channels.vote].T, -MAX_OFFSET_M, MAX_OFFSET_M)
     valid = np.flatnonzero(np.isfinite(cells.values).all(axis=0))
     vote, probability = vote[valid], probability[:, valid]
-    label = cluster(vote, probability.argmax(axis=0), bandwidths_m(info))
+    # Centers of two objects side by side are at least a width apart; the paper does not give its bandwidth. Half the typical
+    # width of a group's narrowest category is taken.
+    bandwidth_m = [min(TYPICAL_SIZE_M[name][1] for name in info.categories[group]) / 2 for group in info.groups]
+    label = cluster(vote, probability.argmax(axis=0), np.array(bandwidth_m))
     center, group, mean = summarize(vote, probability, label)
     i, j = np.floor((center - low) / (info.stride * info.cell_m)).astype(np.intp).T
     h, w = maps.shape[1:]
     middle = np.clip(i, 0, h - 1) * w + np.clip(j, 0, w - 1)
     logit = np.log(mean) - np.log1p(-np.minimum(mean, 1 - 1e-12))
     found = boxes_of_cells(cells_around(maps, middle, group, info, low), group, logit, info)
-    return found.take(usual_height(found, info))
-
-
-def foreground(
-    maps: NDArray[np.float32], grid: NDArray[np.float32], info: NetworkInfo
-) -> tuple[NDArray[np.intp], Array]:
-    """Find cells of road users: flat indices (n,) and the probability (G, n) of each group."""
-    segment = maps[info.channels.segment].reshape(len(info.groups) + 1, -1)
-    step = info.stride
-    corners = [grid[0, i::step, j::step] for i in range(step) for j in range(step)]
-    high = np.flatnonzero(np.maximum.reduce(corners) > MIN_TOP_M / 2)
-    seen = segment.take(high, axis=1)
-    flat = high[seen[1:].max(axis=0) > seen[0]]
-    logits = segment[:, flat].astype(np.float64)
-    weight = np.exp(logits - logits.max(axis=0))
-    return flat, weight[1:] / weight.sum(axis=0)
-
-
-def bandwidths_m(info: NetworkInfo) -> Array:
-    """Choose the bandwidth of each group (G,), m: half the typical width of its narrowest category.
-
-    Notes
-    -----
-    Centers of two objects side by side are at least a width apart; the paper does not give its bandwidth.
-    """
-    return np.array([min(TYPICAL_SIZE_M[name][1] for name in info.categories[group]) / 2 for group in info.groups])
+    limits = [(min(MIN_SIZE_M[n][2] for n in GROUPS[g]), max(MAX_SIZE_M[n][2] for n in GROUPS[g])) for g in info.groups]
+    (least, most), height = np.array(limits)[found.group].T, found.size_m[:, 2]
+    return found.take((height >= least / HEIGHT_TOLERANCE) & (height <= most * HEIGHT_TOLERANCE))
 
 
 def cluster(vote: Array, group: NDArray[np.intp], bandwidth_m: Array) -> NDArray[np.intp]:
@@ -354,8 +338,6 @@ def mean_shift(vote: Array, bandwidth_m: float) -> tuple[Array, NDArray[np.intp]
 
     Returns `modes`: (K, 2), m; `index`: (n,): the mode of each vote.
 
-    Notes
-    -----
     Kernel-weighted means are computed once, on a grid: three blurs instead of a sum over neighbors at every step, in time
     that does not depend on how dense the votes are. Every cell then points to the cell of its mean.
     """
@@ -406,11 +388,3 @@ def summarize(vote: Array, probability: Array, label: NDArray[np.intp]) -> tuple
     total = np.bincount(label, weight, minlength=count)
     center = np.stack([np.bincount(label, weight * v, minlength=count) / total for v in vote.T], axis=1)
     return center, group, mean
-
-
-def usual_height(found: LevelBoxes, info: NetworkInfo) -> NDArray[np.bool_]:
-    """Mark the boxes (M,) whose height is between the limits of their group."""
-    limits = [(min(MIN_SIZE_M[n][2] for n in GROUPS[g]), max(MAX_SIZE_M[n][2] for n in GROUPS[g])) for g in info.groups]
-    low, high = np.array(limits)[found.group].T
-    height = found.size_m[:, 2]
-    return np.asarray((height >= low / HEIGHT_TOLERANCE) & (height <= high * HEIGHT_TOLERANCE))

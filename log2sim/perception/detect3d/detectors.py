@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,14 +151,16 @@ class NetworkDetector:
 
         `weak`: whether boxes that cannot reach the least score are among them.
 
-        Notes
-        -----
         The calibration of a network is fitted to the terms of these.
         """
         info, sensors = self.network.info, viewpoints_xy(cloud)
         xyz, index = level_points(cloud, self.range_m)
         stacked = np.concatenate([xyz, stack_points(cloud, earlier, self.range_m)]) if earlier else xyz
-        center, reach_m = self._square_around(sensors)
+        # The square that holds what is in range of all viewpoints, as large as the network's grid at most.
+        center, reach_m = sensors[0], self.range_m
+        if len(sensors) > 1:
+            first, last = sensors.min(axis=0), sensors.max(axis=0)
+            center, reach_m = (first + last) / 2, min(reach_m + float((last - first).max()) / 2, info.max_range_m)
         low, shape = grid_window(stacked[:, :2], cell_m=info.cell_m, range_m=reach_m, center=center)
         grid = rasterize(stacked, cell_m=info.cell_m, low=low, shape=shape)
         maps = self.network.run(grid)
@@ -166,36 +168,20 @@ class NetworkDetector:
             boxes = decode_votes(maps, grid, info, low)
         else:
             boxes = decode_centers(maps, info, low)
-            boxes = boxes if weak else boxes.take(self._may_suffice(boxes, grid, low, sensors))
-            first = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
-            boxes = boxes.take(suppress(boxes.rectangles, first, boxes.group, across=False))
+            if not weak:
+                # Points are counted, which takes longest, for those alone that reach the least score with as many as they may
+                # hold, or with none.
+                counts, reach = np.rint(np.expm1(3 * grid[3])), bounding_reach(boxes.size_m, boxes.yaw_rad)
+                most, range_m = (
+                    most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach),
+                    ranges_m(boxes, sensors),
+                )
+                best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
+                boxes = boxes.take(best >= self._least(boxes))
+            without = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
+            boxes = boxes.take(suppress(boxes.rectangles, without, boxes.group, across=False))
         inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
         return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensors)))
-
-    def _square_around(self, sensors: Array) -> tuple[Array, float]:
-        """Return center (2,) and half of the side, m, of the square that holds what is in range of sensors at (V, 2).
-
-        It is as large as the network's grid at most.
-        """
-        low, high = sensors.min(axis=0), sensors.max(axis=0)
-        if len(sensors) == 1:
-            return sensors[0], self.range_m
-        reach_m = self.range_m + float((high - low).max()) / 2
-        return (low + high) / 2, min(reach_m, self.network.info.max_range_m)
-
-    def _may_suffice(
-        self, boxes: LevelBoxes, grid: NDArray[np.float32], low: Array, sensors: Array
-    ) -> NDArray[np.bool_]:
-        """Mark boxes (M,) that reach the least score with as many points as they may hold, or with none.
-
-        Points are counted for these alone, as counting takes longest.
-        """
-        info, reach = self.network.info, bounding_reach(boxes.size_m, boxes.yaw_rad)
-        counts = np.rint(np.expm1(3 * grid[3]))
-        most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
-        range_m = ranges_m(boxes, sensors)
-        best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
-        return np.asarray(best >= self._least(boxes))
 
     def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
         """Return the least score (M,) that each box needs."""
@@ -301,20 +287,18 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
         detector: LidarDetector = create(log, settings)
     if plugins.is_built_in("lidar_detector", rest):
         return detector
-    return checked(detector, plugins.plugin_label("lidar_detector", rest))
-
-
-def checked(detector: Any, source: str) -> LidarDetector:
-    """Return a detector of somebody else whose faults are told in one line each that begins with `source`.
-
-    Raises `PluginError` when it lacks a member of `LidarDetector`, or its `detect` cannot be called.
-    """
-    require_members(detector, MEMBERS, DETECT_IN_CLOUD, source)
-    return CheckedLidarDetector(detector, source)
+    return CheckedLidarDetector(detector, plugins.plugin_label("lidar_detector", rest))
 
 
 class CheckedLidarDetector(ForeignDetector):
-    """A detector of somebody else; what it raises and what it returns is checked."""
+    """A detector of somebody else; what it raises and what it returns is checked.
+
+    Raises `PluginError` when it lacks a member of `LidarDetector`, or its `detect` cannot be called.
+    """
+
+    def __post_init__(self) -> None:
+        """Check the members."""
+        require_members(self.inner, MEMBERS, DETECT_IN_CLOUD, self.source)
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud; `PluginError` when the detector raises something, or returns no `Boxes3D`."""

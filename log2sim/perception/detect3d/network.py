@@ -155,8 +155,6 @@ def level_points(cloud: Cloud, range_m: float) -> tuple[NDArray[np.float32], NDA
 def stack_points(cloud: Cloud, earlier: Sequence[Cloud], range_m: float) -> NDArray[np.float32]:
     """Merge the points of earlier clouds that are in range of a cloud's sensors: (n, 3) as from `level_points`.
 
-    Notes
-    -----
     Clouds are in map axes already, so that only their origins differ. Each keeps its height above its own ground.
     """
     parts = [np.zeros((0, 3), np.float32)]
@@ -194,8 +192,6 @@ def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[
 
     All are relative to the cloud's origin. Each box has a point; `index` (n,) are those that `inside` numbers in the cloud.
 
-    Notes
-    -----
     A car is seen from one side: on a slope of 10 % the ground under its points is 0.1 to 0.2 m off that under its center.
     """
     inside = inside.sample(PLANE_POINTS)
@@ -346,43 +342,31 @@ def load_network(path: Path) -> Network:
     Raises `ConfigError`: a missing, oversized or broken file, an ONNX file of another kind, or metadata that are missing or wrong.
     """
     session = open_session(path, MAX_FILE_BYTES, "network for clouds")
-    check_names(session, path)
-    network = Network(path, read_info(session.get_modelmeta().custom_metadata_map, path), session)
-    network.run(np.zeros((CHANNELS, MIN_SIZE_CELLS, MIN_SIZE_CELLS), np.float32))
-    return network
-
-
-def check_names(session: Any, path: Path) -> None:
-    """Raise `ConfigError` unless the network takes a grid and gives maps."""
     inputs = [(i.name, i.type, i.shape) for i in session.get_inputs()]
     outputs = [o.name for o in session.get_outputs()]
     fits = len(inputs) == 1 and inputs[0][:2] == ("grid", "tensor(float)") and len(inputs[0][2]) == 4
-    if fits and "maps" in outputs:
-        channels, *sides = inputs[0][2][1:]
-        if channels != CHANNELS and isinstance(channels, int):
-            raise ConfigError(f"{path}: input 'grid' has {channels} channels; expected {CHANNELS}")
-        if any(isinstance(side, int) for side in sides):
-            raise ConfigError(f"{path}: input 'grid' is {inputs[0][2]}; export it with free height and width")
-        return
-    listed = ", ".join(f"'{name}' {kind} {shape}" for name, kind, shape in inputs)
-    raise ConfigError(
-        f"{path}: inputs {listed}, outputs {', '.join(outputs)}: not a network for clouds; expected one input 'grid' "
-        f"(1, {CHANNELS}, H, W) float and an output 'maps'"
-    )
-
-
-def read_info(metadata: dict[str, str], path: Path) -> NetworkInfo:
-    """Read the description of a network from the metadata of its file."""
-    text = metadata.get(METADATA_KEY)
+    if not fits or "maps" not in outputs:
+        listed = ", ".join(f"'{name}' {kind} {shape}" for name, kind, shape in inputs)
+        raise ConfigError(
+            f"{path}: inputs {listed}, outputs {', '.join(outputs)}: not a network for clouds; expected one input 'grid' "
+            f"(1, {CHANNELS}, H, W) float and an output 'maps'"
+        )
+    channels, *sides = inputs[0][2][1:]
+    if channels != CHANNELS and isinstance(channels, int):
+        raise ConfigError(f"{path}: input 'grid' has {channels} channels; expected {CHANNELS}")
+    if any(isinstance(side, int) for side in sides):
+        raise ConfigError(f"{path}: input 'grid' is {inputs[0][2]}; export it with free height and width")
+    text, where = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY), f"{path}: metadata '{METADATA_KEY}'"
     if text is None:
         raise ConfigError(
             f"{path}: its metadata have no entry '{METADATA_KEY}', a JSON document with cell_m, stride, range_m, groups, "
             "categories, calibration and min_score"
         )
-    where = f"{path}: metadata '{METADATA_KEY}'"
     if len(text) > METADATA_LIMIT_CHARS:
         raise ConfigError(f"{where}: {len(text)} characters; expected at most {METADATA_LIMIT_CHARS}")
     try:
-        return NetworkInfo.model_validate_json(text)
+        network = Network(path, NetworkInfo.model_validate_json(text), session)
     except ValidationError as error:
         raise ConfigError(f"{where}: {first_problem(error, NetworkInfo)}") from None
+    network.run(np.zeros((CHANNELS, MIN_SIZE_CELLS, MIN_SIZE_CELLS), np.float32))
+    return network

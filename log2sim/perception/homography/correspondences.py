@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import CHI2_2DOF_99, Array, Camera, undistort
 from log2sim.perception.boxes import quantile_of_sorted
-from log2sim.perception.homography.fit import HomographyFit, refused_fit, validated_fit
+from log2sim.perception.homography.fit import HomographyFit, RobustFit, refused_fit, validated_fit
 from log2sim.perception.homography.normalized import NormalizedCorrespondences, bounded_losses, linearize
-from log2sim.perception.homography.ransac import RobustFit
 
 # Heights of cars differ by about a tenth (standard deviation), and so does a range derived from them.
 SIZE_SIGMA_SHARE = 0.1
@@ -69,12 +68,8 @@ class HomographyModel:
         """Fit by the direct linear transform to points (N, 2), (N, 2); False where they do not determine one."""
         (x, y), (u, v) = ground.T, image.T
         one, zero = np.ones_like(x), np.zeros_like(x)
-        rows = np.concatenate(
-            [
-                np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1),
-                np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1),
-            ]
-        )
+        of_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
+        rows = np.concatenate([of_u, np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)])
         # The gram matrix costs the same for any number of points, where a full SVD of the rows costs its square.
         values, vectors = np.linalg.eigh(rows.T @ rows)
         self.h = vectors[:, 0].reshape(3, 3)
@@ -110,29 +105,6 @@ def ransac_skimage(data: NormalizedCorrespondences, rng: np.random.Generator, tr
         return RobustFit(None, data)
     h = model.h / np.linalg.norm(model.h)
     return RobustFit(h, data, linearize(data, h[None]))
-
-
-def ground_from_sizes(uv_px: Array, height_px: Array, height_m: Array, K: Array, ego_T_cam: Array) -> Array:
-    """Estimate ground positions of objects from their heights in the image and average heights.
-
-    `uv_px`: (N, 2): undistorted foot points, px. `height_px`, `height_m`: (N,): heights of the boxes, px, and of the
-    objects, m. `K`: (3, 3). `ego_T_cam`: (4, 4): pose of the camera.
-
-    Returns (N, 2) float64: positions in the ego frame, m; NaN for boxes without height.
-    """
-    depth = K[1, 1] * height_m / np.where(height_px > 0, height_px, np.nan)
-    rays = np.column_stack([(uv_px - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(uv_px))])
-    return np.asarray((rays * depth[:, None]) @ ego_T_cam[:2, :3].T + ego_T_cam[:2, 3])
-
-
-def sigma_from_sizes_m(xy_m: Array) -> float:
-    """Estimate the standard deviation, m, of ground positions (N, 2) from average sizes.
-
-    A tenth of the range, for which twice the spread of the positions stands: it does not depend on the origin.
-    """
-    known = xy_m[np.isfinite(xy_m).all(axis=1)]
-    range_m = 2.0 * float(np.sqrt(known.var(axis=0).sum())) if len(known) else 0.0
-    return SIZE_SIGMA_SHARE * range_m
 
 
 # Fewer LiDAR points leave the nearest side of an obstacle undetermined.
@@ -213,7 +185,13 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
         return Correspondences.join([])
     boxes = measured.box_px[rows]
     feet = undistorted_pixels(camera, feet_of_boxes(boxes))
-    height_m = np.array([TYPICAL_SIZE_M[str(c)][2] for c in measured.category[rows]])
+    # Where their heights in the image and average heights put them; NaN for boxes without height.
+    height_m, height_px = (
+        np.array([TYPICAL_SIZE_M[str(c)][2] for c in measured.category[rows]]),
+        boxes[:, 3] - boxes[:, 1],
+    )
     ego_T_cam = camera.mount_T_cam if camera.mount == "ego" else ego_T_map.reshape(-1, 4, 4)[0] @ camera.mount_T_cam
-    by_size = ground_from_sizes(feet, boxes[:, 3] - boxes[:, 1], height_m, camera.K, ego_T_cam)
+    depth = camera.K[1, 1] * height_m / np.where(height_px > 0, height_px, np.nan)
+    rays = np.column_stack([(feet - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], np.ones(len(feet))])
+    by_size = np.asarray((rays * depth[:, None]) @ ego_T_cam[:2, :3].T + ego_T_cam[:2, 3])
     return Correspondences(feet, np.array(xy), np.full(len(rows), tick, dtype=np.int64), by_size)

@@ -6,18 +6,28 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M
 from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian
 from log2sim.perception.homography.correspondences import (
+    SIZE_SIGMA_SHARE,
     Correspondences,
     fit_frames,
     ransac_skimage,
-    sigma_from_sizes_m,
     undistorted_pixels,
 )
-from log2sim.perception.homography.fit import HomographyFit, PitchRoll, ground_covariances, refused_fit, validated_fit
+from log2sim.perception.homography.fit import (
+    RANSAC_SCHEDULE,
+    RANSAC_SCHEDULE_OF_A_FRAME,
+    HomographyFit,
+    PitchRoll,
+    RansacRound,
+    RansacSchedule,
+    ground_covariances,
+    ransac,
+    refused_fit,
+    validated_fit,
+)
 from log2sim.perception.homography.normalized import NormalizedCorrespondences, scaled
 from log2sim.perception.homography.pitch_roll import (
     PITCH_SIGMA_PX,
@@ -28,13 +38,6 @@ from log2sim.perception.homography.pitch_roll import (
     stabilized,
     stabilizing_warps,
     two_folds,
-)
-from log2sim.perception.homography.ransac import (
-    RANSAC_SCHEDULE,
-    RANSAC_SCHEDULE_OF_A_FRAME,
-    RansacRound,
-    RansacSchedule,
-    ransac,
 )
 
 STREAM_METHODS = ("time-aware", "calibrated")
@@ -76,19 +79,27 @@ def estimate_homography(
     Raises `ValueError` for an unknown method, or when the method lacks its input: intrinsics for "calibrated", positions by
     average sizes for "straw-man".
 
-    Notes
-    -----
     "time-aware" draws one half of its samples from single frames, where correspondences share the camera's momentary
     pose, and one half from all frames. It scores each hypothesis over all frames and obstacles with a bounded loss of
     the whitened error, and refines the best over all of its inliers. "calibrated" does the same over the six parameters
     of the pose of a camera with known intrinsics. The others are baselines, see `baselines`.
     """
     options = options or EstimationOptions()
-    _check_options(correspondences, options)
+    method, of_stream = options.method, options.method in STREAM_METHODS
+    if method not in METHODS:
+        raise ValueError(f"unknown method '{method}'; known: {', '.join(METHODS)}")
     uv, xy, sigma_m = correspondences.uv, correspondences.xy_ego, options.sigma_m
-    if options.method == "straw-man":
+    shape = () if options.K is None else options.K.shape
+    if method == "calibrated" and shape != (3, 3):
+        raise ValueError(f"method 'calibrated' needs the intrinsics K (3, 3), got shape {shape}")
+    if method == "straw-man":
+        if correspondences.xy_by_size is None or correspondences.xy_by_size.shape != uv.shape:
+            raise ValueError("method 'straw-man' needs the ground positions by average sizes, xy_by_size (N, 2)")
         xy = np.asarray(correspondences.xy_by_size, dtype=np.float64)
-        sigma_m = max(sigma_m, sigma_from_sizes_m(xy))
+        # Off by a tenth of the range, for which twice the spread of the positions stands: it does not depend on the origin.
+        known = xy[np.isfinite(xy).all(axis=1)]
+        range_m = 2.0 * float(np.sqrt(known.var(axis=0).sum())) if len(known) else 0.0
+        sigma_m = max(sigma_m, SIZE_SIGMA_SHARE * range_m)
     ticks, number = np.unique(correspondences.tick, return_inverse=True)
     rows = np.flatnonzero(np.isfinite(uv[:, 0]) & np.isfinite(uv[:, 1]) & np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1]))
     if len(rows) < 4:
@@ -96,75 +107,47 @@ def estimate_homography(
     rows = rows[np.argsort(number[rows], kind="stable")]
     dense = np.unique(number[rows], return_inverse=True)[1]
     data = NormalizedCorrespondences.of(uv[rows], xy[rows], dense, options.sigma_px, sigma_m)
-    if options.method in STREAM_METHODS:
-        fit = _fit_stream(data, options, rng)
+    if of_stream:
+        image_K = None
+        if method == "calibrated":
+            K = np.asarray(options.K, dtype=np.float64)
+            if not (np.isfinite(K).all() and np.linalg.cond(K) < MAX_CONDITION):
+                return refused_fit("the intrinsics K are singular", len(uv), ticks)
+            image_K = data.image_N_px @ K
+        pitch_sigma = PITCH_SIGMA_PX * data.image_N_px[0, 0] if options.pitch_roll else 0.0
+        schedule = options.schedule(RANSAC_SCHEDULE)
+        robust = ransac(data, rng, pitch_sigma=pitch_sigma, image_K=image_K, schedule=schedule)
+        if robust.h is None or not options.pitch_roll:
+            fit = validated_fit(robust, image_K)
+        else:
+            moving, warps, tick_sigmas = fit_pitch_roll(data, robust.h, image_K)
+            fit = validated_fit(moving, image_K)
+            if fit.ok and moving.h is not None:
+                tick_sigmas = fit.ground_H_image @ np.linalg.inv(data.image_N_px) @ tick_sigmas @ data.image_N_px
+                fit = replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h), tick_sigmas=tick_sigmas)
     else:
         estimate = partial(ransac, rng=rng, schedule=options.schedule(RANSAC_SCHEDULE_OF_A_FRAME))
-        if options.method == "per-frame-skimage":
+        if method == "per-frame-skimage":
             estimate = partial(ransac_skimage, rng=rng, trials=options.hypotheses)
-        fit = fit_frames(data, estimate, keep_all=options.method != "min-frame")
-    fit = _spread_to_all(fit, correspondences.tick, rows, of_stream=options.method in STREAM_METHODS)
-    if options.method == "straw-man" and fit.ok:
+        fit = fit_frames(data, estimate, keep_all=method != "min-frame")
+    # From the rows that were used to all. A tick without any gets NaN, or the homography of the stream where there is one, and
+    # may have any angle that other ticks have.
+    inliers, of_ticks = np.zeros(len(uv), dtype=bool), np.unique(number[rows])
+    inliers[rows] = fit.inliers
+    per_tick, sigmas = fit.per_tick, fit.tick_sigmas
+    if per_tick is not None:
+        per_tick = np.repeat((fit.ground_H_image if of_stream else np.full((3, 3), np.nan))[None], len(ticks), axis=0)
+        per_tick[of_ticks] = fit.per_tick
+    if sigmas is not None:
+        sigmas = np.repeat(sigmas[[np.abs(sigmas).sum(axis=(1, 2, 3)).argmax()]], len(ticks), axis=0)
+        sigmas[of_ticks] = fit.tick_sigmas
+    fit = replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick, tick_sigmas=sigmas)
+    if method == "straw-man" and fit.ok:
         offset = apply_homography(fit.ground_H_image, uv)[0] - correspondences.xy_ego
         distance = np.hypot(*offset[fit.inliers].T)
         error_m = float(np.nanmedian(distance)) if np.isfinite(distance).any() else float("nan")
         fit = replace(fit, error_m=error_m)
     return fit
-
-
-def _check_options(correspondences: Correspondences, options: EstimationOptions) -> None:
-    if options.method not in METHODS:
-        raise ValueError(f"unknown method '{options.method}'; known: {', '.join(METHODS)}")
-    shape = () if options.K is None else options.K.shape
-    if options.method == "calibrated" and shape != (3, 3):
-        raise ValueError(f"method 'calibrated' needs the intrinsics K (3, 3), got shape {shape}")
-    sized = correspondences.xy_by_size
-    if options.method == "straw-man" and (sized is None or np.shape(sized) != correspondences.uv.shape):
-        raise ValueError("method 'straw-man' needs the ground positions by average sizes, xy_by_size (N, 2)")
-
-
-def _fit_stream(data: NormalizedCorrespondences, options: EstimationOptions, rng: np.random.Generator) -> HomographyFit:
-    """Fit one homography over all ticks, and if asked for pitch and roll of each tick."""
-    image_K = None
-    if options.method == "calibrated":
-        K = np.asarray(options.K, dtype=np.float64)
-        if not (np.isfinite(K).all() and np.linalg.cond(K) < MAX_CONDITION):
-            return refused_fit("the intrinsics K are singular", data.image.shape[1])
-        image_K = data.image_N_px @ K
-    pitch_sigma = PITCH_SIGMA_PX * data.image_N_px[0, 0] if options.pitch_roll else 0.0
-    schedule = options.schedule(RANSAC_SCHEDULE)
-    robust = ransac(data, rng, pitch_sigma=pitch_sigma, image_K=image_K, schedule=schedule)
-    if robust.h is None or not options.pitch_roll:
-        return validated_fit(robust, image_K)
-    moving, warps, tick_sigmas = fit_pitch_roll(data, robust.h, image_K)
-    fit = validated_fit(moving, image_K)
-    if not fit.ok or moving.h is None:
-        return fit
-    tick_sigmas = fit.ground_H_image @ np.linalg.inv(data.image_N_px) @ tick_sigmas @ data.image_N_px
-    return replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h), tick_sigmas=tick_sigmas)
-
-
-def _spread_to_all(
-    fit: HomographyFit, tick: NDArray[np.int64], rows: NDArray[np.int64], *, of_stream: bool
-) -> HomographyFit:
-    """Convert a fit of `rows` into one of all correspondences, whose ticks are `tick` (N,).
-
-    In `per_tick` a tick without usable rows gets NaN, or the homography of the stream for methods that have one.
-    """
-    ticks, number = np.unique(tick, return_inverse=True)
-    inliers = np.zeros(len(tick), dtype=bool)
-    inliers[rows] = fit.inliers
-    per_tick = fit.per_tick
-    if per_tick is not None:
-        missing = fit.ground_H_image if of_stream else np.full((3, 3), np.nan)
-        per_tick = np.repeat(missing[None], len(ticks), axis=0)
-        per_tick[np.unique(number[rows])] = fit.per_tick
-    tick_sigmas = fit.tick_sigmas
-    if tick_sigmas is not None:
-        # A tick without usable rows may have any angle that other ticks have.
-        tick_sigmas = np.repeat(tick_sigmas[[np.abs(tick_sigmas).sum(axis=(1, 2, 3)).argmax()]], len(ticks), axis=0)
-        tick_sigmas[np.unique(number[rows])] = fit.tick_sigmas
-    return replace(fit, inliers=inliers, ticks=ticks, per_tick=per_tick, tick_sigmas=tick_sigmas)
 
 
 # A detector's box ends this far from the true foot point (standard deviation).
@@ -200,7 +183,7 @@ def fit_camera(
     fit, source = _fit_fixed(feet, ground, options, rng)
     if options.method not in STREAM_METHODS or (len(ground) < 4 and len(feet) < MIN_FEET):
         return fit, source
-    feet, ground = _finite(feet), _finite(ground)
+    feet, ground = (c.take(np.isfinite(np.column_stack([c.uv, c.xy_ego])).all(axis=1)) for c in (feet, ground))
     rng = rng.spawn(1)[0]
     tested = _test_ground(fit, feet, ground, options, rng)
     if tested is None or not tested[1].per_tick:
@@ -287,12 +270,6 @@ def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: 
     pitches = bool(np.abs(stabilizing_warps(moving) - np.eye(3)).max() > MIN_WARP)
     sigmas_deg = (float("nan"), float("nan")) if options.K is None else angle_sigmas_deg(moving, options.K)
     return errors.decide(source, sigmas_deg, moves=pitches)
-
-
-def _finite(correspondences: Correspondences) -> Correspondences:
-    """Select the rows whose pixels and positions are finite."""
-    values = np.column_stack([correspondences.uv, correspondences.xy_ego])
-    return correspondences.take(np.isfinite(values).all(axis=1))
 
 
 # Beyond this range one pixel of a camera at car height is several meters.

@@ -104,16 +104,23 @@ def squared_errors(
 
     `pitch_sigma` is a further standard deviation along v, for cameras that pitch, in normalized units.
 
-    Notes
-    -----
     Sampson's distance: the error of the cross-multiplied equations weighted by its first-order covariance. Errors, depth
     and covariance are linear in products of the coordinates, so one matrix product gives them for all homographies.
     """
-    kind = data.products.dtype
-    terms = (_coefficients(image_H_ground, data.sigma_ground**2).astype(kind) @ data.products).reshape(
-        6, len(image_H_ground), -1
+    # Factors (6, K, 12) of `products` that give two errors, the depth and three entries of the covariance.
+    c, (a, b, d) = np.zeros((6, len(image_H_ground), 12)), image_H_ground.transpose(1, 0, 2)
+    c[0, :, 0:3], c[0, :, 3:6] = -a, d
+    c[1, :, 0:3], c[1, :, 6:9] = -b, d
+    c[2, :, 0:3] = d
+    aa, bb, dd, ab, ad, bd = (
+        data.sigma_ground**2 * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
+        for p, q in ((a, a), (b, b), (d, d), (a, b), (a, d), (b, d))
     )
-    ex, ey, w, cuu, cvv, cuv = terms
+    c[3, :, 2], c[3, :, 5], c[3, :, 9] = aa, -2 * ad, dd
+    c[4, :, 2], c[4, :, 8], c[4, :, 10] = bb, -2 * bd, dd
+    c[5, :, 2], c[5, :, 5], c[5, :, 8], c[5, :, 11] = ab, -bd, -ad, dd
+    kind = data.products.dtype
+    ex, ey, w, cuu, cvv, cuv = (c.reshape(-1, 12).astype(kind) @ data.products).reshape(6, len(image_H_ground), -1)
     pixel = w * w
     cvv += kind.type(data.sigma_image**2 + pitch_sigma**2) * pixel
     pixel *= kind.type(data.sigma_image**2)
@@ -135,23 +142,6 @@ def squared_errors(
     return np.asarray(ex)
 
 
-def _coefficients(h: Array, ground_variance: float) -> Array:
-    """Build the factors (6 K, 12) of `products` that give two errors, the depth and three entries of the covariance."""
-    c = np.zeros((6, len(h), 12))
-    a, b, d = h[:, 0], h[:, 1], h[:, 2]
-    c[0, :, 0:3], c[0, :, 3:6] = -a, d
-    c[1, :, 0:3], c[1, :, 6:9] = -b, d
-    c[2, :, 0:3] = d
-    aa, bb, dd, ab, ad, bd = (
-        ground_variance * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
-        for p, q in ((a, a), (b, b), (d, d), (a, b), (a, d), (b, d))
-    )
-    c[3, :, 2], c[3, :, 5], c[3, :, 9] = aa, -2 * ad, dd
-    c[4, :, 2], c[4, :, 8], c[4, :, 10] = bb, -2 * bd, dd
-    c[5, :, 2], c[5, :, 5], c[5, :, 8], c[5, :, 11] = ab, -bd, -ad, dd
-    return c.reshape(-1, 12)
-
-
 def bounded_losses(
     data: NormalizedCorrespondences, image_H_ground: Array, pitch_sigma: float = 0.0
 ) -> NDArray[np.floating[Any]]:
@@ -166,8 +156,6 @@ def nearest_poses(image_K: Array, h: Array) -> Array:
     The first two columns of `inv(image_K) @ h` are the ground axes in the camera frame, so they must be orthogonal and
     of equal length. Columns that are zero or parallel give NaN.
 
-    Notes
-    -----
     The polar factor of these two columns is the nearest such matrix in the Frobenius norm (Zhang, 2000, appendix C).
     """
     m = np.linalg.inv(image_K) @ h
@@ -274,11 +262,24 @@ def linearize(data: NormalizedCorrespondences, h: Array, warps: Array | None = N
 
 
 def refine_many(data: NormalizedCorrespondences, h: Array, gates: tuple[float, ...]) -> Array:
-    """Take one Gauss-Newton step of all homographies (K, 3, 3) for each of `gates` on the squared error."""
-    h = h / np.linalg.norm(h, axis=(1, 2), keepdims=True)
+    """Take one Gauss-Newton step of all homographies (K, 3, 3) for each of `gates` on the squared error; none where undetermined."""
+    h, count = h / np.linalg.norm(h, axis=(1, 2), keepdims=True), len(h)
     for gate in gates:
         linear = linearize(data, h)
-        h = np.asarray(h + newton_steps(linear, linear.squared < gate, h))
+        use = linear.squared < gate
+        slope = (linear.slope * use[:, None, None]).reshape(count, 9, -1)
+        normal, right = slope @ slope.swapaxes(1, 2), slope @ linear.error.reshape(count, -1, 1)
+        # The scale of a homography is free: steps are taken across it, never along it.
+        along = h.reshape(count, 9, 1)
+        size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 9
+        normal += size * (along @ along.swapaxes(1, 2)) + 1e-14 * size * np.eye(9)
+        enough = np.count_nonzero(use, axis=1) >= 4
+        normal[~enough] = np.eye(9)
+        try:
+            step = -np.linalg.solve(normal, right).reshape(count, 3, 3)
+        except np.linalg.LinAlgError:
+            step = np.full((count, 3, 3), np.nan)
+        h = h + np.where((enough & np.isfinite(step).all(axis=(1, 2)))[:, None, None], step, 0.0)
         h /= np.linalg.norm(h, axis=(1, 2), keepdims=True)
     return h
 
@@ -330,31 +331,11 @@ def scale_free_basis(h: Array) -> Array:
     return np.asarray(out)
 
 
-def newton_steps(linear: Linearization, use: NDArray[np.bool_], h: Array) -> Array:
-    """Compute Gauss-Newton steps (K, 3, 3) over the correspondences in `use` (K, N); zero where undetermined."""
-    count = len(h)
-    slope = (linear.slope * use[:, None, None]).reshape(count, 9, -1)
-    normal, right = slope @ slope.swapaxes(1, 2), slope @ linear.error.reshape(count, -1, 1)
-    # The scale of a homography is free: steps are taken across it, never along it.
-    along = h.reshape(count, 9, 1)
-    size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 9
-    normal += size * (along @ along.swapaxes(1, 2)) + 1e-14 * size * np.eye(9)
-    enough = np.count_nonzero(use, axis=1) >= 4
-    normal[~enough] = np.eye(9)
-    try:
-        step = -np.linalg.solve(normal, right).reshape(count, 3, 3)
-    except np.linalg.LinAlgError:
-        return np.zeros((count, 3, 3))
-    return np.where((enough & np.isfinite(step).all(axis=(1, 2)))[:, None, None], step, 0.0)
-
-
 def noise_factors(data: NormalizedCorrespondences, linear: Linearization, parameters: float = 8) -> tuple[float, float]:
     """Estimate from the inliers by which factors the noise of pixels and of ground positions exceeds the assumed one.
 
     `parameters` is the number of fitted parameters, subtracted from the degrees of freedom.
 
-    Notes
-    -----
     Variance components by one step of Fisher scoring of the normal likelihood, with the assumed noise as prior.
     """
     use = linear.squared[0] < CHI2_2DOF_99
@@ -374,12 +355,8 @@ def noise_factors(data: NormalizedCorrespondences, linear: Linearization, parame
     auu, auv, avu, avv = iuu * guu + iuv * guv, iuu * guv + iuv * gvv, iuv * guu + icc * guv, iuv * guv + icc * gvv
     score = np.array([pixel * (zu @ zu + zv @ zv), (zu * zu) @ guu + 2 * (zu * zv) @ guv + (zv * zv) @ gvv])
     cross = float(pixel * (auu @ iuu + (auv + avu) @ iuv + avv @ icc))
-    fisher = np.array(
-        [
-            [pixel**2 * (iuu @ iuu + 2 * iuv @ iuv + icc @ icc), cross],
-            [cross, auu @ auu + 2 * auv @ avu + avv @ avv],
-        ]
-    )
+    of_pixels, of_ground = pixel**2 * (iuu @ iuu + 2 * iuv @ iuv + icc @ icc), auu @ auu + 2 * auv @ avu + avv @ avv
+    fisher = np.array([[of_pixels, cross], [cross, of_ground]])
     score *= 2 * count / (2 * count - parameters) / TRUNCATED_VARIANCE_SHARE
     variances = np.linalg.solve(fisher + NOISE_PRIOR_ROWS * np.eye(2), score + NOISE_PRIOR_ROWS)
     factors = np.sqrt(np.clip(variances, MAX_NOISE_FACTOR**-2, MAX_NOISE_FACTOR**2))

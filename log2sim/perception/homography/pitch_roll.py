@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.fit import HomographyFit, PitchRoll
+from log2sim.perception.homography.fit import HomographyFit, PitchRoll, RobustFit
 from log2sim.perception.homography.normalized import (
     Linearization,
     NormalizedCorrespondences,
@@ -28,7 +28,6 @@ from log2sim.perception.homography.normalized import (
     pose_tangent,
     scale_free_basis,
 )
-from log2sim.perception.homography.ransac import RobustFit
 
 # Standard deviations of pitch, as a shift along v, and of roll, before they are estimated.
 PITCH_SIGMA_PX = 4.0
@@ -61,14 +60,19 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     Returns the fit; the image homography of each tick on top of it (T, 3, 3); and the image motions (T, 2, 3, 3) by one standard
     deviation of its two angles. An angle counts among the effective parameters by how little its prior determines it.
 
-    Notes
-    -----
     Each tick's shift starts at the candidate that most of its correspondences agree with. Then Gauss-Newton over the
     homography and all angles, which are coupled only through the homography, so that a tick costs a 2x2 system (Schur's
     complement). Noise and standard deviations of the angles are estimated anew after each step.
     """
     sigma = np.array([PITCH_SIGMA_PX * data.image_N_px[0, 0], ROLL_SIGMA_RAD])
-    angles = _Angles(np.zeros((len(data.start), 2)), sigma, np.ones(2, dtype=bool), _generators(data, image_K))
+    # Without intrinsics pitch shifts the image and roll rotates it about the mean of the correspondences: for a tenth of a degree
+    # the difference is below a tenth of a pixel.
+    shift, roll = np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 0]]), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]])
+    generators = np.array([shift, roll])
+    if image_K is not None:
+        pitch = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]]) / image_K[1, 1]
+        generators = image_K @ np.array([pitch, roll]) @ np.linalg.inv(image_K)
+    angles = _Angles(np.zeros((len(data.start), 2)), sigma, np.ones(2, dtype=bool), generators)
     noisy = data
     for k in range(ROUNDS):
         if k < 2:  # again in the second round, with the homography and the standard deviation fitted in the first
@@ -80,7 +84,14 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
             noisy = noisy.scale_noise(*noise_factors(noisy, linear, 8 + 2 * len(angles.value)))
         variance = 1.0 / (information + 1.0 / angles.sigma**2)
         if k == ROUNDS - 2:
-            significant = _is_significant(angles, information)
+            # Whether they differ from zero over the ticks by more than noise explains, as they would be without the prior, which
+            # shrinks them.
+            informed = information > 0.01 / angles.sigma**2
+            known = np.where(informed, information, 1.0)
+            unshrunk = angles.value * (1.0 + 1.0 / (angles.sigma**2 * known))
+            excess = np.where(informed, unshrunk**2 * known - 1.0, 0.0).sum(axis=0)
+            noise = np.sqrt(2.0 * np.maximum(informed.sum(axis=0), 1))
+            significant = np.asarray(excess > MIN_SIGNIFICANCE_SIGMA * noise)
             angles = replace(angles, value=angles.value * significant, significant=significant)
         sigma = np.sqrt(np.maximum((angles.value**2 + variance).mean(axis=0), angles.sigma**2 / 25))
         angles = replace(angles, sigma=sigma)
@@ -88,30 +99,6 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     of_rows, parameters = warps[noisy.tick], float((angles.significant * information * variance).sum())
     tick_sigmas = (np.sqrt(variance) * angles.significant)[:, :, None, None] * angles.generators
     return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps, tick_sigmas
-
-
-def _is_significant(angles: _Angles, information: Array) -> NDArray[np.bool_]:
-    """Test whether pitch and roll (2,) differ from zero over the ticks by more than noise explains."""
-    sigma = angles.sigma
-    informed = information > 0.01 / sigma**2
-    information = np.where(informed, information, 1.0)
-    # The estimates as they would be without the prior, which shrinks them.
-    unshrunk = angles.value * (1.0 + 1.0 / (sigma**2 * information))
-    excess = np.where(informed, unshrunk**2 * information - 1.0, 0.0).sum(axis=0)
-    return np.asarray(excess > MIN_SIGNIFICANCE_SIGMA * np.sqrt(2.0 * np.maximum(informed.sum(axis=0), 1)))
-
-
-def _generators(data: NormalizedCorrespondences, image_K: Array | None) -> Array:
-    """Build the image motions (2, 3, 3) of pitch, as a shift along v, and of roll, in normalized units.
-
-    Without intrinsics pitch shifts the image and roll rotates it about the mean of the correspondences: for a tenth of a
-    degree the difference is below a tenth of a pixel.
-    """
-    if image_K is None:
-        return np.array([[[0, 0, 0], [0, 0, 1], [0, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], dtype=np.float64)
-    pitch = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]]) / image_K[1, 1]
-    roll = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]])
-    return np.asarray(image_K @ np.array([pitch, roll]) @ np.linalg.inv(image_K))
 
 
 def _consensus_shift(data: NormalizedCorrespondences, h: Array, sigma: float) -> Array:
@@ -144,7 +131,15 @@ def _step(
     use = linear.squared[0] < CHI2_2DOF_99
     by_h = linear.slope[0] * use
     error = linear.error[0] * use
-    by_angle = _angle_slopes(linear, angles.generators) * use * angles.significant[:, None, None]
+    # Derivatives (2, 2, N) of the whitened errors by the two angles.
+    (u, v), (wu, wv, shear) = linear.projected[0], linear.whiten[:, 0]
+    by_angle = np.empty((2, 2, len(u)))
+    for k, g in enumerate(angles.generators):
+        dw = g[2, 0] * u + g[2, 1] * v + g[2, 2]
+        du = g[0, 0] * u + g[0, 1] * v + g[0, 2] - u * dw
+        dv = g[1, 0] * u + g[1, 1] * v + g[1, 2] - v * dw
+        by_angle[k] = du * wu, (dv - shear * du) * wv
+    by_angle = by_angle * use * angles.significant[:, None, None]
     basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
     by_h = (basis.T @ by_h.reshape(9, -1)).reshape(-1, *by_h.shape[1:])
 
@@ -170,20 +165,6 @@ def _step(
     information = np.diagonal(own, axis1=1, axis2=2) - 1.0 / angles.sigma**2
     value = (angles.value + angle_step) * angles.significant
     return np.asarray(moved), replace(angles, value=value), information
-
-
-def _angle_slopes(linear: Linearization, generators: Array) -> Array:
-    """Compute the derivatives (2, 2, N) of the whitened errors by the two angles."""
-    u, v = linear.projected[0]
-    wu, wv, shear = linear.whiten[:, 0]
-    out = np.empty((2, 2, len(u)))
-    for k, g in enumerate(generators):
-        dw = g[2, 0] * u + g[2, 1] * v + g[2, 2]
-        du = g[0, 0] * u + g[0, 1] * v + g[0, 2] - u * dw
-        dv = g[1, 0] * u + g[1, 1] * v + g[1, 2] - v * dw
-        out[k, 0] = du * wu
-        out[k, 1] = (dv - shear * du) * wv
-    return out
 
 
 # Median of chi-squared with 2 degrees of freedom.
@@ -238,15 +219,11 @@ def stabilizing_warps(moving: HomographyFit) -> Array:
 
 def stabilized(correspondences: Correspondences, moving: HomographyFit) -> Correspondences:
     """Undo the pitch and roll of each tick in the pixels; ticks that `moving` does not have are left as they are."""
-    warps = _warps_at(stabilizing_warps(moving), moving.ticks, correspondences.tick)
+    index = np.clip(np.searchsorted(moving.ticks, correspondences.tick), 0, len(moving.ticks) - 1)
+    known = (moving.ticks[index] == correspondences.tick)[:, None, None]
+    warps = np.where(known, stabilizing_warps(moving)[index], np.eye(3))
     q = np.einsum("nij,nj->ni", warps, np.column_stack([correspondences.uv, np.ones(len(correspondences))]))
     return replace(correspondences, uv=q[:, :2] / q[:, 2:])
-
-
-def _warps_at(values: Array, ticks: NDArray[np.int64], tick: NDArray[np.int64]) -> Array:
-    """Look up the matrices (N, 3, 3) of ticks (N,); the identity where there is none."""
-    index = np.clip(np.searchsorted(ticks, tick), 0, len(ticks) - 1)
-    return np.where((ticks[index] == tick)[:, None, None], values[index], np.eye(3))
 
 
 def held_out_errors(
@@ -256,25 +233,20 @@ def held_out_errors(
     sigma_m: float,
 ) -> HeldOutErrors:
     """Compute the errors of the same correspondences, raw and stabilized, with the homographies fitted to each."""
-    errors = [_image_errors(fit.ground_H_image, data, sigma_px, sigma_m) for fit, data in (fixed, moving)]
-    squared, distance = (np.stack([e[k] for e in errors]) for k in range(2))
-    return HeldOutErrors(fixed[1].tick, squared, distance)
-
-
-def _image_errors(
-    ground_H_image: Array, correspondences: Correspondences, sigma_px: float, sigma_m: float
-) -> tuple[Array, Array]:
-    """Compute squared whitened errors (N,) and distances (N,), px; infinite behind the camera."""
-    h = np.linalg.inv(ground_H_image)
-    q = correspondences.xy_ego @ h[:, :2].T + h[:, 2]
-    front = q[:, 2] > 0
-    depth = np.where(front, q[:, 2], 1.0)[:, None]
-    projected = q[:, :2] / depth
-    slope = (h[:2, :2] - projected[:, :, None] * h[2, :2]) / depth[:, :, None]
-    covariance = sigma_px**2 * np.eye(2) + sigma_m**2 * slope @ slope.swapaxes(1, 2)
-    error = correspondences.uv - projected
-    squared = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
-    return np.where(front, squared, np.inf), np.where(front, np.hypot(*error.T), np.inf)
+    squared, distance = [], []
+    for fit, data in (fixed, moving):
+        h = np.linalg.inv(fit.ground_H_image)
+        q = data.xy_ego @ h[:, :2].T + h[:, 2]
+        front = q[:, 2] > 0
+        depth = np.where(front, q[:, 2], 1.0)[:, None]
+        projected = q[:, :2] / depth
+        slope = (h[:2, :2] - projected[:, :, None] * h[2, :2]) / depth[:, :, None]
+        covariance = sigma_px**2 * np.eye(2) + sigma_m**2 * slope @ slope.swapaxes(1, 2)
+        error = data.uv - projected
+        whitened = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+        squared.append(np.where(front, whitened, np.inf))  # infinite behind the camera
+        distance.append(np.where(front, np.hypot(*error.T), np.inf))
+    return HeldOutErrors(fixed[1].tick, np.stack(squared), np.stack(distance))
 
 
 def two_folds(correspondences: Correspondences) -> list[tuple[Correspondences, Correspondences]]:

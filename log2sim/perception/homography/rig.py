@@ -1,24 +1,41 @@
-"""Cameras of a rig over one ground plane: their correspondences, and the plane by RANSAC over all of them.
+"""The homographies of all cameras of a rig over one ground plane, and the feet of boxes in them, solved together.
 
 All cameras of a rig see the same ground, and one detector finds their boxes. So the plane of the ground relative to the rig
 and the systematic error of the boxes' feet are parameters of the rig; a camera has a rotation of its mount of its own.
 
 A ray of a calibrated camera passes over the ground position that it shows at a height, which is linear in the plane. So
-correspondences of different cameras serve one hypothesis, three determine it, and all of them judge it.
+correspondences of different cameras and ticks serve one hypothesis, three determine it, and all of them judge it (RANSAC). The
+ego's pitch and roll against the plane are those of all cameras, and are kept at each tick if they lower held-out errors. Then
+one bundle over the feet of boxes in all cameras finds where boxes end, and how each camera is turned.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, Camera, inverse, shift_poses
+from log2sim.geometry import CHI2_2DOF_99, Array, Camera, apply_homography, inverse, shift_poses
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.normalized import scaled
+from log2sim.perception.homography.estimate import (
+    FOOT_SIGMA_M,
+    FOOT_SIGMA_PX,
+    GROUND_SIGMA_M,
+    GROUND_SIGMA_PX,
+    MIN_TESTED_FEET,
+)
+from log2sim.perception.homography.fit import (
+    MIN_INLIER_SHARE,
+    MIN_INLIERS,
+    HomographyFit,
+    ground_covariances,
+    refused_fit,
+)
+from log2sim.perception.homography.normalized import MAX_NOISE_FACTOR, NOISE_PRIOR_ROWS, scaled
+from log2sim.perception.homography.pitch_roll import CHI2_2DOF_50, HeldOutErrors
 
 # Ground ahead of a camera at which the errors of its homography are predicted.
 PROBE_M = 20.0
@@ -73,23 +90,17 @@ def rotation_of(vector: Array) -> Array:
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + np.sinc(angle / 2 / np.pi) ** 2 / 2 * cross @ cross)
 
 
-def cam_of_ground(cam_T_rig: Array, plane: Array, turn: Array) -> Array:
-    """Compute the matrices (..., 3, 3) from ground positions (x, y, 1), rig frame, to points in a camera (4, 4).
-
-    `plane`: (..., 3). `turn`: (3, 3): rotation of the camera against its calibration.
-    """
-    r, t = turn @ cam_T_rig[:3, :3], turn @ cam_T_rig[:3, 3]
-    rise = r[:, 2, None] * np.asarray(plane)[..., None, :]
-    return np.asarray(np.column_stack([r[:, :2], t]) + rise)
-
-
 def foot_homography(rig: Rig, state: RigState, name: str, plane: Array | None = None) -> Array:
     """Compute `ground_H_image` (..., 3, 3) of the feet of boxes at the nearest sides of obstacles.
 
     px and m, in the ground frame of the correspondences; `plane` (..., 3) replaces that of the state, as that of a tick does.
     """
     lifted = (state.plane if plane is None else plane) + [0.0, 0.0, state.lift_m[name]]
-    image_H_ground = rig.cameras[name].K @ cam_of_ground(rig.cam_T_rig[name], lifted, rotation_of(state.feet[name]))
+    turn, cam_T_rig = rotation_of(state.feet[name]), rig.cam_T_rig[name]
+    r, t = turn @ cam_T_rig[:3, :3], turn @ cam_T_rig[:3, 3]
+    # From ground positions (x, y, 1), rig frame, to points in the camera.
+    cam_of_ground = np.column_stack([r[:, :2], t]) + r[:, 2, None] * lifted[..., None, :]
+    image_H_ground = rig.cameras[name].K @ cam_of_ground
     back, below = np.eye(3), np.eye(3)
     back[:2, 2], below[1, 2] = rig.origin_m[:2], state.below_px
     return scaled(scaled(back @ np.linalg.inv(image_H_ground)) @ below)
@@ -120,16 +131,6 @@ def foot_covariance(rig: Rig, state: RigState, name: str, covariance: Array) -> 
         columns.append((after - before).ravel() / (2 * step))
     by_parameter = np.column_stack(columns)
     return np.asarray(by_parameter @ covariance @ by_parameter.T)
-
-
-def probe_of(rig: Rig, state: RigState, name: str) -> Array | None:
-    """Return the pixel (1, 2) that shows the ground `PROBE_M` ahead of a camera; None where it does not see so far."""
-    axis, place = rig.cam_T_rig[name][2, :2], inverse(rig.cam_T_rig[name])[:2, 3]
-    if not np.hypot(*axis) > 0:
-        return None
-    at = place + PROBE_M * axis / np.hypot(*axis) + rig.origin_m[:2]
-    point = np.linalg.inv(foot_homography(rig, state, name)) @ [*at, 1.0]
-    return np.asarray(point[None, :2] / point[2]) if point[2] > 0 else None
 
 
 # Parameters of feet: one that all cameras share, then of each camera the height of feet above the road, m, and its rotation.
@@ -177,8 +178,8 @@ class RigRows:
         return RigRows(*(column[index] for column in vars(self).values()))
 
 
-def heights_of(rig: Rig, rows: RigRows) -> tuple[Array, Array]:
-    """Compute how high the rays of rows pass over their ground positions, by the calibration: (N,) m, and sigmas (N,) m."""
+def heights_of(rig: Rig, rows: RigRows) -> HeightRows:
+    """Compute how high the rays of rows pass over their ground positions, by the calibration; without those that never do."""
     rig_T_cam = inverse(np.array(list(rig.cam_T_rig.values())))[rows.camera]
     rotation, place = rig_T_cam[:, :3, :3], rig_T_cam[:, :3, 3]
     direction = np.einsum("nij,nj->ni", rotation, np.column_stack([rows.ray, np.ones(len(rows))]))
@@ -188,7 +189,9 @@ def heights_of(rig: Rig, rows: RigRows) -> tuple[Array, Array]:
     # A pixel turns the ray, and a ground position that is farther is passed lower.
     by_pixel = reach * np.sqrt(level + direction[:, 2] ** 2 * (1 + direction[:, 2] ** 2 / level)) / rows.focal_px
     sigma = np.hypot(by_pixel * rows.sigma_px, direction[:, 2] / np.sqrt(level) * rows.sigma_m)
-    return height, np.where(reach > 0, sigma, np.inf)
+    kept = np.isfinite(sigma) & (reach > 0)
+    xy1 = np.column_stack([rows.xy, np.ones(len(rows))])
+    return HeightRows(xy1[kept], height[kept], np.hypot(sigma, ROAD_SIGMA_M)[kept], rows.tick[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +225,8 @@ def linearize_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | Non
     slope = np.zeros((len(rows), 2, SHARED + OF_CAMERA))
     slope[:, 1, 0] = -1.0
     slope[:, :, 1] = np.einsum("nij,nj->ni", by_point, up)
-    slope[:, :, 2:] = -by_point @ _cross(point)
+    (x, y, z), zero = point.T, np.zeros(len(rows))
+    slope[:, :, 2:] = -by_point @ np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
     error = (ray - rows.ray) * rows.focal_px[:, None] - [0.0, state.below_px]
     pixels = np.where(front, np.hypot(*error.T), np.inf)
     covariance = (rows.sigma_m**2)[:, None, None] * by_xy @ by_xy.swapaxes(1, 2)
@@ -231,12 +235,6 @@ def linearize_feet(rig: Rig, rows: RigRows, state: RigState, planes: Array | Non
     error, slope = (whiten @ error[:, :, None])[:, :, 0], whiten @ slope
     squared = np.where(front, (error**2).sum(axis=1), np.inf)
     return FootErrors(squared, error, slope, pixels)
-
-
-def _cross(v: Array) -> Array:
-    """Build the matrices (N, 3, 3) of cross products with vectors (N, 3)."""
-    (x, y, z), zero = v.T, np.zeros(len(v))
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
 
 
 # 99 % quantile of chi-squared with 1 degree of freedom, at which the bounded loss is cut.
@@ -266,10 +264,6 @@ class HeightRows:
         squared = ((planes @ self.xy1.T - self.height) / self.sigma) ** 2
         return np.asarray(np.minimum(squared, CHI2_1DOF_99).mean(axis=1))
 
-    def inlier_share(self, plane: Array) -> float:
-        """Compute the share of rows that agree with a plane (3,)."""
-        return float(np.mean(((self.xy1 @ plane - self.height) / self.sigma) ** 2 < CHI2_1DOF_99))
-
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> HeightRows:
         """Select rows."""
         return HeightRows(self.xy1[index], self.height[index], self.sigma[index], self.tick[index])
@@ -278,16 +272,23 @@ class HeightRows:
 def find_plane(rows: HeightRows, rng: np.random.Generator, samples: int = SAMPLES) -> Array | None:
     """Find the plane (3,) that most rows agree with; None where no three rows span one.
 
-    Notes
-    -----
     As for a single camera, one half of the samples come from single ticks and one half from all, and hypotheses are judged
     over all cameras and ticks by a bounded loss (MSAC, Torr & Zisserman, 2000); then least squares over what agrees.
     """
-    planes = _hypotheses(rows, rng, samples)
+    count, half = len(rows.tick), samples // 2
+    if count < 3:
+        return None
+    start, end = (np.searchsorted(rows.tick, rows.tick, side=side) for side in ("left", "right"))
+    drawn = rng.integers(count, size=half)
+    of_tick = start[drawn] + (rng.random((3, half)) * (end - start)[drawn]).astype(np.int64)
+    three = np.concatenate([of_tick, rng.integers(count, size=(3, samples - half))], axis=1).T
+    spread = np.abs(np.linalg.det(rows.xy1[three])) > MIN_TRIANGLE_M2
+    planes = np.linalg.solve(rows.xy1[three[spread]], rows.height[three[spread], None])[:, :, 0]
+    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < MAX_SLOPE]
     if len(planes) == 0:
         return None
-    if len(rows.tick) > 2 * FIRST_ROWS and len(planes) > JUDGED_BY_ALL:
-        some = rows.take(np.sort(rng.permutation(len(rows.tick))[:FIRST_ROWS]))
+    if count > 2 * FIRST_ROWS and len(planes) > JUDGED_BY_ALL:
+        some = rows.take(np.sort(rng.permutation(count)[:FIRST_ROWS]))
         planes = planes[np.argsort(some.losses(planes), kind="stable")[:JUDGED_BY_ALL]]
     plane = planes[int(np.argmin(rows.losses(planes)))]
     for _ in range(REFINEMENTS):
@@ -304,27 +305,9 @@ def find_plane(rows: HeightRows, rng: np.random.Generator, samples: int = SAMPLE
     return np.asarray(plane)
 
 
-def _hypotheses(rows: HeightRows, rng: np.random.Generator, samples: int) -> Array:
-    """Draw planes (K, 3) through three rows each, half of them from single ticks."""
-    count, half = len(rows.tick), samples // 2
-    if count < 3:
-        return np.zeros((0, 3))
-    start = np.searchsorted(rows.tick, rows.tick)
-    end = np.searchsorted(rows.tick, rows.tick, side="right")
-    drawn = rng.integers(count, size=half)
-    of_tick = start[drawn] + (rng.random((3, half)) * (end - start)[drawn]).astype(np.int64)
-    three = np.concatenate([of_tick, rng.integers(count, size=(3, samples - half))], axis=1).T
-    matrices = rows.xy1[three]
-    spread = np.abs(np.linalg.det(matrices)) > MIN_TRIANGLE_M2
-    planes = np.linalg.solve(matrices[spread], rows.height[three[spread], None])[:, :, 0]
-    return np.asarray(planes[np.hypot(planes[:, 0], planes[:, 1]) < MAX_SLOPE])
-
-
 def tilt_of_ticks(rows: HeightRows, plane: Array) -> tuple[NDArray[np.int64], Array]:
     """Estimate the slopes of each tick's ground against the plane: ticks (T,), and slopes (T, 2).
 
-    Notes
-    -----
     The slopes have a zero-mean normal prior whose standard deviations are estimated from all ticks (empirical Bayes), so that a
     tick with few rows keeps the plane of all.
     """
@@ -344,3 +327,199 @@ def tilt_of_ticks(rows: HeightRows, plane: Array) -> tuple[NDArray[np.int64], Ar
         variance = np.diagonal(np.linalg.inv(normal), axis1=1, axis2=2)
         sigma = np.sqrt(np.maximum((tilt**2 + variance).mean(axis=0), sigma**2 / 25))
     return ticks, tilt
+
+
+# Standard deviations before anything is fitted. A box ends within some pixels of its object. Overhangs of cars are
+# 0.7 to 1 m, which is as much as 0.1 m in height where a camera 1.6 m high sees them 12 m away.
+BELOW_SIGMA_PX, LIFT_SIGMA_M = 4.0, 0.1
+# Mounts that are not calibrated to each other at the same time differ by some tenths of a degree.
+MOUNT_SIGMA_RAD = np.deg2rad(0.5)
+# Gates on the squared error while it is fitted, then until nothing changes.
+GATES = (16 * CHI2_2DOF_99, 6 * CHI2_2DOF_99, 2 * CHI2_2DOF_99, CHI2_2DOF_99, CHI2_2DOF_99, CHI2_2DOF_99)
+LAST_GATES = 4
+# Of the shifts that single feet of a camera ask for so many are tried.
+MAX_CANDIDATES = 48
+
+
+@dataclass(frozen=True, eq=False)
+class FeetFit:
+    """What the feet of boxes say about a rig."""
+
+    state: RigState
+    errors: FootErrors  # of all rows, by the assumed noise
+    noise: float  # factor by which the noise exceeds that
+    covariance: Array  # (P, P): of the shared parameters of feet, m and px, then of the rotation of each camera, rad
+
+    @property
+    def inliers(self) -> NDArray[np.bool_]:
+        """Mask (N,) of the rows that agree."""
+        return np.asarray(self.errors.squared < CHI2_2DOF_99 * self.noise**2)
+
+
+def fit_feet(
+    rig: Rig, rows: RigRows, state: RigState, planes: Array | None = None, *, is_start: bool = True
+) -> FeetFit:
+    """Fit the two parameters of feet and the rotation of each camera that they ask for, over all cameras and ticks.
+
+    Gauss-Newton on whitened errors with a bounded loss, from the shift that most feet of a camera agree with. Normal priors
+    keep what is not observed at the calibration, such as a camera without feet. With `is_start` False the state is that of an
+    earlier fit to the same rows, from which fewer steps lead on.
+    """
+    names, scale = list(rig.cameras), 1.0
+    if is_start:
+        linear, feet = linearize_feet(rig, rows, state, planes), dict(state.feet)
+        for k, name in enumerate(names):
+            own = np.flatnonzero((rows.camera == k) & np.isfinite(linear.squared))
+            if len(own) < 2:
+                continue
+            some = own[np.linspace(0, len(own) - 1, min(len(own), MAX_CANDIDATES)).round().astype(np.intp)]
+            # Rotations about x and y of the camera alone: two equations of a foot, two unknowns.
+            slope = linear.slope[some][:, :, 2:4]
+            usable = np.abs(np.linalg.det(slope)) > 1e-9
+            asked = -np.linalg.solve(slope[usable], linear.error[some][usable][:, :, None])[:, :, 0]
+            candidates = np.concatenate([np.zeros((1, 2)), asked])
+            moved = linear.error[own] + np.einsum("nij,kj->kni", linear.slope[own][:, :, 2:4], candidates)
+            loss = np.minimum((moved**2).sum(axis=2), CHI2_2DOF_99).sum(axis=1)
+            best = candidates[int(np.argmin(loss + (candidates**2).sum(axis=1) / MOUNT_SIGMA_RAD**2))]
+            feet[name] = feet[name] + np.append(best, 0.0)
+        state = replace(state, feet=feet)
+    covariance = np.zeros((SHARED + OF_CAMERA * len(names),) * 2)
+    for gate in GATES if is_start else GATES[-LAST_GATES:]:
+        linear = linearize_feet(rig, rows, state, planes)
+        step, covariance = _step(rig, rows, linear, state, gate=gate * scale**2, scale=scale)
+        of_camera = step[SHARED:].reshape(-1, OF_CAMERA)
+        lift = {name: state.lift_m[name] + float(s[0]) for name, s in zip(names, of_camera)}
+        turned = {name: state.feet[name] + s[1:] for name, s in zip(names, of_camera)}
+        state = replace(state, below_px=state.below_px + float(step[0]), lift_m=lift, feet=turned)
+        if gate <= 2 * CHI2_2DOF_99:
+            # By which factor the noise exceeds the assumed one, from the median error of the rows within the gate.
+            near = linear.squared[linear.squared < gate * scale**2]
+            median = float(np.median(near)) if len(near) else 0.0
+            variance = (median / CHI2_2DOF_50 * len(near) + NOISE_PRIOR_ROWS) / (len(near) + NOISE_PRIOR_ROWS)
+            scale = float(np.clip(np.sqrt(variance), 1 / MAX_NOISE_FACTOR, MAX_NOISE_FACTOR))
+    linear = linearize_feet(rig, rows, state, planes)
+    return FeetFit(state, linear, scale, covariance)
+
+
+def _step(
+    rig: Rig, rows: RigRows, linear: FootErrors, state: RigState, *, gate: float, scale: float
+) -> tuple[Array, Array]:
+    """Compute a Gauss-Newton step (P,) and the covariance (P, P)."""
+    use = linear.squared < gate
+    slope, error = linear.slope[use] / scale, linear.error[use] / scale
+    count = len(rig.cameras)
+    size = SHARED + OF_CAMERA * count
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for k in range(count):
+        own = rows.camera[use] == k
+        block = slope[own].reshape(-1, SHARED + OF_CAMERA)
+        place = np.r_[0:SHARED, SHARED + OF_CAMERA * k : SHARED + OF_CAMERA * (k + 1)]
+        normal[np.ix_(place, place)] += block.T @ block
+        right[place] += block.T @ error[own].ravel()
+    of_camera = np.array([LIFT_SIGMA_M, *[MOUNT_SIGMA_RAD] * 3]) ** -2.0
+    prior = np.concatenate([[BELOW_SIGMA_PX**-2.0], np.tile(of_camera, count)])
+    value = np.array([state.below_px, *(v for n in rig.cameras for v in (state.lift_m[n], *state.feet[n]))])
+    covariance = np.asarray(np.linalg.inv(normal + np.diag(prior)), dtype=np.float64)
+    return np.asarray(-covariance @ (right + prior * value)), covariance
+
+
+# Crossfall of 2.5 % over the width of a lane, and the depth of ruts: the road is this far from a plane.
+ROAD_SIGMA_M = 0.05
+# Fewer correspondences of all cameras together do not tell the ground from what else they may be on.
+MIN_ROWS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class RigFit:
+    """The homographies of the cameras of a rig, fitted together."""
+
+    reason: str  # why nothing was fitted, "" otherwise
+    rig: Rig
+    # From the feet of boxes to the ground, by camera; refused ones state why
+    fits: Mapping[str, HomographyFit] = field(default_factory=dict)
+    state: RigState | None = None
+    # (T,): ticks with a plane of their own, ascending
+    ticks: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    planes: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (T, 3)
+
+
+def fit_rig(
+    rig: Rig,
+    feet: Mapping[str, Correspondences],
+    ground: Mapping[str, Correspondences],
+    *,
+    rng: np.random.Generator,
+    samples: int = SAMPLES,
+) -> RigFit:
+    """Fit the homographies of all cameras of a rig.
+
+    `feet`, `ground`: of obstacles and of LiDAR ground points, by camera. `samples`: planes that RANSAC draws for the whole
+    rig.
+    """
+    foot_rows = RigRows.of(rig, feet, FOOT_SIGMA_PX, FOOT_SIGMA_M)
+    ground_rows = RigRows.of(rig, ground, GROUND_SIGMA_PX, GROUND_SIGMA_M)
+    heights = heights_of(rig, RigRows.join([foot_rows, ground_rows]))
+    plane = find_plane(heights, rng, samples) if len(heights.tick) >= MIN_ROWS else None
+    if plane is None:
+        reason = f"{len(heights.tick)} correspondences of all cameras do not determine the ground"
+        return RigFit(reason, rig)
+    share = float(np.mean(((heights.xy1 @ plane - heights.height) / heights.sigma) ** 2 < CHI2_1DOF_99))
+    if share < MIN_INLIER_SHARE:
+        return RigFit(f"only {share:.0%} of the correspondences of all cameras agree on a ground", rig)
+    fit = fit_feet(rig, foot_rows, RigState.calibrated(rig, plane))
+    ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
+    if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
+        ticks, tilt = tilt_of_ticks(heights_of(rig, ground_rows), plane)
+        planes = plane + np.column_stack([tilt, np.zeros(len(ticks))])
+        # The plane of all ticks where a tick has none of its own.
+        index = np.clip(np.searchsorted(ticks, foot_rows.tick), 0, len(ticks) - 1)
+        own = np.where((ticks[index] == foot_rows.tick)[:, None], planes[index], plane)
+        moving = fit_feet(rig, foot_rows, fit.state, own, is_start=False)
+        # By the errors of the feet, since ground points gave the tilts.
+        squared, pixels = (np.stack([getattr(of.errors, k) for of in (fit, moving)]) for k in ("squared", "pixels"))
+        pitch, roll = np.degrees((planes - plane)[:, :2].std(axis=0)).tolist()
+        errors, moves = HeldOutErrors(foot_rows.tick, squared, pixels), bool(np.abs(planes - plane).max() > 0)
+        decision = errors.decide("ground points", (pitch, roll), moves=moves)
+        if decision.per_tick:
+            fit = moving
+        else:
+            ticks, planes = ticks[:0], planes[:0]
+    result = RigFit("", rig, {}, fit.state, ticks, planes)
+    found = {name: feet.get(name) or Correspondences.join([]) for name in rig.cameras}
+    fits = {name: _fit_of_camera(result, fit, foot_rows, name, data) for name, data in found.items()}
+    fits = {name: replace(f, pitch_roll=decision) if f.ok else f for name, f in fits.items()}
+    return replace(result, fits=fits)
+
+
+def _fit_of_camera(result: RigFit, fit: FeetFit, rows: RigRows, name: str, data: Correspondences) -> HomographyFit:
+    """Make the result of one camera of a rig, refused where its feet contradict the rig; `rows` are all feet."""
+    number = list(result.rig.cameras).index(name)
+    own = rows.camera == number
+    count, agree = int(own.sum()), int((own & fit.inliers).sum())
+    needed = max(MIN_INLIERS, int(np.ceil(MIN_INLIER_SHARE * count)))
+    if count >= MIN_INLIERS and agree < needed:
+        reason = f"{agree} of {count} feet of its obstacles agree with the rig, at least {needed} are needed"
+        return refused_fit(reason, len(data))
+    h = foot_homography(result.rig, fit.state, name)
+    # The rows of the rig are sorted by tick, and finite.
+    inliers = np.zeros(len(data), dtype=bool)
+    usable = np.flatnonzero(np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1))
+    inliers[usable[np.argsort(data.tick[usable], kind="stable")]] = fit.inliers[own]
+    distance = np.hypot(*(apply_homography(h, data.uv[inliers])[0] - data.xy_ego[inliers]).T)
+    known = distance[np.isfinite(distance)]
+    error_m, s = float(np.median(known)) if len(known) else float("nan"), np.linalg.svd(h, compute_uv=False)
+    per_tick = foot_homography(result.rig, fit.state, name, result.planes) if len(result.ticks) else None
+    place = [*range(SHARED), *range(SHARED + OF_CAMERA * number, SHARED + OF_CAMERA * (number + 1))]
+    covariance = foot_covariance(result.rig, fit.state, name, fit.covariance[np.ix_(place, place)])
+    # Where the picture shows the ground ahead, if the camera sees so far.
+    cam_T_rig, sigma_m = result.rig.cam_T_rig[name], float("nan")
+    ahead, probe = cam_T_rig[2, :2], np.full(3, np.nan)
+    if np.hypot(*ahead) > 0:
+        at = inverse(cam_T_rig)[:2, 3] + PROBE_M * ahead / np.hypot(*ahead) + result.rig.origin_m[:2]
+        probe = np.linalg.inv(h) @ [*at, 1.0]
+    if probe[2] > 0:
+        sigma_m = float(
+            np.sqrt(np.linalg.eigvalsh(ground_covariances(h, covariance, probe[None, :2] / probe[2])[0])[-1])
+        )
+    condition = float(s[0] / s[-1])
+    return HomographyFit(True, "", h, inliers, error_m, condition, result.ticks, per_tick, sigma_m, covariance)

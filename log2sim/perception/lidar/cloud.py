@@ -58,18 +58,40 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
     `xyz`: (N, 3), m. `center`: (2,), m: in the frame of the points. `z_hint`: expected height at the center, m. Without any
     point the ground is flat at this height.
 
-    Notes
-    -----
     A quadratic surface is fitted to the lowest point of every cell by iteratively reweighted least squares, with
     `z_hint` as an anchor; the smoothed residuals of cells near that surface are added.
     """
-    k = int(2 * REACH_M / CELL_M) + 1
-    lowest = _lowest_points(xyz, center, k)
-    terms, range_m = _terms(k)
+    k, kind = int(2 * REACH_M / CELL_M) + 1, xyz.dtype.type
+    i, j = ((xyz[:, axis] - kind(center[axis])) * kind(1 / CELL_M) + kind(k / 2) for axis in range(2))
+    inside = np.flatnonzero((i >= 0) & (i < k) & (j >= 0) & (j < k))
+    cell = i.take(inside).astype(np.int32) * k + j.take(inside).astype(np.int32)
+    z = xyz[:, 2].take(inside).astype(np.float64)
+    lowest: Array = np.full(k * k, np.inf)
+    second = lowest.copy()
+    np.minimum.at(lowest, cell, z)
+    above = np.flatnonzero(z > lowest.take(cell))
+    np.minimum.at(second, cell.take(above), z.take(above))
+    # Single false returns are left out: mirror reflections are decimeters below the road; roughness is centimeters.
+    lowest = np.where(np.isfinite(second) & (second > lowest + 0.3), second, lowest).reshape(k, k)
+    all_terms, all_ranges_m = _terms(k)
     filled = np.isfinite(lowest)
     surface = np.full((k, k), z_hint)
     if filled.sum() >= 12:
-        surface = terms @ _fit_surface(terms[filled], lowest[filled], range_m[filled], z_hint)
+        terms, z, range_m = all_terms[filled], lowest[filled], all_ranges_m[filled]
+        nearness, tolerance = 1.0 / (1.0 + (range_m / 25.0) ** 2), 0.1 + 0.02 * range_m
+        weight = nearness * (np.abs(z - z_hint) < 1.0 + 0.15 * range_m)
+        for _ in range(ROUNDS):
+            # The anchor has a tenth of the weight of all cells, and only a constant term.
+            anchor, weighted = 0.1 * max(float(weight.sum()), 1.0), terms * weight[:, None]
+            normal, right = weighted.T @ terms + np.diag([0.0, 1.0, 1.0, 3e2, 3e2, 3e2]), weighted.T @ z
+            normal[0, 0] += anchor
+            right[0] += anchor * z_hint
+            solution = np.linalg.solve(normal, right)
+            above_m = z - terms @ solution
+            # Cells above it lose weight twice as fast as those below.
+            scaled = np.where(above_m > 0, above_m, above_m / 2) / tolerance
+            weight = nearness / (1 + scaled**2) ** 2
+        surface = all_terms @ solution
     lowest = np.where(filled, lowest, 0.0)
     residual = np.where(filled, lowest - surface, 0.0)
     for widened in (2.0, 1.0):
@@ -96,44 +118,6 @@ def _blur(grid: Array) -> Array:
     single = grid.astype(np.float32)
     near, far = (cv2.GaussianBlur(single, (8 * s + 1, 8 * s + 1), s, borderType=cv2.BORDER_CONSTANT) for s in (2, 8))
     return np.asarray(near + np.float32(1e-3) * far, dtype=np.float64)
-
-
-def _lowest_points(xyz: NDArray[np.floating[Any]], center: Array, k: int) -> Array:
-    """Find the lowest height in every cell (K, K), without single false returns below the road; inf if empty."""
-    kind = xyz.dtype.type
-    i, j = ((xyz[:, axis] - kind(center[axis])) * kind(1 / CELL_M) + kind(k / 2) for axis in range(2))
-    inside = np.flatnonzero((i >= 0) & (i < k) & (j >= 0) & (j < k))
-    flat = i.take(inside).astype(np.int32) * k + j.take(inside).astype(np.int32)
-    z = xyz[:, 2].take(inside).astype(np.float64)
-    lowest = np.full(k * k, np.inf)
-    np.minimum.at(lowest, flat, z)
-    second = np.full(k * k, np.inf)
-    above = np.flatnonzero(z > lowest.take(flat))
-    np.minimum.at(second, flat.take(above), z.take(above))
-    # Mirror reflections are decimeters below the road; roughness is centimeters.
-    reflected = np.isfinite(second) & (second > lowest + 0.3)
-    return np.where(reflected, second, lowest).reshape(k, k)
-
-
-def _fit_surface(terms: Array, z: Array, range_m: Array, z_hint: float) -> Array:
-    """Fit the coefficients (6,) of a quadratic surface robustly; cells above it lose weight twice as fast as those below."""
-    nearness = 1.0 / (1.0 + (range_m / 25.0) ** 2)
-    tolerance = 0.1 + 0.02 * range_m
-    weight = nearness * (np.abs(z - z_hint) < 1.0 + 0.15 * range_m)
-    prior = np.diag([0.0, 1.0, 1.0, 3e2, 3e2, 3e2])
-    solution = np.array([z_hint, 0, 0, 0, 0, 0.0])
-    for _ in range(ROUNDS):
-        # The anchor has a tenth of the weight of all cells, and only a constant term.
-        anchor = 0.1 * max(float(weight.sum()), 1.0)
-        weighted = terms * weight[:, None]
-        normal, right = weighted.T @ terms + prior, weighted.T @ z
-        normal[0, 0] += anchor
-        right[0] += anchor * z_hint
-        solution = np.linalg.solve(normal, right)
-        residual = z - terms @ solution
-        scaled = np.where(residual > 0, residual, residual / 2) / tolerance
-        weight = nearness / (1 + scaled**2) ** 2
-    return solution
 
 
 # Width of the window next to an end in which ranges are compared, in m at the end's range, and its limits as an angle: a
@@ -185,8 +169,6 @@ class AzimuthIndex:
 
         `members`: R arrays (n,): rows of each cluster's points in the cloud, at least one.
 
-        Notes
-        -----
         Next to an end of the object, rays at its height reach what lies behind it. If they stop at something nearer, if
         they hit the same surface, or if there are no rays at all, the object may extend beyond what was seen.
         """
@@ -207,24 +189,32 @@ class AzimuthIndex:
         cut = np.minimum(np.round(TRIM * (count - 1)).astype(np.intp), MAX_TRIMMED_POINTS)
         end = np.stack([start + cut, start + count - 1 - cut], axis=1)
         edge = azimuth[end]
-        range_m = _medians_near(self.range_m[row], group, azimuth, edge)
+        # Upper medians of the ranges near both ends. Azimuths of different clusters are moved so far apart that those of all
+        # clusters are sorted, windows across their ends included.
+        own = 3 * STEPS_PER_TURN
+        placed, middle = group * own + azimuth, (own * np.arange(len(edge))[:, None] + edge).ravel()
+        low, high = np.searchsorted(placed, [middle - MIN_WINDOW_STEPS + 1, middle + MIN_WINDOW_STEPS])
+        first, window = np.cumsum(high - low) - (high - low), np.repeat(np.arange(len(low)), high - low)
+        near = self.range_m[row][np.arange(len(window)) + np.repeat(low - first, high - low)]
+        range_m = near[np.lexsort((near, window))][first + (high - low) // 2].reshape(-1, 2)
         width = np.clip(WINDOW_M / np.maximum(range_m, 1e-3), MIN_WINDOW_RAD, MAX_WINDOW_RAD) / STEP_RAD
         sign = np.array([-1, 1])
         beside = np.sort([edge + 2 * sign, edge + sign * np.round(width).astype(np.int64)], axis=0)
         window, other = self._between(*beside.reshape(2, -1))
         # Rays are at the height of a cluster between its slopes.
-        slope, own = self.slope[other], self.slope[row]
-        low = np.minimum.reduceat(own, start) - np.float32(SLOPE_MARGIN)
-        high = np.maximum.reduceat(own, start) + np.float32(SLOPE_MARGIN)
-        found = np.flatnonzero((slope >= np.repeat(low, 2)[window]) & (slope <= np.repeat(high, 2)[window]))
+        slope, slopes = self.slope[other], self.slope[row]
+        least = np.minimum.reduceat(slopes, start) - np.float32(SLOPE_MARGIN)
+        most = np.maximum.reduceat(slopes, start) + np.float32(SLOPE_MARGIN)
+        found = np.flatnonzero((slope >= np.repeat(least, 2)[window]) & (slope <= np.repeat(most, 2)[window]))
         window, other = window[found], other[found]
         place = np.minimum(np.searchsorted(ordered, window // 2 * size + other), len(ordered) - 1)
         foreign = ordered[place] != window // 2 * size + other
         window, other = window[foreign], other[foreign]
         # Some points of each cluster show its faces as well as all do.
         some = np.flatnonzero((np.arange(len(row)) - start[group]) % -(-count // MAX_FACE_POINTS)[group] == 0)
-        corner, xy = (self.range_m[of][..., None] * _direction(self.azimuth[of]) for of in (row[end], row[some]))
-        goes_on_m = _extended_face_ranges(corner, group[some], xy, window, _direction(self.azimuth[other]))
+        unit = _directions()
+        corner, xy = (self.range_m[of][..., None] * unit[self.azimuth[of]] for of in (row[end], row[some]))
+        goes_on_m = _extended_face_ranges(corner, group[some], xy, window, unit[self.azimuth[other]])
         beyond = self.range_m[other] > np.maximum(goes_on_m, range_m.ravel()[window]) + MIN_DEPTH_STEP_M
         rays = np.bincount(window[beyond], minlength=end.size)
         blocked = np.bincount(window[~beyond & self.obstacle[other]], minlength=end.size)
@@ -242,20 +232,6 @@ class AzimuthIndex:
         return np.repeat(np.arange(len(count)) // 2, count), np.repeat(start, count) + ordinal
 
 
-def _medians_near(
-    range_m: NDArray[np.float32], group: NDArray[np.intp], azimuth: NDArray[np.int64], edge: NDArray[np.int64]
-) -> NDArray[np.float32]:
-    """Return the upper medians (R, 2) of the ranges (K,) of clusters, in the order of their azimuths, around azimuths (R, 2)."""
-    # Azimuths of different clusters are so far apart that those of all clusters are sorted, windows across their ends included.
-    own = 3 * STEPS_PER_TURN
-    ordered, middle = group * own + azimuth, (own * np.arange(len(edge))[:, None] + edge).ravel()
-    low, high = np.searchsorted(ordered, [middle - MIN_WINDOW_STEPS + 1, middle + MIN_WINDOW_STEPS])
-    count = high - low
-    first, window = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
-    near = range_m[np.arange(len(window)) + np.repeat(low - first, count)]
-    return np.asarray(near[np.lexsort((near, window))][first + count // 2]).reshape(-1, 2)
-
-
 def _extended_face_ranges(
     corner: NDArray[np.float64],
     group: NDArray[np.intp],
@@ -268,13 +244,9 @@ def _extended_face_ranges(
     `corner`: (R, 2, 2): the points at the right and the left end of each cluster. `group`, `xy`: (K,), (K, 2): points of
     the clusters, and which of them they belong to. `window`: (n,): twice the cluster, plus one at its left end.
     """
-    near, points = [], []
-    for side in range(2):
-        x, y = (xy - corner[group, side]).T
-        point = np.flatnonzero(x * x + y * y < FACE_M**2)
-        near.append(2 * group[point] + side)
-        points.append(xy[point])
-    of, (x, y) = np.concatenate(near), np.concatenate(points).T
+    near = [np.flatnonzero(((xy - corner[group, side]) ** 2).sum(axis=1) < FACE_M**2) for side in range(2)]
+    of = np.concatenate([2 * group[point] + side for side, point in enumerate(near)])
+    x, y = xy[np.concatenate(near)].T
     count = np.maximum(np.bincount(of, minlength=2 * len(corner)), 1)
 
     def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -294,13 +266,8 @@ def _extended_face_ranges(
     return np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
 
 
-def _direction(azimuth: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """Return unit vectors (n, 2) of azimuths (n,) in steps."""
-    return np.take(_unit_vectors(), azimuth, axis=0)
-
-
 @lru_cache(maxsize=1)
-def _unit_vectors() -> NDArray[np.float64]:
+def _directions() -> NDArray[np.float64]:
     """Return unit vectors (`STEPS_PER_TURN` + 1, 2) of all azimuths: a look-up takes a tenth of a sine and a cosine."""
     angle = np.arange(STEPS_PER_TURN + 1) * STEP_RAD
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -506,32 +473,23 @@ MAX_APART_M = 5.0
 def assemble_views(log: Log, sweeps: Mapping[str, Sweep], **options: Any) -> Cloud | None:
     """Merge the simultaneous sweeps of all LiDARs into one cloud, by parts where both ends have LiDARs.
 
-    The options are those of `assemble_cloud`, which makes the cloud of a log with one end.
+    A part holds the vehicle's LiDARs, or those of one place at the road. The options are those of `assemble_cloud`, which
+    makes the cloud of a log with one end.
 
-    Notes
-    -----
     The ground is estimated from each viewpoint's own points: between two of them there may be none.
     """
-    groups = ({name: sweeps[name] for name in names} for names in group_by_viewpoint(log, sweeps))
-    parts = (assemble_cloud(log, group, **options) for group in groups)
+    groups: list[list[str]] = [list(sweeps)]
+    if {end_of(lidar) for lidar in log.lidars.values()} >= set(ENDS):
+        groups = [[name for name in sweeps if end_of(log.lidars[name]) == VEHICLE]]
+        for name in (name for name in sweeps if name not in groups[0]):
+            place = log.lidars[name].mount_T_lidar[:2, 3]
+            near = [g for g in groups[1:] if np.hypot(*(log.lidars[g[0]].mount_T_lidar[:2, 3] - place)) <= MAX_APART_M]
+            if near:
+                near[0].append(name)
+            else:
+                groups.append([name])
+    parts = (assemble_cloud(log, {name: sweeps[name] for name in group}, **options) for group in groups)
     return join_parts([part for part in parts if part is not None])
-
-
-def group_by_viewpoint(log: Log, names: Mapping[str, Sweep] | Sequence[str]) -> list[list[str]]:
-    """Group LiDARs by where they look from: the vehicle's together, those of the road by their place; one group without both ends."""
-    if len({end_of(lidar) for lidar in log.lidars.values()}) < len(ENDS):
-        return [list(names)]
-    groups: list[list[str]] = [[name for name in names if end_of(log.lidars[name]) == ENDS[0]]]
-    for name in names:
-        if end_of(log.lidars[name]) == ENDS[0]:
-            continue
-        place = log.lidars[name].mount_T_lidar[:2, 3]
-        near = [g for g in groups[1:] if np.hypot(*(log.lidars[g[0]].mount_T_lidar[:2, 3] - place)) <= MAX_APART_M]
-        if near:
-            near[0].append(name)
-        else:
-            groups.append([name])
-    return [group for group in groups if group]
 
 
 def join_parts(parts: Sequence[Cloud]) -> Cloud | None:
@@ -589,8 +547,12 @@ def assemble_cloud(
         t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
         position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
         parts.append((np.stack([column.take(near) for column in local]), t_s.take(near), position))
-        place = _follow_sensor(log, name, stamp, t_s, origin)
-        sensors.append(CloudSensor(len(near), *place, end_of(log.lidars[name])))
+        # The line through its places at the first and the last time; without known poses it stands at the origin.
+        ends_s = np.array([t_s.min(), t_s.max()], dtype=np.float64)
+        poses, known = log.map_T_sensor(name, stamp + np.round(ends_s * NS_PER_S).astype(np.int64))
+        first, last = poses[:, :3, 3] - origin if known.all() else np.zeros((2, 3))
+        velocity = (last - first) / (ends_s[1] - ends_s[0]) if ends_s[1] > ends_s[0] else np.zeros(3)
+        sensors.append(CloudSensor(len(near), first - ends_s[0] * velocity, velocity, end_of(log.lidars[name])))
     if not parts:
         return None
     columns, t_s = np.concatenate([p[0] for p in parts], axis=1), np.concatenate([p[1] for p in parts])
@@ -600,21 +562,6 @@ def assemble_cloud(
     sensor = np.mean([p[2] for p in parts if p[0].size] or [p[2] for p in parts], axis=0).astype(np.float32)
     ground, xyz = np.abs(height) <= ON_GROUND_M, np.ascontiguousarray(columns.T)
     return Cloud(stamp, np.asarray(origin, float), xyz, t_s, sensor, ground, height, tuple(sensors))
-
-
-def _follow_sensor(log: Log, name: str, stamp_ns: int, t_s: NDArray[np.float32], origin: Array) -> tuple[Array, Array]:
-    """Follow a LiDAR through times (N,) relative to a stamp: position (3,) at the stamp relative to `origin`, velocity (3,).
-
-    The line goes through its places at the first and the last time; without known poses it stands at the origin.
-    """
-    first_s, last_s = float(t_s.min()), float(t_s.max())
-    t_ns = stamp_ns + np.round(np.array([first_s, last_s]) * NS_PER_S).astype(np.int64)
-    map_T_lidar, known = log.map_T_sensor(name, t_ns)
-    if not known.all():
-        return np.zeros(3), np.zeros(3)
-    first, last = map_T_lidar[:, :3, 3] - origin
-    velocity = (last - first) / (last_s - first_s) if last_s > first_s else np.zeros(3)
-    return first - first_s * velocity, velocity
 
 
 OBSTACLE_REACH_M = 70.0
@@ -639,8 +586,6 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
 def first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.intp]:
     """Return the indices of the first point of every voxel among points (3, N), in the order of the points.
 
-    Notes
-    -----
     Points are written into a table from the last to the first, each in the place of its voxel, which so holds its first. Voxels
     that share a place with another's are looked up again in other places.
     """
@@ -671,13 +616,20 @@ MAX_REACH_M = 70.0
 def sample_rays(cloud: Cloud) -> Rays:
     """Take a ray of every cell of directions and every sensor of those that end within reach and below what hangs over the road.
 
-    Notes
-    -----
     Cells of directions, unlike voxels, keep the same share of the rays that hit something near and of those that pass it.
     Directions are those from the middle of the sensors of a viewpoint, which does for a sample.
     """
     if cloud.parts:
-        return _join([sample_rays(part) for part in cloud.parts], cloud)
+        parts = [sample_rays(part) for part in cloud.parts]
+        before = np.cumsum([0, *(len(part.position) for part in parts)])
+        late_s = [(part.stamp_ns - cloud.stamp_ns) / NS_PER_S for part in cloud.parts]
+        return Rays(
+            np.concatenate([part.end for part in parts]),
+            np.concatenate([part.t_s + np.float32(late) for part, late in zip(parts, late_s)]),
+            np.concatenate([part.sensor + np.uint8(first) for part, first in zip(parts, before)]),
+            np.concatenate([part.position - np.float32(late) * part.velocity_mps for part, late in zip(parts, late_s)]),
+            np.concatenate([part.velocity_mps for part in parts]),
+        )
     azimuth, range_m, slope = cloud.azimuth_index.unsorted
     point = np.flatnonzero((range_m < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
     # The slope of a ray differs from its angle where it is steep: near the sensor, where rays are many.
@@ -695,19 +647,6 @@ def sample_rays(cloud: Cloud) -> Rays:
         _sensor_of(cloud, kept).astype(np.uint8),
         np.array([s.position for s in sensors], dtype=np.float32),
         np.array([s.velocity_mps for s in sensors], dtype=np.float32),
-    )
-
-
-def _join(parts: Sequence[Rays], cloud: Cloud) -> Rays:
-    """Join the rays of the parts of a cloud; their sensors are numbered on."""
-    before = np.cumsum([0, *(len(part.position) for part in parts)])
-    late_s = [(part.stamp_ns - cloud.stamp_ns) / NS_PER_S for part in cloud.parts]
-    return Rays(
-        np.concatenate([part.end for part in parts]),
-        np.concatenate([part.t_s + np.float32(late) for part, late in zip(parts, late_s)]),
-        np.concatenate([part.sensor + np.uint8(first) for part, first in zip(parts, before)]),
-        np.concatenate([part.position - np.float32(late) * part.velocity_mps for part, late in zip(parts, late_s)]),
-        np.concatenate([part.velocity_mps for part in parts]),
     )
 
 

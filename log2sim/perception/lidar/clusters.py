@@ -5,9 +5,9 @@ A sensor with 32 layers has 2 to 6 points on a person at 20 to 30 m.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,21 +35,11 @@ SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS = 0.2, 0.3, 1.5
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5
 
 
-def clusters_of(xy: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.intp]:
-    """Label (N,) the connected clusters of points (N, 2): points in adjacent grid cells, diagonals included, are connected."""
-    return _cluster(xy, cell_m)[0]
+def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], Array, NDArray[Any]]:
+    """Label (N,) the connected clusters of points (N, 2): points in adjacent grid cells, diagonals included, are connected.
 
-
-class _Grid(NamedTuple):
-    """Cells in which points were labeled."""
-
-    corner: Array  # (2,), m: lower one
-    cell_m: float
-    owner: NDArray[Any]  # labels plus one, 0 where empty
-
-
-def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.intp], _Grid]:
-    """Label points (N, 2) by the connected cells of a grid that they are in."""
+    Returned with the lower corner (2,) of the grid, and the labels of its cells plus one, 0 where empty.
+    """
     import cv2
 
     x, y = xy.T
@@ -59,8 +49,8 @@ def _cluster(xy: NDArray[np.floating[Any]], cell_m: float) -> tuple[NDArray[np.i
     grid = np.zeros((i.max() + 2, j.max() + 2), dtype=np.uint8)
     grid[i, j] = 1
     _, labels = cv2.connectedComponents(grid, connectivity=8, ltype=cv2.CV_16U)
-    grid = np.asarray(labels)
-    return grid[i, j].astype(np.intp) - 1, _Grid(corner, cell_m, grid)
+    owner = np.asarray(labels)
+    return owner[i, j].astype(np.intp) - 1, corner, owner
 
 
 def candidate_clusters(
@@ -74,69 +64,53 @@ def candidate_clusters(
     Returns list of (indices (n,), score): the score, in (0, 1], is the IoU of the cluster's image rectangle with the box,
     times the square root of the ratio of the nearest cluster's range to its own.
 
-    Notes
-    -----
     The rectangle of the object's own cluster fills the box; an occluder covers a part of it, and background is visible
     only around the object. Of clusters that fill the box equally the nearer one is the object. A cluster that extends
     beyond the box, such as a wall or a hedge, is left out.
     """
+    import cv2
+
     u, v = uv.T
     inside = np.flatnonzero((u >= box_px[0]) & (u <= box_px[2]) & (v >= box_px[1]) & (v <= box_px[3]))
     if len(inside) < MIN_CLUSTER_POINTS:
         return []
-    cell_m = CELL_M[GROUP_OF[category]]
-    labels, grid = _cluster(xyz[inside, :2], cell_m)
-    is_structure = _extends_beyond_box(xyz, uv, box_px, np.bincount(labels), grid)
+    cell_m, longest_m = CELL_M[GROUP_OF[category]], MAX_SIZE_M[category][0]
+    labels, corner, owner = _cluster(xyz[inside, :2], cell_m)
     # NumPy sorts 16-bit integers by radix.
     order, count = np.argsort(labels.astype(np.uint16), kind="stable"), np.bincount(labels)
-    first = np.cumsum(count) - count
-    enough = (count >= MIN_CLUSTER_POINTS) & ~is_structure
+    # Clusters that extend into the margin beyond two of the left, right and upper side of the box are structures.
+    outside = np.flatnonzero(((u < box_px[0]) | (u > box_px[2]) | (v < box_px[1])) & (v <= box_px[3]))
+    i, j = ((xyz[outside, axis] - corner[axis]) / cell_m for axis in (0, 1))
+    on_grid = (i >= 0) & (i < owner.shape[0]) & (j >= 0) & (j < owner.shape[1])
+    outside, i, j = outside[on_grid], i[on_grid].astype(np.intp), j[on_grid].astype(np.intp)
+    next_to = cv2.dilate(owner, np.ones((3, 3)))[i, j].astype(np.intp) - 1
+    sides, u, v = np.zeros(len(count), dtype=np.int64), u[outside], v[outside]
+    within = (u >= box_px[0]) & (u <= box_px[2])
+    for rows in (u < box_px[0], u > box_px[2], within & (v < box_px[1])):
+        beyond = np.bincount(next_to[rows & (next_to >= 0)], minlength=len(count))
+        sides += beyond >= np.maximum(MIN_DENSITY_RATIO * MARGIN * count, 3)
+    enough = (count >= MIN_CLUSTER_POINTS) & (sides < 2)
     if not enough.any():
         return []
-    span = np.concatenate(_group_extents(uv[inside[order]], first), axis=1)
+    first = np.cumsum(count) - count
+    span = np.concatenate([end.reduceat(uv[inside[order]], first) for end in (np.minimum, np.maximum)], axis=1)
+    low, high = (end.reduceat(xyz[inside[order], :2], first) for end in (np.minimum, np.maximum))
     middle_m = np.bincount(labels, range_m[inside]) / np.maximum(count, 1)
     nearest_m = middle_m[enough].min()
-    low, high = _group_extents(xyz[inside[order], :2], first)
     members = {int(g): inside[order[first[g] : first[g] + count[g]]] for g in np.flatnonzero(enough)}
-    too_long = np.hypot(*(high - low).T) > MAX_SIZE_M[category][0]
+    too_long = np.hypot(*(high - low).T) > longest_m
     for g in np.flatnonzero(enough & (too_long | (count > MAX_SCORED_POINTS))).tolist():
-        members[g] = cropped = crop_to_length(xyz, members[g], range_m, MAX_SIZE_M[category][0])
+        cropped = members[g]
+        if too_long[g]:  # to half the length around the median of its nearest 40 %
+            near = cropped[range_m[cropped] <= np.quantile(range_m[cropped], 0.4)]
+            kept = cropped[np.hypot(*(xyz[cropped, :2] - np.median(xyz[near, :2], axis=0)).T) <= longest_m / 2]
+            cropped = members[g] = kept if len(kept) >= MIN_CLUSTER_POINTS else near
         sample = uv[subsample(cropped, MAX_SCORED_POINTS)]
         span[g] = np.concatenate([sample.min(axis=0), sample.max(axis=0)])
         middle_m[g] = range_m[cropped].mean()
     fill = box_iou(span, box_px)[:, 0]
     score = fill * np.sqrt(nearest_m / np.maximum(middle_m, 1e-3))
     return [(points, float(score[g])) for g, points in members.items() if fill[g] >= MIN_IMAGE_IOU]
-
-
-def _group_extents(values: NDArray[Any], first: Index) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the smallest and largest values (G, 2), (G, 2) of consecutive groups of rows (N, 2) that begin at `first` (G,)."""
-    return np.minimum.reduceat(values, first), np.maximum.reduceat(values, first)
-
-
-def _extends_beyond_box(
-    xyz: NDArray[np.float32],
-    uv: NDArray[np.floating[Any]],
-    box_px: Array,
-    count: NDArray[np.intp],
-    grid: _Grid,
-) -> NDArray[np.bool_]:
-    """Mark the clusters of so many points (L,) that extend into the margin beyond two of the left, right and upper side of the box."""
-    import cv2
-
-    u, v = uv.T
-    outside = np.flatnonzero(((u < box_px[0]) | (u > box_px[2]) | (v < box_px[1])) & (v <= box_px[3]))
-    i, j = ((xyz[outside, axis] - grid.corner[axis]) / grid.cell_m for axis in (0, 1))
-    on_grid = (i >= 0) & (i < grid.owner.shape[0]) & (j >= 0) & (j < grid.owner.shape[1])
-    outside, i, j = outside[on_grid], i[on_grid].astype(np.intp), j[on_grid].astype(np.intp)
-    owner = cv2.dilate(grid.owner, np.ones((3, 3)))[i, j].astype(np.intp) - 1
-    sides = np.zeros(len(count), dtype=np.int64)
-    u, v = u[outside], v[outside]
-    within = (u >= box_px[0]) & (u <= box_px[2])
-    for rows in (u < box_px[0], u > box_px[2], within & (v < box_px[1])):
-        beyond = np.bincount(owner[rows & (owner >= 0)], minlength=len(count))
-        sides += beyond >= np.maximum(MIN_DENSITY_RATIO * MARGIN * count, 3)
-    return sides >= 2
 
 
 def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: Array, count: int) -> list[Index]:
@@ -147,8 +121,6 @@ def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: 
 
     Returns K arrays (n,) of indices, empty for a box without a cluster.
 
-    Notes
-    -----
     Greedy: the box whose best candidate has the most points is served first, and its points are taken from the candidates
     of other boxes, except of duplicate boxes. Of an occluded object only the points around its occluder remain.
     """
@@ -169,17 +141,6 @@ def assign_clusters(options: Sequence[Sequence[tuple[Index, float]]], boxes_px: 
     return chosen
 
 
-def crop_to_length(xyz: NDArray[np.float32], group: Index, range_m: Array, max_length_m: float) -> Index:
-    """Crop a cluster that exceeds `max_length_m` to the points within half that length of the median of its nearest 40 %."""
-    xy = xyz[group, :2]
-    if np.hypot(*(xy.max(axis=0) - xy.min(axis=0))) <= max_length_m:
-        return group
-    near = group[range_m[group] <= np.quantile(range_m[group], 0.4)]
-    center = np.median(xyz[near, :2], axis=0)
-    kept = group[np.hypot(*(xyz[group, :2] - center).T) <= max_length_m / 2]
-    return kept if len(kept) >= MIN_CLUSTER_POINTS else near
-
-
 def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category: str) -> Index:
     """Grow a seed cluster (n, 2) to all connected points (N, 2): their indices, for an object that the image border cuts.
 
@@ -191,7 +152,7 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     near = near[np.abs(xy_all[near, 1] - center[1]) <= reach]
     if len(near) == 0:
         return np.zeros(0, dtype=np.intp)
-    labels = clusters_of(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])
+    labels, _, _ = _cluster(np.vstack([xy_all[near], seed]), CELL_M[GROUP_OF[category]])
     wanted = np.bincount(labels[len(near) :]).argmax()
     kept = near[labels[: len(near)] == wanted]
     return np.asarray(kept[np.hypot(*(xy_all[kept] - center).T) <= reach])
@@ -205,8 +166,6 @@ def continued_sides(
     `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it. `yaw_rad`: along one of the
     sides; fitted to the cluster where it is not known. `max_gap_m`: a wider gap ends a side also where rays are farther apart.
 
-    Notes
-    -----
     The flank of a long vehicle is seen at so flat an angle that successive rays meet it farther apart than the cells of
     the clusters are: at 15 m along a flank 2.5 m aside, 0.4 degrees are 0.6 m.
     """
@@ -275,96 +234,50 @@ def place_few_points(seen: Shown, columns: dict[str, Any], rows: Index, boxes_px
     `columns`: of `Measurements`, written to. `boxes_px`: (N, 4): all image boxes of the frame, which hide what is behind
     them.
 
-    Notes
-    -----
     A body is where two or more points inside its box have a depth at which the box is as high as a person. Points that go
     on at that depth on both sides of the box or above it belong to a wall, a fence or a pole.
     """
     small = np.array([GROUP_OF[c] in GROUPS_OF_FEW_POINTS for c in columns["category"][rows].tolist()], dtype=bool)
     wanted = rows[small & (columns["source"][rows] == "") & ~columns["truncated"][rows]]
     extended = rows[np.isfinite(columns["low_m"][rows, 0])]
-    visible, index = seen.visible, seen.points[seen.visible.index]
-
-    def is_free(chosen: Index) -> NDArray[np.bool_]:
-        return ~_owned(seen.cloud.xyz[index[chosen], :2] + seen.cloud.origin[:2], columns, extended)
-
+    u, v, depth, index = seen.visible.u, seen.visible.v, seen.visible.depth, seen.points[seen.visible.index]
     for k in wanted.tolist():
         box_px, tall_m = columns["box_px"][k], TYPICAL_SIZE_M[str(columns["category"][k])][2]
-        usual_m = float(seen.view.camera.K[1, 1] * tall_m / (box_px[3] - box_px[1]))
-        chosen = _body_points(visible, box_px, boxes_px, usual_m, is_free)
-        if len(chosen):
-            _write(columns, k, seen, chosen)
-
-
-def _body_points(
-    visible: ProjectedPoints,
-    box_px: Array,
-    boxes_px: Array,
-    usual_m: float,
-    is_free: Callable[[NDArray[np.intp]], NDArray[np.bool_]],
-) -> NDArray[np.intp]:
-    """Choose the points of the body in a box (4,) among the n points of an image; none where nothing fits.
-
-    `boxes_px`: (N, 4): all boxes of the frame. `usual_m`: depth at which a body of typical height fills the box. `is_free`: marks
-    those of some of the points that are no other object's.
-    """
-    u0, v0, u1, v1 = box_px.tolist()
-    u, v, depth = visible.u, visible.v, visible.depth
-    inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * (u1 - u0)
-    inside = np.flatnonzero(inner & (v >= v0) & (v <= v1))
-    inside = inside[np.abs(_off_height(depth[inside], usual_m)) <= MAX_HEIGHT_SIGMAS]
-    inside = inside[is_free(inside)] if len(inside) >= MIN_POINTS else inside
-    if len(inside) < MIN_POINTS:
-        return inside[:0]
-    inside = inside[np.argsort(depth[inside], kind="stable")]
-    bodies = np.split(inside, np.flatnonzero(np.diff(depth[inside]) > MAX_DEPTH_GAP_M) + 1)
-    around = _around(visible, box_px, boxes_px)
-    bodies = [b for b in bodies if len(b) >= MIN_POINTS and not _goes_on(visible, b, around, box_px)]
-
-    def likelihood(body: NDArray[np.intp]) -> float:
-        off = _off_height(depth[body], usual_m)
-        return float(np.log(len(body)) - off.mean() ** 2 / 2)
-
-    return max(bodies, key=likelihood, default=inside[:0])
-
-
-def _off_height(depth_m: NDArray[np.float32], usual_m: float) -> NDArray[np.float32]:
-    """Return by how many sigma the heights of people at depths (n,) are off, whose usual height fills the box at `usual_m`."""
-    return np.asarray((depth_m / np.float32(usual_m) - 1) / HEIGHT_SIGMA_SHARE)
-
-
-def _owned(xy: Array, columns: dict[str, Any], rows: Index) -> NDArray[np.bool_]:
-    """Mark the points (n, 2) of the map within the extents of the points of any of the rows."""
-    owned = np.zeros(len(xy), dtype=bool)
-    for j in rows:
-        local = rotate(xy - columns["sensor_m"][j, :2], -float(columns["yaw_rad"][j]))
-        low, high = columns["low_m"][j] - OWNED_MARGIN_M, columns["high_m"][j] + OWNED_MARGIN_M
-        owned |= ((local >= low) & (local <= high)).all(axis=1)
-    return owned
-
-
-def _around(visible: ProjectedPoints, box_px: Array, boxes_px: Array) -> NDArray[np.intp]:
-    """Find the points left, right and above a box that no other box shows but one as wide."""
-    u0, v0, u1, v1 = box_px.tolist()
-    beside, above = BESIDE_SHARE * (u1 - u0), ABOVE_SHARE * (v1 - v0)
-    u, v = visible.u, visible.v
-    near = np.flatnonzero((u >= u0 - beside) & (u <= u1 + beside) & (v >= v0 - above) & (v <= v1))
-    u, v = u[near], v[near]
-    found = (u < u0) | (u > u1) | (v < v0)
-    for a0, b0, a1, b1 in boxes_px.tolist():
-        if not (a0 <= u0 and a1 >= u1):
-            found &= ~((u >= a0) & (u <= a1) & (v >= b0) & (v <= b1))
-    return np.asarray(near[found])
-
-
-def _goes_on(visible: ProjectedPoints, body: NDArray[np.intp], around: NDArray[np.intp], box_px: Array) -> bool:
-    """Return whether what the points of a body belong to goes on at both sides of its box, or above it."""
-    depth = visible.depth[body]
-    low, high = depth.min() - MAX_DEPTH_GAP_M, depth.max() + MAX_DEPTH_GAP_M
-    same = around[(visible.depth[around] >= low) & (visible.depth[around] <= high)]
-    u, v = visible.u[same], visible.v[same]
-    within = (u >= box_px[0]) & (u <= box_px[2])
-    return bool(((u < box_px[0]).any() and (u > box_px[2]).any()) or (within & (v < box_px[1])).any())
+        u0, v0, u1, v1 = box_px.tolist()
+        # By how many sigma the heights of people at the depths are off, whose usual height fills the box.
+        usual_m = np.float32(seen.view.camera.K[1, 1] * tall_m / (box_px[3] - box_px[1]))
+        off = (depth / usual_m - 1) / HEIGHT_SIGMA_SHARE
+        inner = np.abs(u - (u0 + u1) / 2) <= (0.5 - SIDE_SHARE) * (u1 - u0)
+        inside = np.flatnonzero(inner & (v >= v0) & (v <= v1) & (np.abs(off) <= MAX_HEIGHT_SIGMAS))
+        if len(inside) >= MIN_POINTS:  # without those within the extents of another object
+            xy, free = seen.cloud.xyz[index[inside], :2] + seen.cloud.origin[:2], np.ones(len(inside), dtype=bool)
+            for j in extended:
+                local = rotate(xy - columns["sensor_m"][j, :2], -float(columns["yaw_rad"][j]))
+                low, high = columns["low_m"][j] - OWNED_MARGIN_M, columns["high_m"][j] + OWNED_MARGIN_M
+                free &= ~((local >= low) & (local <= high)).all(axis=1)
+            inside = inside[free]
+        if len(inside) < MIN_POINTS:
+            continue
+        # Points left, right and above that no other box shows but one as wide.
+        beside, above = BESIDE_SHARE * (u1 - u0), ABOVE_SHARE * (v1 - v0)
+        around = np.flatnonzero((u >= u0 - beside) & (u <= u1 + beside) & (v >= v0 - above) & (v <= v1))
+        around = around[(u[around] < u0) | (u[around] > u1) | (v[around] < v0)]
+        for a0, b0, a1, b1 in boxes_px.tolist():
+            if not (a0 <= u0 and a1 >= u1):
+                ua, va = u[around], v[around]
+                around = around[~((ua >= a0) & (ua <= a1) & (va >= b0) & (va <= b1))]
+        inside = inside[np.argsort(depth[inside], kind="stable")]
+        bodies = dict[float, Index]()  # by their likelihood; of equally likely ones the first
+        for body in np.split(inside, np.flatnonzero(np.diff(depth[inside]) > MAX_DEPTH_GAP_M) + 1):
+            if len(body) < MIN_POINTS:
+                continue
+            low_m, high_m = depth[body].min() - MAX_DEPTH_GAP_M, depth[body].max() + MAX_DEPTH_GAP_M
+            same = around[(depth[around] >= low_m) & (depth[around] <= high_m)]
+            left, right, over = u[same] < box_px[0], u[same] > box_px[2], v[same] < box_px[1]
+            if not (left.any() and right.any()) and not (over & ~left & ~right).any():
+                bodies.setdefault(float(np.log(len(body)) - off[body].mean() ** 2 / 2), body)
+        if bodies:
+            _write(columns, k, seen, bodies[max(bodies)])
 
 
 def _write(columns: dict[str, Any], k: int, seen: Shown, chosen: Index) -> None:

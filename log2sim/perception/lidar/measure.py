@@ -83,8 +83,24 @@ def measure(
     rows, own = images.take(alone), list[Index]()
     frame = np.concatenate([np.full(len(boxes), -1), frame[alone]])
     if sweep is not None and len(boxes):
-        own = _members_of_all(boxes, sweep)
-        rows = Measurements.join([_rows_of_boxes(boxes, sweep, own), rows])
+        # Where each box is at the times of the points of a viewpoint.
+        found_in = [_members(follow_box(boxes, part) if sweep.parts else boxes, part) for part in sweep.views]
+        first = np.cumsum([0, *(len(part.xyz) for part in sweep.views)])
+        own = [np.concatenate([start + of[k] for start, of in zip(first, found_in)]) for k in range(len(boxes))]
+        # With too few points a row keeps the position of its box. It is seen from the nearest viewpoint.
+        places = np.array([view.sensor + view.origin for view in sweep.views])
+        away = np.hypot(*(boxes.center_m[:, None, :2] - places[:, :2]).transpose(2, 0, 1))
+        seen_by = np.array([sweep.ends_of(index) for index in own], dtype=bool)
+        of_boxes = replace(
+            Measurements.from_boxes(boxes, sweep.sensor + sweep.origin),
+            yaw_rad=boxes.yaw_rad,
+            points=boxes.points,
+            bottom_m=boxes.center_m[:, 2] - boxes.size_m[:, 2] / 2,
+            top_m=boxes.center_m[:, 2] + boxes.size_m[:, 2] / 2,
+            sensor_m=places[away.argmin(axis=1)],
+            seen_by=seen_by if boxes.seen_by is None else seen_by | boxes.seen_by,
+        )
+        rows = Measurements.join([of_boxes, rows])
     columns: dict[str, Any] = vars(rows) | {"cluster": list(rows.cluster), "others": [None] * len(rows)}
     # The points of rows, by the cloud in which these were sought.
     found: dict[int, tuple[Cloud, dict[int, Index]]] = {}
@@ -109,8 +125,7 @@ def measure(
             if cloud is not None:
                 _measure_as_paper(view, cloud, columns, np.flatnonzero(frame == k))
     if searched:
-        _join_pairs(columns, images, pairs, [view for view, _, _ in frames])
-        _doubt_images(columns, len(boxes))
+        _weigh_pairs(columns, images, pairs, [view for view, _, _ in frames])
     others = tuple(columns["others"]) if any(view is not None for view in columns["others"]) else ()
     return Measurements(**columns | {"cluster": tuple(columns["cluster"]), "others": others})
 
@@ -124,31 +139,15 @@ def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
         *(np.concatenate([getattr(d, k) for _, d, _ in frames]) for k in ("box_px", "score", "category"))
     )
     views = [view for view, _, _ in frames]
-    rows = Measurements.unplaced(found, t_ns=0, camera="", sensor_m=np.zeros(3))
+    border = np.array([[view.camera.width_px, view.camera.height_px] for view in views])[frame] - BORDER_PX
     return replace(
-        rows,
+        Measurements.unplaced(found, t_ns=0, camera="", sensor_m=np.zeros(3)),
         t_ns=np.array([view.t_ns for view in views])[frame],
         camera=np.array([view.camera.name for view in views])[frame],
-        truncated=np.concatenate([_cut_by_border(view.camera, detections.box_px) for view, detections, _ in frames]),
+        truncated=np.asarray(((found.box_px[:, :2] < BORDER_PX) | (found.box_px[:, 2:] > border)).any(axis=1)),
         sensor_m=np.array([view.map_T_cam[:3, 3] for view in views])[frame],
         seen_by=np.concatenate([seen_from(end_of(view.camera), 1) for view in views])[frame],
     ), frame
-
-
-def _rows_of_boxes(boxes: Boxes3D, cloud: Cloud, members: Sequence[Index]) -> Measurements:
-    """Return a row for each box (M,) with points of a cloud; with too few of its own it keeps the position of its box."""
-    rows = Measurements.from_boxes(boxes, cloud.sensor + cloud.origin)
-    seen_by = np.array([cloud.ends_of(index) for index in members], dtype=bool)
-    half_m = boxes.size_m[:, 2] / 2
-    return replace(
-        rows,
-        yaw_rad=boxes.yaw_rad,
-        points=boxes.points,
-        bottom_m=boxes.center_m[:, 2] - half_m,
-        top_m=boxes.center_m[:, 2] + half_m,
-        sensor_m=_nearest_viewpoints(boxes, cloud) if cloud.parts else rows.sensor_m,
-        seen_by=seen_by if boxes.seen_by is None else seen_by | boxes.seen_by,
-    )
 
 
 # Boxes that overlap less are different objects.
@@ -202,7 +201,10 @@ def match_boxes(boxes: Boxes3D, images: Measurements, frame: Index, views: Seque
         box_px, of_frame = np.nan_to_num(projected.box_px), np.flatnonzero(frame == k)
         height_px = np.maximum(height_px, box_px[:, 3] - box_px[:, 1])
         iou[:, of_frame] = box_iou(box_px, images.box_px[of_frame])
-    iou[~_may_be_same(boxes.category, images.category)] = 0.0
+    # Categories of one group may be of one object, and those that are confused with each other.
+    a, b = (np.array([GROUP_OF[str(c)] for c in of.category], dtype="<U16") for of in (boxes, images))
+    allowed = [(a[:, None] == one) & (b == other) for one, other in RELATED_GROUPS]
+    iou[~np.logical_or.reduce([a[:, None] == b, *allowed])] = 0.0
     pairs = np.argwhere(iou >= MIN_IOU)
     pairs = pairs[np.argsort(-iou[*pairs.T], kind="stable")]
     free_images, free_boxes, kept = set(pairs[:, 1].tolist()), {(i, int(frame[j])) for i, j in pairs.tolist()}, []
@@ -215,20 +217,19 @@ def match_boxes(boxes: Boxes3D, images: Measurements, frame: Index, views: Seque
     return Pairs(box, image, iou[box, image], height_px)
 
 
-def _may_be_same(boxes: NDArray[np.str_], images: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Mark the pairs (M, N) whose categories are of one group or confused with each other."""
-    a, b = (np.array([GROUP_OF[str(c)] for c in category], dtype="<U16") for category in (boxes, images))
-    same = a[:, None] == b
-    for one, other in RELATED_GROUPS:
-        same |= (a[:, None] == one) & (b == other)
-    return np.asarray(same)
-
-
-def _join_pairs(columns: dict[str, Any], images: Measurements, pairs: Pairs, views: Sequence[View]) -> None:
-    """Write what image boxes say into the first rows, of 3D boxes; doubt those that an image should show and does not."""
-    score = columns["score"][: len(pairs.height_px)].copy()
+def _weigh_pairs(columns: dict[str, Any], images: Measurements, pairs: Pairs, views: Sequence[View]) -> None:
+    """Write what image boxes say into the first rows, of 3D boxes; doubt the rows that the other detector should have found."""
+    count = len(pairs.height_px)
+    score = columns["score"][:count].copy()
     tall = (pairs.height_px - NO_IMAGE_RECALL_PX) / (IMAGE_RECALL_PX - NO_IMAGE_RECALL_PX)
-    columns["score"][: len(score)] = if_missed(score, IMAGE_RECALL * np.clip(tall, 0, 1))
+    columns["score"][:count] = if_missed(score, IMAGE_RECALL * np.clip(tall, 0, 1))
+    # Of images alone, by how many points they have.
+    found = np.array([SWEEP_RECALL.get(GROUP_OF[str(c)], 0.0) for c in columns["category"][count:]], dtype=np.float64)
+    points = columns["points"][count:]
+    with np.errstate(invalid="ignore"):
+        covered = np.hypot(*(columns["center_m"] - columns["sensor_m"])[count:, :2].T) <= SWEEP_RANGE_M
+    recall = np.where(covered, found * points / (points + SWEEP_RECALL_POINTS), 0.0)
+    columns["score"][count:] = if_missed(columns["score"][count:], recall)
     view_of = {view.camera.name: view for view in views}
     # Of several images the best one is written last.
     for n in np.argsort(pairs.iou * images.score[pairs.image], kind="stable").tolist():
@@ -242,16 +243,6 @@ def _join_pairs(columns: dict[str, Any], images: Measurements, pairs: Pairs, vie
         depth_m = (places - view.map_T_cam[:3, 3]) @ view.map_T_cam[:3, 2]
         category = str(columns["category"][row])
         columns["height_px_m"][row] = _height_m(images.box_px[image], depth_m, category, view.camera)
-
-
-def _doubt_images(columns: dict[str, Any], first: int) -> None:
-    """Lower the scores of rows from the `first` on, of images alone, that the detector in sweeps should have found by their points."""
-    found = np.array([SWEEP_RECALL.get(GROUP_OF[str(c)], 0.0) for c in columns["category"][first:]], dtype=np.float64)
-    points = columns["points"][first:]
-    with np.errstate(invalid="ignore"):
-        covered = np.hypot(*(columns["center_m"] - columns["sensor_m"])[first:, :2].T) <= SWEEP_RANGE_M
-    recall = np.where(covered, found * points / (points + SWEEP_RECALL_POINTS), 0.0)
-    columns["score"][first:] = if_missed(columns["score"][first:], recall)
 
 
 def if_missed(score: Array, recall: Array) -> Array:
@@ -271,11 +262,6 @@ MIN_LONG_M = 10.0
 NEAR_END_QUANTILE = 0.05
 # Smallest extent in mode "paper", m.
 MIN_EXTENT_M = 0.1
-
-
-def _cut_by_border(camera: Camera, box_px: Array) -> NDArray[np.bool_]:
-    border = np.array([camera.width_px, camera.height_px]) - BORDER_PX
-    return np.asarray((box_px[:, :2] < BORDER_PX).any(axis=1) | (box_px[:, 2:] > border).any(axis=1))
 
 
 def _free_points(
@@ -373,53 +359,41 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
     kept = [i for i, views in enumerate(split) if len(views[0][1]) >= min(MIN_CLUSTER_POINTS, len(members[i]))]
     for view in cloud.views:
         own = [i for i in kept if split[i][0][0] is view]
-        if own:
-            _write_view(columns, np.array([rows[i] for i in own]), [split[i][0][1] for i in own], view)
+        if not own:
+            continue
+        of, parts = np.array([rows[i] for i in own]), [split[i][0][1] for i in own]
+        index, count = np.concatenate(parts), np.array([len(points) for points in parts])
+        edges = np.concatenate([[0], np.cumsum(count)])
+        xyz = view.xyz.take(index, axis=0).astype(np.float64)
+        xy, start, of_sensor = xyz[:, :2] - view.sensor[:2], edges[:-1], xyz - view.sensor
+        typical = np.array([TYPICAL_SIZE_M[str(category)] for category in columns["category"][of]])
+        yaw, low, high = fit_extents_of_clusters(xy, count, typical, columns["box_yaw_rad"][of])
+        columns["yaw_rad"][of], columns["low_m"][of], columns["high_m"][of] = yaw, low, high
+        heights = np.stack([xyz[:, 2], xyz[:, 2] - view.height[index]])
+        sort_clusters(heights, count)
+        columns["bottom_m"][of] = heights[1, start + count // 2] + view.origin[2]
+        columns["top_m"][of] = quantile_of_clusters(heights[:1], count, TOP_QUANTILE)[0] + view.origin[2]
+        t_s = view.t_s[index].astype(np.float64)
+        mean_ns = np.round(np.add.reduceat(t_s, start) / count * NS_PER_S).astype(np.int64)
+        columns["t_ns"][of] = view.stamp_ns + mean_ns
+        columns["sensor_m"][of] = view.sensor + view.origin
+        timed = np.column_stack([xyz + view.origin, t_s - np.repeat(mean_ns, count) / NS_PER_S])
+        columns["ends_visible"][of] = view.azimuth_index.ends_visible(parts)
+        shown = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count, MAX_KEPT_POINTS)
+        for row, points in zip(of.tolist(), np.split(timed[shown], np.searchsorted(shown, edges[1:-1]))):
+            columns["cluster"][row] = points
     for i in kept:
         columns["points"][rows[i]] = len(members[i])
         columns["seen_by"][rows[i]] |= cloud.ends_of(members[i])
         if len(split[i]) > 1 and len(split[i][1][1]) >= MIN_CLUSTER_POINTS:
-            columns["others"][rows[i]] = _other_view(*split[i][1], int(columns["t_ns"][rows[i]]))
-
-
-def _write_view(columns: dict[str, Any], rows: Index, members: Sequence[Index], cloud: Cloud) -> None:
-    """Write what the points of one viewpoint, R arrays (n,), show into rows (R,)."""
-    index, count = np.concatenate(members), np.array([len(points) for points in members])
-    edges = np.concatenate([[0], np.cumsum(count)])
-    xyz = cloud.xyz.take(index, axis=0).astype(np.float64)
-    xy, start, of_sensor = xyz[:, :2] - cloud.sensor[:2], edges[:-1], xyz - cloud.sensor
-    typical = np.array([TYPICAL_SIZE_M[str(category)] for category in columns["category"][rows]])
-    yaw, low, high = fit_extents_of_clusters(xy, count, typical, columns["box_yaw_rad"][rows])
-    columns["yaw_rad"][rows], columns["low_m"][rows], columns["high_m"][rows] = yaw, low, high
-    heights = np.stack([xyz[:, 2], xyz[:, 2] - cloud.height[index]])
-    sort_clusters(heights, count)
-    columns["bottom_m"][rows] = heights[1, start + count // 2] + cloud.origin[2]
-    columns["top_m"][rows] = quantile_of_clusters(heights[:1], count, TOP_QUANTILE)[0] + cloud.origin[2]
-    t_s = cloud.t_s[index].astype(np.float64)
-    mean_ns = np.round(np.add.reduceat(t_s, start) / count * NS_PER_S).astype(np.int64)
-    columns["t_ns"][rows] = cloud.stamp_ns + mean_ns
-    columns["sensor_m"][rows] = cloud.sensor + cloud.origin
-    timed = np.column_stack([xyz + cloud.origin, t_s - np.repeat(mean_ns, count) / NS_PER_S])
-    columns["ends_visible"][rows] = cloud.azimuth_index.ends_visible(members)
-    kept = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count, MAX_KEPT_POINTS)
-    for row, points in zip(rows.tolist(), np.split(timed[kept], np.searchsorted(kept, edges[1:-1]))):
-        columns["cluster"][row] = points
-
-
-def _other_view(cloud: Cloud, members: Index, t_ns: int) -> OtherView:
-    """Describe what the points at `members` (n,) of a second viewpoint show of an object that is measured at a time."""
-    of_sensor = cloud.xyz.take(members, axis=0).astype(np.float64) - cloud.sensor
-    kept = sample_surfaces(np.linalg.norm(of_sensor, axis=1), np.array([len(members)]), MAX_KEPT_POINTS)
-    late_s = cloud.t_s[members[kept]].astype(np.float64) + (cloud.stamp_ns - t_ns) / NS_PER_S
-    place, ends = cloud.sensor + cloud.origin, cloud.azimuth_index.ends_visible([members])[0]
-    return OtherView(place, ends, np.column_stack([of_sensor[kept] + place, late_s]))
-
-
-def project_cloud(view: View, cloud: Cloud, index: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array, Array]:
-    """Project the cloud's points at `index`: which of them the camera sees (n,), pixels (n, 2) and depths (n,)."""
-    visible = project_points(view, cloud.origin, cloud.columns.take(index, axis=1))
-    uv = np.stack([visible.u, visible.v], axis=1).astype(np.float64)
-    return visible.index, uv, visible.depth.astype(np.float64)
+            view, index = split[i][1]
+            of_sensor = view.xyz.take(index, axis=0).astype(np.float64) - view.sensor
+            shown = sample_surfaces(np.linalg.norm(of_sensor, axis=1), np.array([len(index)]), MAX_KEPT_POINTS)
+            late_s = (
+                view.t_s[index[shown]].astype(np.float64) + (view.stamp_ns - int(columns["t_ns"][rows[i]])) / NS_PER_S
+            )
+            place, ends = view.sensor + view.origin, view.azimuth_index.ends_visible([index])[0]
+            columns["others"][rows[i]] = OtherView(place, ends, np.column_stack([of_sensor[shown] + place, late_s]))
 
 
 # A box is wrong by less than this at each side; neighbors are farther away.
@@ -443,22 +417,6 @@ def outside_ego(log: Log, boxes: Boxes3D) -> Boxes3D:
     along, across = (offset * axis).sum(axis=1), axis[:, 0] * offset[:, 1] - axis[:, 1] * offset[:, 0]
     length, width = np.array(log.ego_vehicle.size_m[:2]) / 2 + EGO_MARGIN_M
     return boxes.take(~(known & (np.abs(along) < length) & (np.abs(across) < width)))
-
-
-def _nearest_viewpoints(boxes: Boxes3D, cloud: Cloud) -> Array:
-    """Return the position (M, 3) of the viewpoint that is nearest to each box, m, map frame."""
-    places = np.array([view.sensor + view.origin for view in cloud.views])
-    away = np.hypot(*(boxes.center_m[:, None, :2] - places[:, :2]).transpose(2, 0, 1))
-    return np.asarray(places[away.argmin(axis=1)])
-
-
-def _members_of_all(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
-    """Find the points of all viewpoints in each box, where it is at the times of their points."""
-    if not cloud.parts:
-        return _members(boxes, cloud)
-    first = np.cumsum([0, *(len(part.xyz) for part in cloud.parts)])
-    found = [_members(follow_box(boxes, part), part) for part in cloud.parts]
-    return [np.concatenate([start + own[k] for start, own in zip(first, found)]) for k in range(len(boxes))]
 
 
 def follow_box(boxes: Boxes3D, view: Cloud) -> Boxes3D:

@@ -99,8 +99,6 @@ _workspace = _Workspace()
 def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> ProjectedPoints:
     """Project points given as rows x, y, z (3, N) float32, relative to `origin` (3,) in the map frame.
 
-    Notes
-    -----
     One product in single precision rotates the points and applies the intrinsics; points outside the frustum are dropped
     before the division by depth. With a lens distortion the remaining points are projected in double precision; so they are
     where the camera moves while its lines are read, each point by the pose at the time of its line.
@@ -185,8 +183,6 @@ def points_in_image_boxes(points: ProjectedPoints, box_px: Array, margin: float 
 
     `margin`: share of its sides by which a box is widened to the left, right and top.
 
-    Notes
-    -----
     Points are sorted by integer pixel column once; only those in the columns of a box are compared with it.
     """
     if len(box_px) == 0:
