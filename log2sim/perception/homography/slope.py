@@ -80,7 +80,10 @@ def fit_slope(
     if not fit.ok or np.count_nonzero(known) < MIN_ROWS:
         return fit
     data = data.take(known)
-    rows, start = _rows(fit, data, map_T_base, sigma_px, sigma_m), _Planes(np.linalg.inv(fit.ground_H_image))
+    rows, start = (
+        _rows(fit, data, map_T_base, sigma_px, sigma_m),
+        _Planes(np.asarray(np.linalg.inv(fit.ground_H_image), dtype=np.float64)),
+    )
     cell = np.floor(rows.xy_map / CELL_M).astype(np.int64)
     place, parity = np.unique(cell, axis=0, return_inverse=True)[1].ravel(), cell.sum(axis=1) % 2
     if np.bincount(parity, minlength=2).min() < MIN_ROWS // 4:
@@ -140,7 +143,7 @@ def slope_homography(
     # Its image divides the picture, also where the road rises above the horizon of the plane under the ego.
     if line @ ground_H_image @ [*uv, 1.0] <= 0:
         return None
-    image_H_ground = np.linalg.inv(ground_H_image)
+    image_H_ground = np.asarray(np.linalg.inv(ground_H_image), dtype=np.float64)
     by_change = np.outer(image_of_up(image_H_ground, K), line)
     back = np.linalg.inv(image_H_ground + slope.change * by_change)
     size = np.linalg.norm(back[2])
