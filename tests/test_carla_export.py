@@ -22,11 +22,10 @@ from carla_courses import SIZES, agent, left_turn, of
 from log2sim.datatypes import CATEGORIES, Agent, Scenario
 from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
-from log2sim.simulation import follower
+from log2sim.simulation import reference as follower
 from log2sim.simulation.carla.data import BY_CATEGORY, controller_data, nearest_assets
 from log2sim.simulation.carla.player import CarlaActor, SampledTrajectory, VehicleController, main
-from log2sim.simulation.vehicles.parameters import parameters_for
-from log2sim.simulation.vehicles.vehicle import VehicleState
+from log2sim.simulation.vehicles.vehicle import VehicleState, parameters_for
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
@@ -97,7 +96,7 @@ GAINS = SimpleNamespace(**controller_data())
 
 
 def test_the_script_follows_as_the_shim_does() -> None:
-    """The scalar controller against log2sim.simulation.follower, over 300 steps of random states."""
+    """The scalar controller against log2sim.simulation.reference, over 300 steps of random states."""
     rng = np.random.default_rng(3)
     dt = 0.02
     one, parameters = np.ones(1), parameters_for([left_turn()])

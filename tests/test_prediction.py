@@ -14,13 +14,13 @@ from replay_maneuvers import agent_from
 from replay_scenes import line, parked, walker
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
-from log2sim.simulation.prediction.displacement import measure_predictions
 from log2sim.simulation.prediction.motion_table import table_of
 from log2sim.simulation.prediction.prediction import (
     ACCELERATION_S,
     METHODS,
     Predictions,
     drift_variance,
+    measure_predictions,
     predict_scenario,
 )
 

@@ -10,7 +10,7 @@ from replay_maneuvers import OFFSET_M, agent_from, driven, ramp, scenario_of
 
 from log2sim.errors import ScenarioError
 from log2sim.simulation.runner import replay
-from log2sim.simulation.vehicles.parameters import parameters_for
+from log2sim.simulation.vehicles.vehicle import parameters_for
 
 STEPS_S = [0.001, 0.01, 0.1, 1.0]
 LONG_STEPS_S = [0.01, 0.1, 0.25, 1.0]  # for lives too long for steps of 1 ms in a quick test

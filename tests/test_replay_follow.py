@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, OFFSET_M, agent_from, driven, scenario_of
 
-from log2sim.simulation.follower import GAINS, ControllerMemory, follow_vehicles
+from log2sim.simulation.reference import GAINS, ControllerMemory, follow_vehicles
 from log2sim.simulation.runner import replay
-from log2sim.simulation.vehicles.parameters import parameters_for
-from log2sim.simulation.vehicles.vehicle import VehicleState, step_bicycle
+from log2sim.simulation.vehicles.vehicle import VehicleState, parameters_for, step_bicycle
 
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 

@@ -14,8 +14,7 @@ from log2sim.datatypes import Scenario, Trajectory
 from log2sim.simulation.corridors import PathTable, _nearest_edge
 from log2sim.simulation.policy import load_policy
 from log2sim.simulation.reactive import idm_parameters, leader_demand, rate_response
-from log2sim.simulation.rollout import rollout
-from log2sim.simulation.runner import open_world
+from log2sim.simulation.runner import open_world, rollout
 from log2sim.simulation.runner import replay as run
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"

@@ -10,7 +10,6 @@ import pytest
 from replay_maneuvers import agent_from
 from scipy.integrate import solve_ivp
 
-from log2sim.simulation.vehicles.parameters import PUBLISHED, parameters_for, published_parameters
 from log2sim.simulation.vehicles.single_track import (
     Chassis,
     Slips,
@@ -20,7 +19,15 @@ from log2sim.simulation.vehicles.single_track import (
     step_dynamic,
     step_single_track,
 )
-from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, VehicleControls, VehicleState, step_bicycle
+from log2sim.simulation.vehicles.vehicle import (
+    GRAVITY_MPS2,
+    PUBLISHED,
+    VehicleControls,
+    VehicleState,
+    parameters_for,
+    published_parameters,
+    step_bicycle,
+)
 
 BMW = published_parameters(2, rear_axle_offset_m=1.4)
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])

@@ -7,15 +7,17 @@ import pytest
 from replay_maneuvers import agent_from, driven, lane_change, ramp, scenario_of
 
 from log2sim.simulation.runner import replay
-from log2sim.simulation.vehicles.model_choice import SLIP_TOLERANCE_RAD
-from log2sim.simulation.vehicles.parameters import PUBLISHED, STEER_LAG_S, parameters_for
+from log2sim.simulation.vehicles.single_track import SLIP_TOLERANCE_RAD
 from log2sim.simulation.vehicles.vehicle import (
     GRAVITY_MPS2,
     POINT_MAX_ACCEL_MPS2,
+    PUBLISHED,
+    STEER_LAG_S,
     PointControls,
     PointState,
     VehicleControls,
     VehicleState,
+    parameters_for,
     step_bicycle,
     step_point,
 )

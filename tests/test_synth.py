@@ -16,8 +16,7 @@ from log2sim.evaluation.road import seen_ground
 from log2sim.geometry import NS_PER_S, apply, box_corners, inverse
 from log2sim.logs.opening import open_log
 from log2sim.synth import shapes
-from log2sim.synth.actors import MovingScene
-from log2sim.synth.motion import TimedPath
+from log2sim.synth.actors import MovingScene, TimedPath
 from log2sim.synth.paint import Appearance, paint
 from log2sim.synth.raycast import EGO, GROUND, cast_sweep
 from log2sim.synth.scene import load_scene, scene_from_table

@@ -168,8 +168,7 @@ def predict(
     """
     from log2sim.datatypes import Scenario
     from log2sim.files.documents import check_targets, write_json
-    from log2sim.simulation.prediction.displacement import format_figures, prediction_document
-    from log2sim.simulation.prediction.prediction import METHODS, predict_scenario
+    from log2sim.simulation.prediction.prediction import METHODS, format_figures, predict_scenario, prediction_document
 
     check_targets(out, overwrite=overwrite)
     if positions and out is None:

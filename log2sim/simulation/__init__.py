@@ -6,8 +6,7 @@ from log2sim.simulation.expected_motion import WarningSettings
 from log2sim.simulation.metrics.all_metrics import check_limits, check_strict, parse_limits, require_strict
 from log2sim.simulation.policy import Controls, EgoState, Observation, Others, PathAhead, Policy, Route, load_policy
 from log2sim.simulation.result import AgentReplay, Commands, Replay, to_scenario
-from log2sim.simulation.rollout import World
-from log2sim.simulation.runner import external_simulator, open_world, replay
+from log2sim.simulation.runner import World, external_simulator, open_world, replay
 from log2sim.simulation.warnings import BrakeWhenWarned, warn
 
 __all__ = [

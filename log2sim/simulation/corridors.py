@@ -1,4 +1,4 @@
-"""Paths of many agents' boxes in flat tables, predictions along them, and who reaches into an agent's corridor."""
+"""Paths of many agents' boxes in flat tables, and who reaches into an agent's corridor."""
 
 from __future__ import annotations
 
@@ -36,13 +36,11 @@ class Pose(NamedTuple):
 class PathProjection:
     """Points relative to the nearest places of a path."""
 
-    # ahead_m, left_m: of the point, from that place.
-    ahead_m: Array
+    ahead_m: Array  # of the point, from that place
     left_m: Array
-    # cos, sin: direction of travel there.
-    cos: Array
+    cos: Array  # direction of travel there
     sin: Array
-    distance_m: Array  # distance along the path up to there
+    distance_m: Array  # along the path up to there
     t_s: Array  # time of the scenario there; NaN beyond its end
 
 
@@ -55,10 +53,11 @@ class PathTable:
         self.end_s = np.array([p.t_s[-1] for p in trajectories], dtype=np.float64)
         tables = [_time_table(p, self.origin_m) for p in trajectories]
         marks = [_distance_table(t) for t in tables]
-        self._row0, self._rows = _row_ranges(tables)
-        self._mark0, self.marks = _row_ranges(marks)
-        self._poses = np.concatenate([t[:, 1:] for t in tables]) if tables else np.zeros((0, 6))
-        self._marks = np.concatenate(marks) if marks else np.zeros((0, 5))
+        # Numbers of rows of each table, and the first one of each after concatenation.
+        self._rows, self.marks = (np.array([len(t) for t in c], dtype=np.intp) for c in (tables, marks))
+        self._row0, self._mark0 = np.cumsum(self._rows) - self._rows, np.cumsum(self.marks) - self.marks
+        self._poses = np.concatenate([np.zeros((0, 6)), *(t[:, 1:] for t in tables)])
+        self._marks = np.concatenate([np.zeros((0, 5)), *marks])
 
     def at(self, agent: NDArray[np.intp], t_s: Array) -> Pose:
         """Return where agents are at times, broadcast together: held before their lifetime, straight on after it."""
@@ -123,12 +122,6 @@ class PathTable:
         return np.where(np.isnan(t_s), self.end_s[agent], t_s)
 
 
-def scenario_times_of_positions(trajectory: Trajectory, x_m: Array, y_m: Array) -> Array:
-    """Return when the scenario was nearest to the successive positions (S,) of an agent that drives freely."""
-    table = PathTable([trajectory])
-    return table.times(np.zeros(1, dtype=np.intp), table.progress(0, x_m, y_m))
-
-
 def scenario_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y_m: Array) -> Array:
     """Return when the scenario had traveled the distance that an agent on its path has, (S,).
 
@@ -137,8 +130,8 @@ def scenario_times_of_distance(trajectory: Trajectory, t_s: Array, x_m: Array, y
     table = _time_table(trajectory, trajectory.origin_m)
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
     start = float(np.interp(t_s[0], table[:, 0], table[:, 6]))
-    result: Array = np.maximum(np.minimum(np.interp(start + gone, table[:, 6], table[:, 0]), t_s), trajectory.t_s[0])
-    return result
+    at_s = np.interp(start + gone, table[:, 6], table[:, 0])
+    return np.asarray(np.maximum(np.minimum(at_s, t_s), trajectory.t_s[0]))
 
 
 def _time_table(trajectory: Trajectory, origin_m: tuple[float, float]) -> Array:
@@ -174,12 +167,6 @@ def _distance_table(table: Array) -> Array:
     return np.concatenate([np.stack([x, y, cos, sin, t], axis=1), np.stack(ends, axis=1)])
 
 
-def _row_ranges(tables: Sequence[Array]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return first row and number of rows of each table after concatenation."""
-    count = np.array([len(t) for t in tables], dtype=np.intp)
-    return np.cumsum(count) - count, count
-
-
 # Times (H,) ahead at which others are predicted: a car that crosses at 20 m/s moves by its length in between.
 HORIZON_S = np.arange(0.0, 3.01, 0.25)
 
@@ -198,9 +185,8 @@ class SweptCorridor(NamedTuple):
 
     agent: NDArray[np.intp]  # (P,) whose path
     distance_m: Array  # (P,) present distance along it
-    # length_m, width_m: (P,)
-    length_m: Array
-    width_m: Array
+    length_m: Array  # (P,)
+    width_m: Array  # (P,)
     pace_mps: Array  # (P,)
     progress_m: Array  # (P, H) how far they intend to go from here until the times of the horizon
     reach_m: float  # look-ahead distance
@@ -210,9 +196,8 @@ class SafetyMargins(NamedTuple):
     """Margins that are kept to other agents."""
 
     side_m: float  # on both sides of the corridor
-    # crossing_m, crossing_s: before a crossing agent, as a distance and as a time.
-    crossing_m: float
-    crossing_s: float
+    crossing_m: float  # before a crossing agent, as a distance
+    crossing_s: float  # and as a time
     behind_m: float  # how far behind the agent's progress another center still counts as ahead
 
 
@@ -279,35 +264,3 @@ def _nearest_edge(left: Array, cos: Array, sin: Array, half_length: Array, half_
 
 # A driven agent this near to its path in the scenario, and pointing along it, is expected to stay on it.
 ON_PATH_M, ON_PATH_COS = 1.5, 0.9
-
-
-def predict_by_log(paths: PathTable, agent: NDArray[np.intp], t_s: Array, rate: Array) -> Prediction:
-    """Predict agents (P,) that follow their trajectories from times (P,) at rates (P,)."""
-    pose = paths.at(agent[:, None], t_s[:, None] + rate[:, None] * HORIZON_S)
-    return Prediction(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps * rate[:, None])
-
-
-def predict_along_path(
-    paths: PathTable, agent: int, distance_m: Array, pace_mps: Array, left_m: float = 0.0
-) -> Prediction:
-    """Predict an agent that goes along its path at speeds (P,) from distances (P,), with an offset to the left."""
-    ahead = distance_m[:, None] + pace_mps[:, None] * HORIZON_S
-    x, y, cos, sin, _ = paths.along(np.array([agent])[:, None], ahead)
-    pace = np.broadcast_to(pace_mps[:, None], ahead.shape)
-    return Prediction(x - left_m * sin, y + left_m * cos, np.arctan2(sin, cos), pace)
-
-
-def predict_policy_vehicle(
-    paths: PathTable, agent: int, x_m: float, y_m: float, yaw_rad: float, speed_mps: float
-) -> Prediction:
-    """Predict an agent that a policy drives: along its own path while it is on it, else straight ahead; (1, H)."""
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    whole_m = float(paths.marks[agent])
-    foot = paths.foot(np.array([agent]), np.zeros(1), whole_m, np.array([[x_m]]), np.array([[y_m]]))
-    left_m = float(foot.left_m[0, 0])
-    along = float(cos * foot.cos[0, 0] + sin * foot.sin[0, 0])
-    if speed_mps >= 0 and abs(left_m) < ON_PATH_M and along > ON_PATH_COS:
-        return predict_along_path(paths, agent, foot.distance_m[0] + foot.ahead_m[0], np.array([speed_mps]), left_m)
-    traveled = speed_mps * HORIZON_S[None]
-    same = np.ones_like(traveled)
-    return Prediction(x_m + traveled * cos, y_m + traveled * sin, yaw_rad * same, speed_mps * same)

@@ -23,35 +23,23 @@ from log2sim.simulation.prediction.prediction import ACCELERATION_S, MOVING
 from log2sim.simulation.present import Mask, observe, recorded
 from log2sim.simulation.reactive import EXPONENT, IdmParameters, idm_parameters, leader_demand
 
-MODELS = ("drivers", "idm", "constant-velocity", "log")
-"""How agents are simulated; "log" does what the log did."""
-
-LOOKAHEAD = 24
-"""Places ahead on its path at which a driver looks for others."""
-
-FREE_MPS = {"vehicle": 8.0, "two_wheeler": 4.5, "pedestrian": 1.3, "other": 5.0}
-"""Speeds that those who stand take up."""
-
+MODELS = ("drivers", "idm", "constant-velocity", "log")  # how agents are simulated; "log" does what the log did
+LOOKAHEAD = 24  # places ahead on its path at which a driver looks for others
+FREE_MPS = {"vehicle": 8.0, "two_wheeler": 4.5, "pedestrian": 1.3, "other": 5.0}  # speeds that those who stand take up
+# How often those who stand set off by themselves.
 START_PER_S = {"vehicle": 0.06, "two_wheeler": 0.06, "pedestrian": 0.1, "other": 0.02}
-"""How often those who stand set off by themselves."""
-
+# Factors of one standard deviation, of desired speed and acceleration noise of drivers, and of the log's jitter.
 SPEED_SPREAD, ACCELERATION_SPREAD, JITTER_SPREAD = 1.12, 1.5, 2.0
-"""Factors of one standard deviation, of desired speed and acceleration noise of drivers, and of the log's jitter."""
-
-CLEAR_S = 0.5
-"""Between one leaving and another entering where paths cross."""
-
+CLEAR_S = 0.5  # between one leaving and another entering where paths cross
+# Least gain of a lane change (MOBIL; Kesting, Treiber and Helbing 2007), the time gap that is left to who comes from
+# behind, and how often who would gain changes.
 GAIN_MPS2, SAFE_S, CHANGES_PER_S = 0.4, 1.0, 0.1
-"""Least gain of a lane change (MOBIL; Kesting, Treiber and Helbing 2007), the time gap that is left to who comes from behind, and how often
-who would gain changes."""
-
 CHANGE_S = 4.0
 
+# Who had to brake harder for a light that turns yellow drives on (Gazis, Herman and Maradudin 1960; ITE's value of 10
+# ft/s2).
 DILEMMA_MPS2 = 3.0
-"""Who had to brake harder for a light that turns yellow drives on (Gazis, Herman and Maradudin 1960; ITE's value of 10 ft/s2)."""
-
-AT_LINE_M = 1.0
-"""How far before a stop line drivers come to rest."""
+AT_LINE_M = 1.0  # how far before a stop line drivers come to rest
 
 Index = NDArray[np.intp]
 

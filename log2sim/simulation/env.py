@@ -117,7 +117,6 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         """Hold an action for `hold_s`; `ValueError` when it is not two finite numbers."""
         if not self._begun:
             raise gymnasium.error.ResetNeeded("the episode has not begun: call reset() before step()")
-        # Check an action and return pedal and steering in [-1, 1].
         values = np.asarray(action, dtype=np.float64)
         if values.shape != (2,) or not np.isfinite(values).all():
             raise ValueError(f"action {action!r}: expected two finite numbers from -1 to 1, pedal and steering")
@@ -155,23 +154,34 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
 
     def render(self) -> Any:
         """Draw the surroundings of the ego from above, (400, 400, 3) uint8, its front to the right; None without render mode."""
-        return _rendered(self._observation) if self._begun and self.render_mode == "rgb_array" else None
+        if not self._begun or self.render_mode != "rgb_array":
+            return None
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.collections import PolyCollection
+        from matplotlib.figure import Figure
+
+        path, ego, o = self._observation.path, self._observation.ego, self._observation.others
+        figure = Figure(figsize=(PICTURE_PX / 100, PICTURE_PX / 100), dpi=100)
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(-PICTURE_M / 2, PICTURE_M / 2), ylim=(-PICTURE_M / 2, PICTURE_M / 2), aspect="equal")
+        axes.axis("off")
+        axes.plot(*_in_ego_frame(ego, path.x_m, path.y_m), color="#9aa5b1", linewidth=1.5)
+        centers = np.stack(_in_ego_frame(ego, o.x_m, o.y_m), axis=1)
+        others = box_corners_bev(centers.reshape(-1, 2), o.length_m, o.width_m, o.yaw_rad - ego.yaw_rad)
+        axes.add_collection(PolyCollection(list(others), facecolor="#7aa6c2", edgecolor="#33566b"))
+        own = box_corners_bev([[0.0, 0.0]], ego.length_m, ego.width_m, 0.0)
+        axes.add_collection(PolyCollection(list(own), facecolor="#1f2933"))
+        canvas.draw()  # type: ignore[no-untyped-call]
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
     def _shown(self) -> ObservationArrays:
         """Convert the observation to arrays within the bounds of their spaces."""
-        observation, ego = self._observation, self._observation.ego
-        ahead = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M
-        way = observation.path
+        observation, ego, count = self._observation, self._observation.ego, self._rows
+        ahead, way, o = np.arange(1, PATH_ROWS + 1) * PATH_EVERY_M, observation.path, observation.others
         path = (*_in_ego_frame(ego, way.x_m[ahead], way.y_m[ahead]), way.speed_mps[ahead])
-        o, count = observation.others, self._rows
-        velocity = _in_ego_axes(ego, o.velocity_x_mps, o.velocity_y_mps)
-        columns = (
-            *_in_ego_frame(ego, o.x_m, o.y_m),
-            *velocity,
-            wrap_angle(o.yaw_rad - ego.yaw_rad),
-            o.length_m,
-            o.width_m,
-        )
+        velocity, turn = _in_ego_axes(ego, o.velocity_x_mps, o.velocity_y_mps), wrap_angle(o.yaw_rad - ego.yaw_rad)
+        columns = (*_in_ego_frame(ego, o.x_m, o.y_m), *velocity, turn, o.length_m, o.width_m)
         near = np.stack(columns, axis=1)[:count]
         others = np.zeros((count, 7))
         others[: len(near)] = near
@@ -200,28 +210,6 @@ def _path_errors(observation: Observation) -> tuple[Array, Array]:
     x, y, yaw = observation.path.x_m[0], observation.path.y_m[0], observation.path.yaw_rad[0]
     dx, dy = observation.ego.x_m - x, observation.ego.y_m - y
     return dy * np.cos(yaw) - dx * np.sin(yaw), wrap_angle(observation.ego.yaw_rad - yaw)
-
-
-def _rendered(observation: Observation) -> Any:
-    """Draw the ego, its path and the other agents."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.collections import PolyCollection
-    from matplotlib.figure import Figure
-
-    ego, o = observation.ego, observation.others
-    figure = Figure(figsize=(PICTURE_PX / 100, PICTURE_PX / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(-PICTURE_M / 2, PICTURE_M / 2), ylim=(-PICTURE_M / 2, PICTURE_M / 2), aspect="equal")
-    axes.axis("off")
-    axes.plot(*_in_ego_frame(ego, observation.path.x_m, observation.path.y_m), color="#9aa5b1", linewidth=1.5)
-    centers = np.stack(_in_ego_frame(ego, o.x_m, o.y_m), axis=1)
-    others = box_corners_bev(centers.reshape(-1, 2), o.length_m, o.width_m, o.yaw_rad - ego.yaw_rad)
-    axes.add_collection(PolyCollection(list(others), facecolor="#7aa6c2", edgecolor="#33566b"))
-    own = box_corners_bev([[0.0, 0.0]], ego.length_m, ego.width_m, 0.0)
-    axes.add_collection(PolyCollection(list(own), facecolor="#1f2933"))
-    canvas.draw()  # type: ignore[no-untyped-call]
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
 gymnasium.register(ID, entry_point="log2sim.simulation.env:ScenarioEnv")

@@ -71,12 +71,6 @@ class WarningSettings:
         """Return the ways in m until a vehicle stands: reaction, then braking."""
         return np.asarray(np.abs(speed_mps) * self.reaction_s + speed_mps**2 / (2 * self.brake_mps2))
 
-    def is_due(self, probability: Array, way_m: Array, speed_mps: Array) -> NDArray[np.bool_]:
-        """Whether to warn of collisions (C,) of probabilities, after ways of the ego in m, at its speeds."""
-        left_m = way_m - self.stopping_distance_m(speed_mps)
-        early = (probability >= self.early_probability) & (left_m <= np.abs(speed_mps) * self.margin_s)
-        return np.asarray(early | (probability >= self.min_probability) & (left_m <= 0))
-
     def needed_mps2(self, speed_mps: float, way_m: float) -> float | None:
         """Return the deceleration that stops a vehicle within a way; None where it is driven before the brakes work."""
         left_m = way_m - abs(speed_mps) * self.reaction_s
@@ -195,10 +189,7 @@ class ExpectedPaths:
 
 
 class ExpectedAgents:
-    """Where agents (A,) are expected from any tick, by the observations up to then.
-
-    `table`: states of the agents at all ticks. `known`: what is known of them at these ticks. `interval_s`: between
-    observations.
+    """Where agents (A,) of a table are expected from any tick, by what is known of them then, observed every `interval_s`.
 
     Movers are predicted by `log2sim.simulation.prediction` from the states at ticks at which they were observed. To its standard deviations
     comes that of a speed which a tracker has learned from few observations: of the slope of a line through n places with
@@ -213,7 +204,17 @@ class ExpectedAgents:
         movers = np.flatnonzero(~self._static)
         self._mover = np.full(len(table.agents), -1, dtype=np.intp)
         self._mover[movers] = np.arange(len(movers))
-        seen = _observed_table(table, known, movers)
+        # A table of the states at ticks of observation alone, in which who was lost begins anew.
+        there = known.observed[movers] & table.present[movers]
+        blank, jumps = np.where(there, 1.0, np.nan), table.piece[movers]
+        # Pieces that differ where either piece number does.
+        pieces = known.piece[movers] * (int(jumps.max(initial=0)) + 1) + np.maximum(jumps, 0)
+        seen = MotionTable(
+            tuple(table.agents[k] for k in movers.tolist()), table.t_s,
+            blank[..., None] * table.center_m[movers], blank * table.yaw_rad[movers], blank * table.speed_mps[movers],
+            table.tick_s, np.where(there, table.velocity_mps[movers], np.nan), blank * table.sigma_m[movers], there,
+            np.where(there, pieces, -1),
+        )  # fmt: skip
         count = int(np.ceil((horizon_s + CONFIRMED_AGE_S) / LEAD_STEP_S))
         found = predict_table(seen, np.linspace(LEAD_STEP_S, count * LEAD_STEP_S, count), (DEFAULT_METHOD,))
         self._forecast = found.forecasts[DEFAULT_METHOD]
@@ -222,59 +223,27 @@ class ExpectedAgents:
 
     def at(self, agent: Index, tick: Index) -> ExpectedPaths:
         """Return where agents (C,), known at ticks (C,), are expected at the leads from then on."""
-        ways = self._standing(agent, tick)
+        t, known, f, source = self.table, self.known, self._forecast, self.known.source[agent, tick]
+        position, course = (np.empty((len(agent), len(self.lead_s)), dtype=complex) for _ in range(2))
+        yaw, sigma = np.empty(position.shape), np.empty((*position.shape, 2))
+        position[:], course[:] = t.position_m[agent, source][:, None], 1.0
+        yaw[:], sigma[:] = t.yaw_rad[agent, source][:, None], t.sigma_m[agent, source][:, None, None]
         moving = np.flatnonzero(~self._static[agent])
-        if len(moving):
-            position, yaw, course, sigma = self._moving(agent[moving], tick[moving])
-            ways.position_m[moving], ways.yaw_rad[moving] = position, yaw
-            ways.course[moving], ways.sigma_m[moving] = course, sigma
-        return ways
-
-    def _standing(self, agent: Index, tick: Index) -> ExpectedPaths:
-        t, source = self.table, self.known.source[agent, tick]
-        wide = (len(agent), len(self.lead_s))
-        position = np.where(self._static[agent], t.position_m[agent, source], 0.0)
-        sigma = np.where(self._static[agent], t.sigma_m[agent, source], 0.0)
-        return ExpectedPaths(
-            np.repeat(position[:, None], wide[1], axis=1),
-            np.repeat(t.yaw_rad[agent, source][:, None], wide[1], axis=1),
-            np.ones(wide, dtype=complex),
-            np.broadcast_to(sigma[:, None, None], (*wide, 2)).copy(),
-            self.size_m[agent],
-        )
-
-    def _moving(self, agent: Index, tick: Index) -> tuple[Complex, Array, Complex, Array]:
-        """Look forecasts up at the leads, which count from the last observation."""
-        table, known = self.table, self.known
-        source = known.source[agent, tick]
-        row = self._row[self._mover[agent], source]
-        lead = (tick - source)[:, None] * table.tick_s + self.lead_s
-        here = table.position_m[agent, source][:, None]
-        sigma0 = np.repeat(table.sigma_m[agent, source][:, None, None], 2, axis=2)
-        f = self._forecast
-        position = _at_leads(np.concatenate([here, f.position_m[row]], axis=1), lead)
-        course = _at_leads(np.concatenate([f.course[row][:, :1], f.course[row]], axis=1), lead)
-        sigma = _at_leads(np.concatenate([sigma0, f.sigma_m[row]], axis=1), lead)
-        course = course / np.abs(course)
-        yaw = table.yaw_rad[agent, source][:, None] + np.angle(course * f.course[row][:, :1].conj())
-        count = np.clip(known.count[agent, source], 2, LEARNED_OBSERVATIONS)
-        slope = np.sqrt(12.0 / (count * (count**2 - 1.0))) / self._interval_s
-        drift = sigma0[:, 0, 0] * slope
-        return position, yaw, course, np.sqrt(sigma**2 + (drift[:, None] * lead)[..., None] ** 2)
-
-
-def _observed_table(table: MotionTable, known: Known, rows: Index) -> MotionTable:
-    """Return some rows of a table with the states at ticks of observation alone; who was lost begins anew."""
-    there = known.observed[rows] & table.present[rows]
-    blank, jumps = np.where(there, 1.0, np.nan), table.piece[rows]
-    # Pieces that differ where either piece number does.
-    pieces = known.piece[rows] * (int(jumps.max(initial=0)) + 1) + np.maximum(jumps, 0)
-    return MotionTable(
-        tuple(table.agents[k] for k in rows.tolist()), table.t_s,
-        blank[..., None] * table.center_m[rows], blank * table.yaw_rad[rows], blank * table.speed_mps[rows],
-        table.tick_s, np.where(there, table.velocity_mps[rows], np.nan), blank * table.sigma_m[rows], there,
-        np.where(there, pieces, -1),
-    )  # fmt: skip
+        if len(moving):  # forecasts at the leads, which count from the last observation
+            who, at = agent[moving], source[moving]
+            row = self._row[self._mover[who], at]
+            lead = (tick[moving] - at)[:, None] * t.tick_s + self.lead_s
+            here, first = position[moving, :1], f.course[row][:, :1]
+            sigma0 = sigma[moving, :1]
+            position[moving] = _at_leads(np.concatenate([here, f.position_m[row]], axis=1), lead)
+            way = _at_leads(np.concatenate([first, f.course[row]], axis=1), lead)
+            course[moving] = way / np.abs(way)
+            yaw[moving] += np.angle(course[moving] * first.conj())
+            count = np.clip(known.count[who, at], 2, LEARNED_OBSERVATIONS)
+            drift = sigma0[..., 0] * (np.sqrt(12.0 / (count * (count**2 - 1.0))) / self._interval_s)[:, None]
+            spread = _at_leads(np.concatenate([sigma0, f.sigma_m[row]], axis=1), lead)
+            sigma[moving] = np.sqrt(spread**2 + (drift * lead)[..., None] ** 2)
+        return ExpectedPaths(position, yaw, course, sigma, self.size_m[agent])
 
 
 def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:
@@ -294,13 +263,12 @@ KEEPING_SIGMA_M, KEEPING_S = 0.3, 1.0
 class EgoStates(NamedTuple):
     """States of the ego (C,)."""
 
-    # x_m, y_m: (C,) box center, map frame.
-    x_m: Array
+    x_m: Array  # box center, map frame
     y_m: Array
-    yaw_rad: Array  # (C,)
-    speed_mps: Array  # (C,)
-    accel_mps2: Array  # (C,), m/s2 of the speed's amount
-    progress_m: Array  # (C,) how far along its path
+    yaw_rad: Array
+    speed_mps: Array
+    accel_mps2: Array  # of the speed's amount
+    progress_m: Array  # how far along its path
 
     def take(self, index: NDArray[np.generic]) -> EgoStates:
         """Return some of the states."""
@@ -312,12 +280,8 @@ class EgoPath:
 
     def __init__(self, ego: Agent) -> None:
         self._trajectory = Trajectory.through(ego.waypoints, ego.rear_axle_offset_m)
-        self._paths = PathTable([self._trajectory])
+        self.paths = PathTable([self._trajectory])
         self.size_m = ego.size_m
-
-    def progress(self, x_m: Array, y_m: Array) -> Array:
-        """Return how far along the path successive places (N,) are."""
-        return self._paths.progress(0, x_m, y_m)
 
     def at(self, ego: EgoStates, lead_s: Array) -> ExpectedPaths:
         """Return where the ego is expected at leads (H,): on its path, as far aside as it is; off it, straight on.
@@ -331,9 +295,9 @@ class EgoPath:
         t = np.minimum(lead_s, stands_s[:, None])
         ahead = np.asarray(speed_mps[:, None] * t + np.where(brakes, accel_mps2, 0.0)[:, None] * t**2 / 2)
         one = np.zeros((1, 1), dtype=np.intp)
-        x0, y0, cos0, sin0, _ = self._paths.along(one, ego.progress_m[:, None])
-        x, y, cos, sin, _ = self._paths.along(one, ego.progress_m[:, None] + ahead)
-        origin = complex(*self._paths.origin_m)
+        x0, y0, cos0, sin0, _ = self.paths.along(one, ego.progress_m[:, None])
+        x, y, cos, sin, _ = self.paths.along(one, ego.progress_m[:, None] + ahead)
+        origin = complex(*self.paths.origin_m)
         here = (ego.x_m + 1j * ego.y_m)[:, None]
         left = ((here - origin - (x0 + 1j * y0)) * (cos0 - 1j * sin0)).imag
         facing = np.exp(1j * ego.yaw_rad)[:, None]
@@ -353,7 +317,7 @@ class EgoPath:
     def heights(self, progress_m: Array, reach_m: Array) -> Array:
         """Return the heights (C, 7), m, of the ego's center on the next `reach_m` (C,) of its path."""
         ahead = progress_m[:, None] + np.linspace(0.0, 1.0, 7) * reach_m[:, None]
-        at_s = self._paths.times(np.zeros((1, 1), dtype=np.intp), ahead)
+        at_s = self.paths.times(np.zeros((1, 1), dtype=np.intp), ahead)
         return self._trajectory.heights(at_s.ravel()).reshape(at_s.shape)
 
 

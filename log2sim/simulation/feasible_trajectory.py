@@ -53,14 +53,13 @@ class FeasibilityLimits:
 class FeasibleTrajectory:
     """States of a rear axle that rolls without slip, at times `t_s` (K,)."""
 
-    t_s: Array  # (K,)
-    # x_m, y_m: (K,)
+    t_s: Array
     x_m: Array
     y_m: Array
-    yaw_rad: Array  # (K,) unwrapped
-    speed_mps: Array  # (K,) negative in reverse
-    accel_mps2: Array  # (K,)
-    curvature_1pm: Array  # (K,) positive to the left
+    yaw_rad: Array  # unwrapped
+    speed_mps: Array  # negative in reverse
+    accel_mps2: Array
+    curvature_1pm: Array  # positive to the left
 
     @cached_property
     def motion(self) -> tuple[Array, Array]:
@@ -75,12 +74,14 @@ class FeasibleTrajectory:
 def fit_trajectory(
     t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
 ) -> FeasibleTrajectory:
-    """Fit a feasible trajectory to box centers and headings at evenly spaced times (K,), K >= 2.
+    """Fit a feasible trajectory to box centers and headings at evenly spaced times (K,); a single one, or too many, as they are.
 
     Least squares over all knots at once, by Gauss-Newton steps with Levenberg-Marquardt damping. Rolling without slip is a
     residual as well (direct multiple shooting, Bock & Plitt, 1984), which makes every step a banded system: cost O(K).
     Headings and speeds enter by the pseudo-Huber loss, so outliers have little influence.
     """
+    if not 1 < len(t_s) <= MAX_KNOTS:
+        return FeasibleTrajectory(t_s, *_initial_states(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
     axis = np.unwrap(yaw_rad, period=np.pi)
     axis = axis + np.pi if np.sum(np.cos(axis - yaw_rad)) < 0 else axis
     away = wrap_angle(yaw_rad - axis)
@@ -105,13 +106,6 @@ def fit_trajectory(
         if gain < MIN_RELATIVE_GAIN * cost:
             break
     return FeasibleTrajectory(t_s, *state.T)
-
-
-def unfitted_trajectory(
-    t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array, limits: FeasibilityLimits
-) -> FeasibleTrajectory:
-    """Return the given trajectory at times (K,), K >= 1: for a single time, or a lifetime that is too long to be fitted."""
-    return FeasibleTrajectory(t_s, *_initial_states(t_s, x_m, y_m, yaw_rad, speed_mps, limits).T)
 
 
 def _initial_states(t_s: Array, x: Array, y: Array, yaw: Array, speed: Array, limits: FeasibilityLimits) -> Array:
@@ -152,11 +146,7 @@ class _LeastSquares:
     limits: FeasibilityLimits
 
     def terms(self, state: Array) -> list[ResidualTerm]:
-        """Return the terms of the cost."""
-        return [*self._knots(state), *self._ways(state)]
-
-    def _knots(self, state: Array) -> list[ResidualTerm]:
-        """Return the residuals of the scenario's states and of the limits."""
+        """Return the terms of the cost: the scenario's states, limits, rolling from knot to knot, and smooth driving."""
         x, y, yaw, speed, accel, curvature = state.T
         log_x, log_y, log_yaw, log_speed = self.logged.T
         limits, o, scale = self.limits, self.limits.offset_m, math.sqrt(self.h_s / KNOT_S)
@@ -165,7 +155,7 @@ class _LeastSquares:
         hard, gentle = _limit_residual(accel, limits.max_accel_mps2, scale)
         tight, wide = _limit_residual(curvature, limits.max_curvature_1pm, scale)
         aside, grip = _limit_residual(speed**2 * curvature, limits.max_lateral_mps2, scale)
-        return [
+        knots = [
             ResidualTerm((x + o * cos - log_x) * place, {X: place, YAW: -o * place * sin}),
             ResidualTerm((y + o * sin - log_y) * place, {Y: place, YAW: o * place * cos}),
             ResidualTerm(hard, {ACCEL: gentle}),
@@ -174,15 +164,13 @@ class _LeastSquares:
             ResidualTerm((yaw - log_yaw) * turn, {YAW: turn}, robust=True),
             ResidualTerm((speed - log_speed) * pace, {SPEED: pace}, robust=True),
         ]
-
-    def _ways(self, state: Array) -> list[ResidualTerm]:
-        """Return the residuals of rolling from knot to knot and of smooth driving."""
         h, (a, b) = self.h_s, (state[:-1].T, state[1:].T)
         (_, _, yaw, speed, accel, curvature), (dx, dy, turn, gain, jerk, bend) = (a + b) / 2, b - a
         cos, sin, per_speed = np.cos(yaw), np.sin(yaw), h * np.sinc(turn / (2 * np.pi))
         east, north = per_speed * cos, per_speed * sin
         smooth, straight = 1 / (math.sqrt(h * KNOT_S) * JERK_MPS3), 1 / (math.sqrt(h * KNOT_S) * self._curvature_rate)
         return [
+            *knots,
             _transition((dx - speed * east) / ROLL_M, X, 1 / ROLL_M, {YAW: speed * north / ROLL_M, SPEED: -east / ROLL_M}),
             _transition((dy - speed * north) / ROLL_M, Y, 1 / ROLL_M, {YAW: -speed * east / ROLL_M, SPEED: -north / ROLL_M}),
             _transition(
@@ -199,8 +187,7 @@ class _LeastSquares:
         """Standard deviation (K - 1,) of the curvature rate: limited by the steering, and by comfort at speed."""
         pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
         steering = self.limits.max_curvature_rate_1pmps / 2
-        result: Array = LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
-        return result
+        return np.asarray(LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering))
 
 
 def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> ResidualTerm:

@@ -17,12 +17,19 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.geometry import Array, cos_sin, wrap_angle
-from log2sim.simulation import follower, policy
+from log2sim.simulation import policy
 from log2sim.simulation.corridors import SPACING_M, PathTable
-from log2sim.simulation.reference import GRID_S, Reference
-from log2sim.simulation.simulators import VehicleStep
+from log2sim.simulation.reference import (
+    GRID_S,
+    ControllerMemory,
+    Reference,
+    control_step,
+    follow_points,
+    follow_vehicles,
+    start_vehicles,
+)
 from log2sim.simulation.vehicles import vehicle
-from log2sim.simulation.vehicles.model_choice import set_slip_states
+from log2sim.simulation.vehicles.single_track import set_slip_states
 
 STORE_S = 0.05  # spacing of stored states, about 20 Hz
 MARGIN = 1e-6  # in steps, for rounding: a waypoint at 0.3 s is on step 30 of 10 ms
@@ -61,20 +68,15 @@ class StepClock:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot(vehicle.Columns):
-    """Box centers and actuators of agents (A,), map frame.
+    """Box centers and actuators of agents (A,), map frame."""
 
-    Commands are those held over the last step; NaN for agents without.
-    """
-
-    # x_m, y_m, yaw_rad, speed_mps: (A,)
     x_m: Array
     y_m: Array
     yaw_rad: Array
     speed_mps: Array
-    steer_rad: Array  # (A,)
-    accel_mps2: Array  # (A,) NaN where the model has no such state
-    # pedal_command_mps2, steer_command_rad, gear: (A,)
-    pedal_command_mps2: Array
+    steer_rad: Array
+    accel_mps2: Array  # NaN where the model has no such state
+    pedal_command_mps2: Array  # commands held over the last step; NaN for agents without
     steer_command_rad: Array
     gear: Array
 
@@ -142,7 +144,7 @@ class AgentGroup(ABC):
 
     @abstractmethod
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
-        """Put the agents at `index` (of all agents of the group) on their references at a time."""
+        """Put the agents at `index` (of all agents of the group) on their references at a time, if they are not there anyway."""
 
     @abstractmethod
     def snapshot(self) -> Snapshot:
@@ -150,7 +152,7 @@ class AgentGroup(ABC):
 
     def advance(self, dt_s: float) -> None:
         """Move the living agents by one step; within a long step controls are renewed."""
-        held_s = follower.control_step(dt_s)
+        held_s = control_step(dt_s)
         for part in range(round(dt_s / held_s)):
             if part:
                 self.look_up(self.now_s + held_s)
@@ -172,7 +174,6 @@ class LogReplayGroup(AgentGroup):
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Do nothing: the agents are always on their references."""
-        pass
 
     def _step(self, dt_s: float) -> None:
         pass
@@ -190,7 +191,7 @@ class VehicleGroup(AgentGroup):
 
     driver = "pid"
     state: vehicle.VehicleState
-    memory: follower.ControllerMemory
+    memory: ControllerMemory
     commands: vehicle.VehicleControls
     living: vehicle.VehicleParameters
 
@@ -201,22 +202,22 @@ class VehicleGroup(AgentGroup):
         first: NDArray[np.intp],
         last: NDArray[np.intp],
         parameters: vehicle.VehicleParameters,
-        move: VehicleStep,
+        move: vehicle.VehicleStep,
     ) -> None:
         super().__init__(agents, references, first, last)
         self.parameters, self.move, count = parameters, move, len(agents)
-        state, memory = vehicle.VehicleState.zeros(count), follower.ControllerMemory.fresh(count)
+        state, memory = vehicle.VehicleState.zeros(count), ControllerMemory.fresh(count)
         commands = vehicle.VehicleControls(np.zeros(count), np.zeros(count), np.zeros(count, bool))
         self.keep(state=state, memory=memory, commands=commands, living=parameters)
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
         slots = self._slots(index)
-        state = follower.start_vehicles(self._exact(index, t_s), self.living.take(slots))
+        state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
             state = set_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
         self.state.put(slots, state)
-        self.memory.put(slots, follower.ControllerMemory.fresh(len(slots)))
+        self.memory.put(slots, ControllerMemory.fresh(len(slots)))
         placed = self.state.take(slots)
         self.commands.put(slots, vehicle.VehicleControls(placed.pedal_mps2, placed.steer_rad, placed.speed_mps < 0))
 
@@ -232,7 +233,7 @@ class VehicleGroup(AgentGroup):
         return Snapshot(x, y, wrap_angle(s.yaw_rad), s.speed_mps, s.steer_rad, accel, c.pedal_mps2, c.steer_rad, gear)
 
     def _step(self, dt_s: float) -> None:
-        self.commands, self.memory = follower.follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
+        self.commands, self.memory = follow_vehicles(self.row, self.state, self.memory, self.living, dt_s)
         self.state = self.move(self.state, self.commands, self.living, dt_s)
 
 
@@ -279,7 +280,7 @@ class PedestrianGroup(AgentGroup):
         return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(x)), unknown, unknown, unknown, unknown)
 
     def _step(self, dt_s: float) -> None:
-        self.commands = follower.follow_points(self.row, self.state)
+        self.commands = follow_points(self.row, self.state)
         self.state = self.move(self.state, self.commands, dt_s)
 
 
@@ -305,23 +306,18 @@ class WindowRecording:
             column[:] = getattr(snapshot, name)
         self.count += 1
 
-    def lives(self) -> Iterable[tuple[str, NDArray[np.intp], Array]]:
-        """Yield what was stored by agent, cut to its lifetime: id, steps (S,) and columns (C, S)."""
-        group, steps = self.group, self.steps[: self.count]
-        begin = np.searchsorted(steps, group.first[self.live])
-        end = np.searchsorted(steps, group.last[self.live], side="right")
-        for slot, i in enumerate(self.live):
-            alive = slice(begin[slot], end[slot])
-            if begin[slot] < end[slot]:
-                yield group.agents[i].id, steps[alive], self.rows[alive, :, slot].T
-
 
 def merged_tracks(records: Iterable[WindowRecording]) -> RecordedTracks:
-    """Join the recordings of each agent in order of time."""
+    """Join the recordings of each agent, cut to its lifetime, in order of time."""
     parts: dict[str, list[tuple[NDArray[np.intp], Array]]] = {}
     for record in records:
-        for agent, steps, columns in record.lives():
-            parts.setdefault(agent, []).append((steps, columns))
+        group, steps = record.group, record.steps[: record.count]
+        begin = np.searchsorted(steps, group.first[record.live])
+        end = np.searchsorted(steps, group.last[record.live], side="right")
+        for slot, i in enumerate(record.live):
+            alive = slice(begin[slot], end[slot])
+            if begin[slot] < end[slot]:
+                parts.setdefault(group.agents[i].id, []).append((steps[alive], record.rows[alive, :, slot].T))
     return {k: (np.concatenate([s for s, _ in v]), np.concatenate([c for _, c in v], axis=1)) for k, v in parts.items()}
 
 
@@ -344,44 +340,30 @@ class PolicyObserver:
         self._static_lives_s = np.array(lives, dtype=np.float64).reshape(-1, 2)
         self._agents = [_identities(g.agents, [r.trajectory for r in g.references]) for g in self._groups]
         self._static_agents = _identities(statics, [Trajectory.through(a.waypoints, 0.0) for a in statics])
-        self.restart()
-
-    def restart(self) -> None:
-        """Start again at the beginning of the path."""
         self.progress_m = 0.0
 
     def __call__(self, step: int, t_s: float, dt_s: float) -> policy.Observation:
-        """Build the observation at a step; steps must be in order."""
-        ahead = self._ahead()
-        ego = self._state()
-        return policy.Observation(t_s, dt_s, ego, self._others(ego, step, t_s), self._route(t_s), ahead)
-
-    def _state(self) -> policy.EgoState:
-        """Build the ego's state, at the height of its path in the scenario at `progress_m`."""
-        (length, width, height), s, p = self.ego.agents[0].size_m, self.ego.snapshot(), self.ego.living
-        log_t_s = self._path_table.times(ONE, np.array([self.progress_m]))
-        moves = {k: float(getattr(s, k)[0]) for k in ("x_m", "y_m", "yaw_rad", "speed_mps", "accel_mps2", "steer_rad")}
-        built = {k: float(getattr(p, k)[0]) for k in ("wheelbase_m", "rear_axle_offset_m", "understeer_s2pm2")}
-        z_m = float(self._trajectory.heights(log_t_s)[0])
-        return policy.EgoState(z_m=z_m, length_m=length, width_m=width, height_m=height, **moves, **built)
-
-    def _route(self, t_s: float) -> policy.Route:
-        ahead = np.arange(
-            t_s,
-            min(t_s + policy.ROUTE_AHEAD_S, self._trajectory.t_s[-1]) + policy.ROUTE_STEP_S / 2,
-            policy.ROUTE_STEP_S,
-        )
-        x, y, _, yaw, speed = self._trajectory.at(ahead)
-        return policy.Route(*(_read_only(c) for c in (ahead, x, y, yaw, speed)))
-
-    def _ahead(self) -> policy.PathAhead:
-        table, now = self._path_table, self.ego.snapshot()
+        """Build the observation at a step; steps must be in order, but for `progress_m` = 0 at the first."""
+        table, trajectory, now, p = self._path_table, self._trajectory, self.ego.snapshot(), self.ego.living
         self.progress_m = table.progress_near(0, self.progress_m, float(now.x_m[0]), float(now.y_m[0]))
         ahead = np.arange(0.0, policy.PATH_AHEAD_M + SPACING_M / 2, SPACING_M)
         x, y, cos, sin, at_s = table.along(ONE, self.progress_m + ahead)
-        pace = np.abs(table.at(ONE, np.where(np.isnan(at_s), self._trajectory.t_s[-1], at_s)).speed_mps)
+        pace = np.abs(table.at(ONE, np.where(np.isnan(at_s), trajectory.t_s[-1], at_s)).speed_mps)
         columns = (ahead, x + table.origin_m[0], y + table.origin_m[1], wrap_angle(np.arctan2(sin, cos)), pace, at_s)
-        return policy.PathAhead(self.progress_m, *(_read_only(c) for c in columns))
+        path = policy.PathAhead(self.progress_m, *(_read_only(c) for c in columns))
+        # The ego is at the height of its path in the scenario.
+        z_m = float(trajectory.heights(table.times(ONE, np.array([self.progress_m])))[0])
+        moves = {
+            k: float(getattr(now, k)[0]) for k in ("x_m", "y_m", "yaw_rad", "speed_mps", "accel_mps2", "steer_rad")
+        }
+        built = {k: float(getattr(p, k)[0]) for k in ("wheelbase_m", "rear_axle_offset_m", "understeer_s2pm2")}
+        length, width, height = self.ego.agents[0].size_m
+        ego = policy.EgoState(z_m=z_m, length_m=length, width_m=width, height_m=height, **moves, **built)
+        until_s = min(t_s + policy.ROUTE_AHEAD_S, trajectory.t_s[-1]) + policy.ROUTE_STEP_S / 2
+        t = np.arange(t_s, until_s, policy.ROUTE_STEP_S)
+        x, y, _, yaw, speed = trajectory.at(t)
+        route = policy.Route(*(_read_only(c) for c in (t, x, y, yaw, speed)))
+        return policy.Observation(t_s, dt_s, ego, self._others(ego, step, t_s), route, path)
 
     def _others(self, ego: policy.EgoState, step: int, t_s: float) -> policy.Others:
         begin_s, end_s = self._static_lives_s.T

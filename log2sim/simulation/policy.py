@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
@@ -201,16 +200,33 @@ def load_policy(name: str) -> Policy:
     Raises `ConfigError` when the name has another form, or cannot be imported, instantiated or called.
     """
     source, colon, attribute = name.rpartition(":")
-    if not colon and name:
-        return _load_plugin(name)
+    if not colon and name:  # what another package declares as an entry point of the group "log2sim.policy"
+        try:
+            target: Any = plugins.load("policy", name)
+        except PluginError:
+            raise
+        except ConfigError as error:
+            raise ConfigError(
+                f"{error}; of a module or a file, expected module:attribute or file.py:attribute, such as my_driver:brake_late"
+            ) from None
+        label = plugins.plugin_label("policy", name)
+        return PluginPolicy(_made(target, label, PluginError), label)
     if not (source and attribute):
         raise ConfigError(
             f"policy '{name}': expected module:attribute or file.py:attribute, such as my_driver:brake_late, or the name of a plug-in"
         )
     try:
-        folder = Path(source).resolve().parent if source.endswith(".py") else Path.cwd()
-        with _first_on_path(folder):
-            target: Any = _import_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
+        path = Path(source)
+        with _first_on_path(path.resolve().parent if source.endswith(".py") else Path.cwd()):
+            if not source.endswith(".py"):
+                target = importlib.import_module(source)
+            else:
+                spec = importlib.util.spec_from_file_location(f"log2sim_policy_{path.stem}", path)
+                if spec is None or spec.loader is None:
+                    raise ImportError(f"{path} is no Python file")
+                target = importlib.util.module_from_spec(spec)
+                sys.modules[spec.name] = target  # dataclasses of the file look their module up there
+                spec.loader.exec_module(target)
     except Exception as error:  # a user's module may raise anything while it is imported
         raise ConfigError(f"policy '{name}': '{source}' cannot be imported: {type(error).__name__}: {error}") from error
     for part in attribute.split("."):
@@ -246,20 +262,6 @@ class PluginPolicy:
             raise PluginError(f"{self.source}: {error}") from error
 
 
-def _load_plugin(name: str) -> Policy:
-    """Load the policy that another package declares as an entry point of the group "log2sim.policy"."""
-    try:
-        target = plugins.load("policy", name)
-    except PluginError:
-        raise
-    except ConfigError as error:
-        raise ConfigError(
-            f"{error}; of a module or a file, expected module:attribute or file.py:attribute, such as my_driver:brake_late"
-        ) from None
-    source = plugins.plugin_label("policy", name)
-    return PluginPolicy(_made(target, source, PluginError), source)
-
-
 def _made(target: Any, source: str, error_type: type[ConfigError]) -> Policy:
     """Return the policy itself, which a class is made to without arguments."""
     if isinstance(target, type):
@@ -271,16 +273,6 @@ def _made(target: Any, source: str, error_type: type[ConfigError]) -> Policy:
         raise error_type(f"{source}: is a {type(target).__name__}, expected a callable policy(observation) -> Controls")
     result: Policy = target
     return result
-
-
-def _import_file(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"log2sim_policy_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} is no Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses of the file look their module up there
-    spec.loader.exec_module(module)
-    return module
 
 
 @contextmanager

@@ -11,11 +11,9 @@ from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.metrics.realism import Motions, sizes_of
 from log2sim.simulation.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
-from log2sim.simulation.vehicles.parameters import WHEELED
+from log2sim.simulation.vehicles.vehicle import WHEELED
 
-HISTORY_S = 1.0
-"""Of the past is known; with the present eleven ticks, as in the challenge."""
-
+HISTORY_S = 1.0  # of the past is known; with the present eleven ticks, as in the challenge
 NORMAL_PER_MEDIAN = 1.4826
 
 Mask = NDArray[np.bool_]

@@ -20,16 +20,13 @@ from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGrou
 from log2sim.simulation.metrics.collisions import BoxTracks, contacts
 from log2sim.simulation.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
 from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
-from log2sim.simulation.vehicles.parameters import WHEELED
-from log2sim.simulation.vehicles.vehicle import Columns
+from log2sim.simulation.vehicles.vehicle import WHEELED, Columns
 
 EXPONENT = 4.0
 MIN_GAP_M = 0.1  # shorter gaps, and overlaps, count as this one
 MIN_PACE_MPS = 0.5  # where it is slower, the rate responds as at this speed; it would have no bound at standstill
 HOLD_MPS = 0.2  # a slower agent with a leader is held at standstill,
-HOLD_DEMAND = (
-    0.5  # until the leader's demand falls below this share of the free acceleration: 1.4 times the minimum gap
-)
+HOLD_DEMAND = 0.5  # until the leader demands less than this share of the free acceleration: 1.4 times the minimum gap
 
 # Time gap in s, minimum gap in m, acceleration, comfortable and hardest braking in m/s2. On wheels: town traffic in
 # Treiber and Kesting, "Traffic Flow Dynamics", 2013, chapter 11. On foot: an arm's length, and a stop within one step.
@@ -41,11 +38,11 @@ ON_FOOT = (0.5, 0.7, 1.0, 1.5, 4.0)
 class IdmParameters(Columns):
     """Parameters of the intelligent driver model, all (A,)."""
 
-    time_gap_s: Array  # (A,)
-    gap_m: Array  # (A,) minimum gap, kept at standstill
-    accel_mps2: Array  # (A,) free acceleration
-    comfort_mps2: Array  # (A,) comfortable braking
-    brake_mps2: Array  # (A,) hardest braking
+    time_gap_s: Array
+    gap_m: Array  # minimum gap, kept at standstill
+    accel_mps2: Array  # free acceleration
+    comfort_mps2: Array  # comfortable braking
+    brake_mps2: Array  # hardest braking
 
 
 def idm_parameters(agents: Sequence[Agent]) -> IdmParameters:
@@ -61,8 +58,7 @@ def leader_demand(driver: IdmParameters, gap_m: Array, pace_mps: Array, leader_m
     """
     closing = pace_mps * (pace_mps - leader_mps) / (2 * np.sqrt(driver.accel_mps2 * driver.comfort_mps2))
     desired = driver.gap_m + np.maximum(pace_mps * driver.time_gap_s + closing, 0.0)
-    result: Array = (desired / np.maximum(gap_m, MIN_GAP_M)) ** 2
-    return result
+    return np.asarray((desired / np.maximum(gap_m, MIN_GAP_M)) ** 2)
 
 
 def rate_response(
@@ -101,17 +97,33 @@ class PathForesight:
 
     def expect(self, agent: Index, t_s: Array, rate: Array) -> corridors.Prediction:
         """Predict agents (P,) that pass their trajectories at rates (P,), from where these are at times (P,)."""
-        return corridors.predict_by_log(self._paths, agent, t_s, rate)
+        pose = self._paths.at(agent[:, None], t_s[:, None] + rate[:, None] * corridors.HORIZON_S)
+        return corridors.Prediction(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps * rate[:, None])
 
     def expect_driven(self, agent: int, t_s: float, pose: corridors.Pose) -> corridors.Prediction:
-        """Predict an agent that a policy drives, from where it is among all poses; (1, H)."""
+        """Predict an agent that a policy drives, from where it is among all poses: along its path while on it; (1, H)."""
         x, y, yaw, speed = (float(c[agent]) for c in (pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps))
-        return corridors.predict_policy_vehicle(self._paths, agent, x, y, yaw, speed)
+        cos, sin, one, whole_m = np.cos(yaw), np.sin(yaw), np.array([agent]), float(self._paths.marks[agent])
+        foot = self._paths.foot(one, np.zeros(1), whole_m, np.array([[x]]), np.array([[y]]))
+        left_m = float(foot.left_m[0, 0])
+        along = float(cos * foot.cos[0, 0] + sin * foot.sin[0, 0])
+        if speed >= 0 and abs(left_m) < corridors.ON_PATH_M and along > corridors.ON_PATH_COS:
+            return self._along_path(agent, foot.distance_m[0] + foot.ahead_m[0], np.array([speed]), left_m)
+        traveled = speed * corridors.HORIZON_S[None]
+        same = np.ones_like(traveled)
+        return corridors.Prediction(x + traveled * cos, y + traveled * sin, yaw * same, speed * same)
 
     def expect_driven_in_scenario(self, agent: int, t_s: Array) -> corridors.Prediction:
         """Predict that agent by the same rules from where the scenario has it at times (P,)."""
         pose = self._paths.at(np.full(len(t_s), agent), t_s)
-        return corridors.predict_along_path(self._paths, agent, pose.distance_m, np.abs(pose.speed_mps))
+        return self._along_path(agent, pose.distance_m, np.abs(pose.speed_mps))
+
+    def _along_path(self, agent: int, distance_m: Array, pace_mps: Array, left_m: float = 0.0) -> corridors.Prediction:
+        """Predict an agent that goes along its path at speeds (P,) from distances (P,), with an offset to the left."""
+        ahead = distance_m[:, None] + pace_mps[:, None] * corridors.HORIZON_S
+        x, y, cos, sin, _ = self._paths.along(np.array([agent])[:, None], ahead)
+        pace = np.broadcast_to(pace_mps[:, None], ahead.shape)
+        return corridors.Prediction(x - left_m * sin, y + left_m * cos, np.arctan2(sin, cos), pace)
 
 
 class MotionForesight(PathForesight):
@@ -119,10 +131,9 @@ class MotionForesight(PathForesight):
 
     def __init__(self, paths: corridors.PathTable, agents: Sequence[Agent]) -> None:
         super().__init__(paths)
-        begin_s, end_s = float(paths.begin_s.min()), float(paths.end_s.max())
-        self._begin_s = begin_s
-        ticks = np.arange(int((end_s - begin_s) / TICK_S) + 1, dtype=np.float64)
-        table = tabulate(agents, begin_s + TICK_S * ticks, TICK_S)
+        self._begin_s, end_s = float(paths.begin_s.min()), float(paths.end_s.max())
+        ticks = np.arange(int((end_s - self._begin_s) / TICK_S) + 1, dtype=np.float64)
+        table = tabulate(agents, self._begin_s + TICK_S * ticks, TICK_S)
         smooth = smooth_motion(table)
         self._velocity = np.where(table.present, smooth.velocity_mps, 0.0)
         self._turn_radps = np.where(table.present, smooth.turn_radps, 0.0)
@@ -175,164 +186,6 @@ GAP_M, SPEED_MPS = 0.5, 0.5
 MIN_DEMAND = 1e-3  # share of the free acceleration below which a demand is ignored
 PATH_HULL_MARGIN_M = 1.0  # how far paths may leave the hull of a few of their points
 
-
-@dataclass(frozen=True, eq=False)
-class TrafficState:
-    """All agents (A,) at one time."""
-
-    paths: corridors.PathTable
-    idm: IdmParameters
-    size_m: Array  # (A, 3)
-    reacts: NDArray[np.bool_]  # (A,) whether an agent is reactive
-    driven: int  # the agent that a policy drives, -1 without
-    t_s: Array  # (A,) time on the scenario of each agent
-    rate: Array  # (A,) rate at which each agent passes its trajectory
-    pose: corridors.Pose  # where the agents are, (A,)
-    prediction: corridors.Prediction  # where they are expected to go, (A, H)
-    foresight: PathForesight  # what expects it
-
-    def reach_m(self, i: Index) -> Array:
-        """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
-        pace, d = np.abs(self.pose.speed_mps[i]), self.idm.take(i)
-        stop_m = pace * (d.time_gap_s + corridors.HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
-        result: Array = np.minimum(MIN_LOOKAHEAD_M + stop_m + self.size_m[i, 0], corridors.EXTENSION_M)
-        return result
-
-    def meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
-        """Select those of the pairs (P,), (P,) that may come near each other within the horizon."""
-        p, radius = self.pose, np.hypot(self.size_m[:, 0], self.size_m[:, 1]) / 2
-        reach = self.reach_m(i) + np.abs(p.speed_mps[j]) * corridors.HORIZON_S[-1] + radius[i] + radius[j]
-        near = (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
-        i, j = i[near], j[near]
-        level = self._level(i, j)
-        i, j = i[level], j[level]
-        # Four boxes about the path ahead exclude most agents within the circle, above all those in other lanes.
-        x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self.prediction[:2])
-        swept = self._hull(i, x[:, j], y[:, j])
-        room = radius[j] + self.size_m[i, 1] / 2 + MARGINS_IN_SCENARIO.side_m + PATH_HULL_MARGIN_M
-        own = np.flatnonzero(self.reacts)
-        ahead = np.linspace(0.0, 1.0, 13)[:, None] * self.reach_m(own)
-        x, y, *_ = self.paths.along(own[None], self.pose.distance_m[own] + ahead)
-        meets, slot = np.zeros(len(i), dtype=bool), np.searchsorted(own, i)
-        for part in (slice(0, 4), slice(3, 7), slice(6, 10), slice(9, 13)):
-            section = self._hull(own, x[part], y[part])
-            apart = [
-                (low > end[slot] + room) | (high < begin[slot] - room)
-                for (low, high), (begin, end) in zip(swept, section)
-            ]
-            meets |= ~(apart[0] | apart[1])
-        return i[meets], j[meets]
-
-    def _level(self, i: Index, j: Index) -> NDArray[np.bool_]:
-        """Whether agents j (P,) are at the height of agents i (P,), or of the paths of these that far ahead."""
-        p = self.pose
-        gap_m = np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j])
-        ahead_m = self.paths.at(i, self.paths.times(i, p.distance_m[i] + gap_m)).z_m
-        apart_m = np.minimum(np.abs(p.z_m[i] - p.z_m[j]), np.abs(ahead_m - p.z_m[j]))
-        result: NDArray[np.bool_] = apart_m < (self.size_m[i, 2] + self.size_m[j, 2]) / 2
-        return result
-
-    def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Return minimum and maximum of points (N, P), ahead and to the left of agents i (P,)."""
-        cos, sin = np.cos(self.pose.yaw_rad[i]), np.sin(self.pose.yaw_rad[i])
-        dx, dy = x_m - self.pose.x_m[i], y_m - self.pose.y_m[i]
-        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
-        return (ahead.min(axis=0), ahead.max(axis=0)), (left.min(axis=0), left.max(axis=0))
-
-
-def excess_demand(m: TrafficState, i: Index, j: Index, trusted: NDArray[np.bool_]) -> Array:
-    """Return the share of the free acceleration of agents i (P,) that agents j (P,) take beyond the scenario.
-
-    Where the scenario is not `trusted` (P,), the whole demand counts.
-    """
-    driver, logged_pace = m.idm.take(i), np.abs(m.pose.speed_mps[i])
-    pace = m.rate[i] * logged_pace
-    logged = m.paths.at(i[:, None], m.t_s[i][:, None] + corridors.HORIZON_S).distance_m - m.pose.distance_m[i][:, None]
-    starting = pace[:, None] * corridors.HORIZON_S + driver.accel_mps2[:, None] * corridors.HORIZON_S**2 / 2
-    means = np.where(m.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
-    there = corridors.Prediction(*(c[j] for c in m.prediction))
-    found = corridors.leaders(m.paths, _corridor(m, i, pace, means), there, m.size_m[j], MARGINS_NOW)
-    # Where two reactive agents meet, the one that was first in the scenario goes first; an obstacle already in the path is
-    # waited for.
-    first = m.reacts[i] & m.reacts[j] & (found.ahead_s > 0)
-    first &= found.own_t_s < m.t_s[j] + m.rate[j] * found.ahead_s
-    gap = np.where(first & trusted, np.inf, found.gap_m)
-    taken = leader_demand(driver, gap, pace, found.speed_mps)
-    t_s = m.t_s[i]
-    k = np.flatnonzero((taken > MIN_DEMAND) & trusted & (m.paths.begin_s[j] <= t_s) & (t_s <= m.paths.end_s[j]))
-    if len(k):
-        taken[k] -= _demand_in_scenario(m, i[k], j[k], gap[k], _corridor(m, i[k], logged_pace[k], logged[k]))
-    return np.maximum(taken, 0.0)
-
-
-def _demand_in_scenario(m: TrafficState, i: Index, j: Index, gap_m: Array, corridor: corridors.SweptCorridor) -> Array:
-    """Return the demand of agents j (P,) in the scenario when agents i (P,) were here, as far as it applies now.
-
-    The nearer the other agent is than it was in the scenario, the less of the scenario's demand counts; at half the gap
-    none.
-    """
-    found = corridors.leaders(m.paths, corridor, _predict_in_scenario(m, j, m.t_s[i]), m.size_m[j], MARGINS_IN_SCENARIO)
-    gap = found.gap_m - GAP_M
-    taken = leader_demand(m.idm.take(i), gap, corridor.pace_mps, found.speed_mps - SPEED_MPS)
-    known = np.isfinite(gap)
-    scale = np.maximum(np.where(known, gap, 0.0) / 2, 1.0)
-    lost = np.where(known, np.maximum(np.where(known, gap, 0.0) - gap_m, 0.0) / scale, 1.0)
-    result: Array = np.maximum(1 - lost, 0.0) * taken
-    return result
-
-
-def _corridor(m: TrafficState, i: Index, pace: Array, progress: Array) -> corridors.SweptCorridor:
-    reach = float(m.reach_m(i).max())
-    return corridors.SweptCorridor(i, m.pose.distance_m[i], m.size_m[i, 0], m.size_m[i, 1], pace, progress, reach)
-
-
-def _predict_in_scenario(m: TrafficState, j: Index, t_s: Array) -> corridors.Prediction:
-    """Predict agents (P,) from the scenario at times (P,), by the same rules."""
-    prediction = m.foresight.expect(j, t_s, np.ones(len(j)))
-    if not np.any(j == m.driven):
-        return prediction
-    return _select(j == m.driven, m.foresight.expect_driven_in_scenario(m.driven, t_s), prediction)
-
-
-def _select(mask: NDArray[np.bool_], one: corridors.Prediction, other: corridors.Prediction) -> corridors.Prediction:
-    return corridors.Prediction(*(np.where(mask[:, None], a, b) for a, b in zip(one, other)))
-
-
-DEEP_OVERLAP_M = 0.5  # larger than the errors of boxes
-OVERLAP_CHUNK = 200
-
-
-def deep_overlaps(paths: corridors.PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the pairs (A, A) whose boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
-
-    Pairs that overlap from the start are one object detected twice, or a load and its carrier: no reason to brake.
-    """
-    count = len(size_m)
-    deep, together = np.zeros((2, count, count), dtype=bool)
-    stays = static & (paths.begin_s == paths.end_s)
-    moving = ~static
-    if not moving.any():
-        return deep
-    begin_s = np.where(stays, -np.inf, paths.begin_s)
-    end_s = np.where(stays, np.inf, paths.end_s)
-    t_s = np.arange(
-        paths.begin_s[moving].min(), paths.end_s[moving].max() + corridors.TIME_STEP_S, corridors.TIME_STEP_S
-    )
-    size = np.maximum(size_m - [DEEP_OVERLAP_M, DEEP_OVERLAP_M, 0.0], 0.1)
-    everybody = np.arange(count)
-    for part in np.split(t_s, range(OVERLAP_CHUNK, len(t_s), OVERLAP_CHUNK)):
-        pose = paths.at(everybody, part[:, None])
-        there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
-        x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
-        found = contacts(BoxTracks(x, y, z, yaw, speed, size), moving)
-        a, b = found.a, found.b
-        deep[a, b] = True
-        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + corridors.TIME_STEP_S
-        together[a[at_once], b[at_once]] = True
-    into = deep & ~together
-    return into | into.T
-
-
 DECISION_STEP_S = 0.1
 CHUNK = 4096  # pairs evaluated together
 # A demand fades over this time after it ends, so that the rate does not oscillate at the edge of a conflict.
@@ -354,6 +207,10 @@ class Traffic:
     is reproduced. Where the paths of two reactive agents cross, the one that was there first in the scenario goes
     first. Cost: R A comparisons a decision, then some 500 distances for each pair in reach.
     """
+
+    _t_s: Array  # time on the scenario of each agent at the last decision, and where it was
+    _pose: corridors.Pose
+    _prediction: corridors.Prediction  # where agents were expected to go then, (A, H)
 
     def __init__(
         self,
@@ -395,59 +252,157 @@ class Traffic:
         self.delay_s = self.delay_s + np.where(going, (1 - (self.rate + rate) / 2) * dt_s, 0.0)
         self.rate = rate
 
-    def _decide(self, t_s: float, tau: Array, own: NDArray[np.intp], ego: Snapshot | None) -> None:
-        """Set the rates of agents `own` (R,) and their slopes."""
-        pose = self.paths.at(np.arange(len(tau)), tau)
+    def _decide(self, t_s: float, tau: Array, own: Index, ego: Snapshot | None) -> None:
+        """Set the rates of agents `own` (R,) and their slopes; each agent is at its own time of the scenario, `tau`."""
+        paths, driven, everyone = self.paths, self._driven, np.arange(len(tau))
+        pose = paths.at(everyone, tau)
         pace = np.abs(pose.speed_mps[own])
-        log_accel = (np.abs(self.paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
-        pose = self._replace_driven_pose(pose, ego)
-        # Predict all agents (A,) at a time, each of which is at its own time of the scenario `own_s` (A,).
-        everyone = np.arange(len(tau))
+        log_accel = (np.abs(paths.at(own, tau[own] + DECISION_STEP_S).speed_mps) - pace) / DECISION_STEP_S
+        if ego is not None and driven >= 0 and len(ego.x_m):  # the driven agent is where the policy has driven it
+            x, y, z, yaw, speed = (c.copy() for c in pose[:5])
+            x[driven], y[driven] = ego.x_m[0] - paths.origin_m[0], ego.y_m[0] - paths.origin_m[1]
+            yaw[driven], speed[driven] = ego.yaw_rad[0], ego.speed_mps[0]
+            # Its height is that of the scenario at this place; by time, nobody would brake for it on a slope if it fell behind.
+            self._driven_m = paths.progress_near(driven, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
+            one = np.array([driven])
+            z[driven] = paths.at(one, paths.times(one, np.array([self._driven_m]))).z_m[0]
+            pose = pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
         prediction = self._foresight.expect(everyone, tau, self.rate)
-        if self._driven >= 0:
-            driven = self._foresight.expect_driven(self._driven, t_s, pose)
-            prediction = _select(everyone == self._driven, driven, prediction)
-        moment = TrafficState(
-            self.paths, self.idm, self._size, self.reacts, self._driven, tau, self.rate, pose, prediction,
-            self._foresight,
-        )  # fmt: skip
-        taken = np.zeros(len(tau))
-        pairs = moment.meeting(*self._pairs(t_s, tau, own))
+        if driven >= 0:
+            prediction = _select(everyone == driven, self._foresight.expect_driven(driven, t_s, pose), prediction)
+        self._t_s, self._pose, self._prediction = tau, pose, prediction
+        # Pairs of a reactive agent and a present one whose relation differs from the scenario.
+        differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_DELAY_S) & ~self._static
+        if driven >= 0:
+            differs[:, driven] = True
+        differs |= self._distrusted[own]
+        differs &= (paths.begin_s <= t_s) & (tau <= paths.end_s) | self._stays
+        differs[np.arange(len(own)), own] = False
+        row, other = np.nonzero(differs)
+        pairs, taken = self._meeting(own[row], other), np.zeros(len(tau))
         for begin in range(0, len(pairs[0]), CHUNK):
             i, j = (p[begin : begin + CHUNK] for p in pairs)
-            np.maximum.at(taken, i, excess_demand(moment, i, j, ~self._distrusted[i, j]))
+            np.maximum.at(taken, i, self._excess_demand(i, j))
         kept = np.minimum(self._taken, MAX_KEPT_DEMAND) * np.exp(-DECISION_STEP_S / RELEASE_S)
-        taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
-        self._taken = taken
+        self._taken = taken = np.maximum(taken, np.where(kept > MIN_DEMAND, kept, 0.0))
         rate, slope = rate_response(self.idm.take(own), self.rate[own], taken[own], pace, log_accel)
         stands = pace < STANDSTILL_MPS  # the scenario's time goes on: waiting then counts as the scenario's own stop
         self.rate[own], self.rate_slope[own] = np.where(stands, 1.0, rate), np.where(stands, 0.0, slope)
 
-    def _replace_driven_pose(self, pose: corridors.Pose, ego: Snapshot | None) -> corridors.Pose:
-        """Replace the pose of the driven agent by the one to which the policy has driven it."""
-        k = self._driven
-        if ego is None or k < 0 or not len(ego.x_m):
-            return pose
-        x, y, yaw, speed = pose.x_m.copy(), pose.y_m.copy(), pose.yaw_rad.copy(), pose.speed_mps.copy()
-        x[k], y[k] = ego.x_m[0] - self.paths.origin_m[0], ego.y_m[0] - self.paths.origin_m[1]
-        yaw[k], speed[k] = ego.yaw_rad[0], ego.speed_mps[0]
-        # Its height is that of the scenario at this place; by time, nobody would brake for it on a slope if it fell behind.
-        self._driven_m = self.paths.progress_near(k, self._driven_m, float(ego.x_m[0]), float(ego.y_m[0]))
-        z = pose.z_m.copy()
-        driven = np.array([k])
-        z[k] = self.paths.at(driven, self.paths.times(driven, np.array([self._driven_m]))).z_m[0]
-        return pose._replace(x_m=x, y_m=y, z_m=z, yaw_rad=yaw, speed_mps=speed)
+    def _reach_m(self, i: Index) -> Array:
+        """Return the look-ahead distance of agents (P,): a comfortable stop and a reserve."""
+        pace, d = np.abs(self._pose.speed_mps[i]), self.idm.take(i)
+        stop_m = pace * (d.time_gap_s + corridors.HORIZON_S[-1]) + pace**2 / (2 * d.comfort_mps2)
+        return np.asarray(np.minimum(MIN_LOOKAHEAD_M + stop_m + self._size[i, 0], corridors.EXTENSION_M))
 
-    def _pairs(self, t_s: float, tau: Array, own: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return pairs of a reactive agent (P,) and a present agent (P,) whose relation differs from the scenario."""
-        differs = (np.abs(self.delay_s[own][:, None] - self.delay_s) > SAME_DELAY_S) & ~self._static
-        if self._driven >= 0:
-            differs[:, self._driven] = True
-        differs |= self._distrusted[own]
-        differs &= (self.paths.begin_s <= t_s) & (tau <= self.paths.end_s) | self._stays
-        differs[np.arange(len(own)), own] = False
-        row, j = np.nonzero(differs)
-        return own[row], j
+    def _meeting(self, i: Index, j: Index) -> tuple[Index, Index]:
+        """Select those of the pairs (P,), (P,) that may come near each other within the horizon."""
+        p, size, radius = self._pose, self._size, np.hypot(self._size[:, 0], self._size[:, 1]) / 2
+        reach = self._reach_m(i) + np.abs(p.speed_mps[j]) * corridors.HORIZON_S[-1] + radius[i] + radius[j]
+        near = (p.x_m[i] - p.x_m[j]) ** 2 + (p.y_m[i] - p.y_m[j]) ** 2 < reach**2
+        i, j = i[near], j[near]
+        # At one height are agents j with agents i, or with the paths of these that far ahead.
+        gap_m = np.hypot(p.x_m[i] - p.x_m[j], p.y_m[i] - p.y_m[j])
+        ahead_m = self.paths.at(i, self.paths.times(i, p.distance_m[i] + gap_m)).z_m
+        apart_m = np.minimum(np.abs(p.z_m[i] - p.z_m[j]), np.abs(ahead_m - p.z_m[j]))
+        level = apart_m < (size[i, 2] + size[j, 2]) / 2
+        i, j = i[level], j[level]
+        # Four boxes about the path ahead exclude most agents within the circle, above all those in other lanes.
+        x, y = (np.ascontiguousarray(c[:, ::4].T) for c in self._prediction[:2])
+        swept = self._hull(i, x[:, j], y[:, j])
+        room = radius[j] + size[i, 1] / 2 + MARGINS_IN_SCENARIO.side_m + PATH_HULL_MARGIN_M
+        own = np.flatnonzero(self.reacts)
+        ahead = np.linspace(0.0, 1.0, 13)[:, None] * self._reach_m(own)
+        x, y, *_ = self.paths.along(own[None], p.distance_m[own] + ahead)
+        meets, slot = np.zeros(len(i), dtype=bool), np.searchsorted(own, i)
+        for part in (slice(0, 4), slice(3, 7), slice(6, 10), slice(9, 13)):
+            section = self._hull(own, x[part], y[part])
+            apart = [
+                (low > end[slot] + room) | (high < begin[slot] - room)
+                for (low, high), (begin, end) in zip(swept, section)
+            ]
+            meets |= ~(apart[0] | apart[1])
+        return i[meets], j[meets]
+
+    def _hull(self, i: Index, x_m: Array, y_m: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Return minimum and maximum of points (N, P), ahead and to the left of agents i (P,)."""
+        cos, sin = np.cos(self._pose.yaw_rad[i]), np.sin(self._pose.yaw_rad[i])
+        dx, dy = x_m - self._pose.x_m[i], y_m - self._pose.y_m[i]
+        ahead, left = dx * cos + dy * sin, dy * cos - dx * sin
+        return (ahead.min(axis=0), ahead.max(axis=0)), (left.min(axis=0), left.max(axis=0))
+
+    def _corridor(self, i: Index, pace: Array, progress: Array) -> corridors.SweptCorridor:
+        length, width, reach = self._size[i, 0], self._size[i, 1], float(self._reach_m(i).max())
+        return corridors.SweptCorridor(i, self._pose.distance_m[i], length, width, pace, progress, reach)
+
+    def _excess_demand(self, i: Index, j: Index) -> Array:
+        """Return the share of the free acceleration of agents i (P,) that agents j (P,) take beyond the scenario."""
+        driver, logged_pace, t_s = self.idm.take(i), np.abs(self._pose.speed_mps[i]), self._t_s[i]
+        pace, trusted = self.rate[i] * logged_pace, ~self._distrusted[i, j]
+        logged = self.paths.at(i[:, None], t_s[:, None] + corridors.HORIZON_S).distance_m
+        logged = logged - self._pose.distance_m[i][:, None]
+        starting = pace[:, None] * corridors.HORIZON_S + driver.accel_mps2[:, None] * corridors.HORIZON_S**2 / 2
+        means = np.where(self.rate[i][:, None] < 1, np.minimum(logged, starting), logged)
+        there = corridors.Prediction(*(c[j] for c in self._prediction))
+        found = corridors.leaders(self.paths, self._corridor(i, pace, means), there, self._size[j], MARGINS_NOW)
+        # Where two reactive agents meet, the one that was first in the scenario goes first; an obstacle already in the path is
+        # waited for.
+        first = self.reacts[i] & self.reacts[j] & (found.ahead_s > 0)
+        first &= found.own_t_s < self._t_s[j] + self.rate[j] * found.ahead_s
+        gap = np.where(first & trusted, np.inf, found.gap_m)
+        taken = leader_demand(driver, gap, pace, found.speed_mps)
+        k = np.flatnonzero(
+            (taken > MIN_DEMAND) & trusted & (self.paths.begin_s[j] <= t_s) & (t_s <= self.paths.end_s[j])
+        )
+        if len(k):  # less the demand of agents j in the scenario when agents i were here, as far as it applies now
+            i, j, gap, t_s, logged_pace = i[k], j[k], gap[k], t_s[k], logged_pace[k]
+            there = self._foresight.expect(j, t_s, np.ones(len(j)))
+            if np.any(j == self._driven):
+                driven = self._foresight.expect_driven_in_scenario(self._driven, t_s)
+                there = _select(j == self._driven, driven, there)
+            corridor = self._corridor(i, logged_pace, logged[k])
+            found = corridors.leaders(self.paths, corridor, there, self._size[j], MARGINS_IN_SCENARIO)
+            # The nearer the other agent is than it was in the scenario, the less of that counts; at half the gap none.
+            known, logged_gap = np.isfinite(found.gap_m), found.gap_m - GAP_M
+            was = np.where(known, logged_gap, 0.0)
+            lost = np.where(known, np.maximum(was - gap, 0.0) / np.maximum(was / 2, 1.0), 1.0)
+            before = leader_demand(driver.take(k), logged_gap, logged_pace, found.speed_mps - SPEED_MPS)
+            taken[k] -= np.maximum(1 - lost, 0.0) * before
+        return np.maximum(taken, 0.0)
+
+
+def _select(mask: NDArray[np.bool_], one: corridors.Prediction, other: corridors.Prediction) -> corridors.Prediction:
+    return corridors.Prediction(*(np.where(mask[:, None], a, b) for a, b in zip(one, other)))
+
+
+DEEP_OVERLAP_M = 0.5  # larger than the errors of boxes
+OVERLAP_CHUNK = 200
+
+
+def deep_overlaps(paths: corridors.PathTable, size_m: Array, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the pairs (A, A) whose boxes come to overlap by more than `DEEP_OVERLAP_M`, not from the start.
+
+    Pairs that overlap from the start are one object detected twice, or a load and its carrier: no reason to brake.
+    """
+    count, moving, step_s = len(size_m), ~static, corridors.TIME_STEP_S
+    deep, together = np.zeros((2, count, count), dtype=bool)
+    if not moving.any():
+        return deep
+    stays = static & (paths.begin_s == paths.end_s)
+    begin_s, end_s = np.where(stays, -np.inf, paths.begin_s), np.where(stays, np.inf, paths.end_s)
+    t_s = np.arange(paths.begin_s[moving].min(), paths.end_s[moving].max() + step_s, step_s)
+    size = np.maximum(size_m - [DEEP_OVERLAP_M, DEEP_OVERLAP_M, 0.0], 0.1)
+    for part in np.split(t_s, range(OVERLAP_CHUNK, len(t_s), OVERLAP_CHUNK)):
+        pose = paths.at(np.arange(count), part[:, None])
+        there = (begin_s <= part[:, None]) & (part[:, None] <= end_s)
+        x, y, z, yaw, speed = (np.where(there, c, np.nan) for c in pose[:5])
+        found = contacts(BoxTracks(x, y, z, yaw, speed, size), moving)
+        a, b = found.a, found.b
+        deep[a, b] = True
+        at_once = part[found.first_row.astype(np.intp)] <= np.maximum(begin_s[a], begin_s[b]) + step_s
+        together[a[at_once], b[at_once]] = True
+    into = deep & ~together
+    return into | into.T
 
 
 # Columns that scale with the rate, and the columns of their derivatives.

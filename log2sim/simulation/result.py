@@ -40,8 +40,7 @@ class CollisionWarning:
     probability: float = 0.0  # of the collision, at that time
     ttc_s: float | None = None  # time to the collision then
     way_m: float | None = None  # of the ego until then, at its speed
-    # M/s2, deceleration with which the ego stands before that place; None where it is too late.
-    needed_mps2: float | None = None
+    needed_mps2: float | None = None  # deceleration with which the ego stands before that place; None: too late
     braking_suffices: bool = False  # whether the ego can stand before that place
     spans_s: tuple[tuple[float, float], ...] = ()  # while it is warned of
     collision_s: float | None = None  # when the ego touches it in the replay
@@ -73,9 +72,8 @@ class Warnings:
     margin_s: float
     reaction_s: float
     brake_mps2: float
-    # agents, known_agents: agents without the ego, and how many of them the ends get to know.
-    agents: int
-    known_agents: int
+    agents: int  # without the ego
+    known_agents: int  # how many of them the ends get to know
     driven_s: float  # for how long the ego moved, or all together who are warned in its place
     events: tuple[CollisionWarning, ...] = ()
 
@@ -85,11 +83,8 @@ class Warnings:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry `warnings` of `schemas/replay-1.json`."""
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "events"}
-        events = [
-            {**asdict(w), "known_by": dict(w.known_by), "spans_s": [list(s) for s in w.spans_s]} for w in self.events
-        ]
-        return {**plain, "events": events}
+        plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {**plain, "events": [{**asdict(w), "spans_s": [list(s) for s in w.spans_s]} for w in self.events]}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
@@ -180,10 +175,7 @@ class Replay:
 
     def agent(self, id: str) -> AgentReplay:
         """Return the agent with an id; `KeyError` when there is none."""
-        for agent in self.agents:
-            if agent.id == id:
-                return agent
-        raise KeyError(id)
+        return {agent.id: agent for agent in self.agents}[id]
 
     def save(self, path: Path | str) -> None:
         """Write the replay, whole or not at all."""
@@ -203,10 +195,20 @@ class Replay:
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/replay-1.json`."""
         plain = {k: getattr(self, k) for k in ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s")}
-        agents = [_agent_to_dict(a) for a in self.agents]
-        metrics = {"metrics": dict(self.metrics), "left_out": dict(self.left_out)}
-        document = {"replay_version": VERSION, **plain, "agents": agents, **metrics}
-        return document if self.warnings is None else {**document, "warnings": self.warnings.to_dict()}
+        agents = []
+        for a in self.agents:
+            length, width, height = (float(v) for v in a.size_m)
+            commands, errors = a.commands, AgentReplay.ERRORS if a.cross_track_m is not None else ()
+            agents.append({
+                "id": a.id, "category": a.category, "size_m": {"length": length, "width": width, "height": height},
+                "driver": a.driver, "model": a.model, "model_reason": a.model_reason, "flags": list(a.flags),
+                "states": {k: getattr(a, k).tolist() for k in AgentReplay.COLUMNS},
+                "commands": commands and {k: getattr(commands, k).tolist() for k in Commands.COLUMNS},
+                "errors": {k: getattr(a, k).tolist() for k in errors} or None,
+            })  # fmt: skip
+        document = {"replay_version": VERSION, **plain, "agents": agents, "metrics": dict(self.metrics)}
+        warned = {} if self.warnings is None else {"warnings": self.warnings.to_dict()}
+        return {**document, "left_out": dict(self.left_out), **warned}
 
     @classmethod
     def from_dict(cls, document: Any) -> Self:
@@ -215,36 +217,46 @@ class Replay:
         if version != VERSION:
             raise ScenarioError(f"replay_version is {version!r}, expected {VERSION}; is this a replay file of log2sim?")
         check(document, "replay-1", ScenarioError)
-        plain = ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s", "metrics")
-        agents = tuple(_agent_from_dict(a) for a in document["agents"])
-        known = {**{k: document[k] for k in plain}, "metrics": _add_owners(document["metrics"])}
+        agents = []
+        for entry in document["agents"]:
+            states = _columns(entry, "states", AgentReplay.COLUMNS)
+            # Files written by 0.1.0 have neither commands nor errors.
+            commands = _columns(entry, "commands", Commands.COLUMNS)
+            if commands:
+                commands["gear"] = commands["gear"].astype(np.int8)
+            length, width, height = (float(entry["size_m"][key]) for key in ("length", "width", "height"))
+            agents.append(AgentReplay(
+                **{key: entry[key] for key in ("id", "category", "driver", "model")}, size_m=(length, width, height),
+                flags=tuple(entry["flags"]), model_reason=entry.get("model_reason", ""),
+                commands=Commands(**commands) if commands else None, **states,
+                **_columns(entry, "errors", AgentReplay.ERRORS),
+            ))  # fmt: skip
+
+        # Older files only say whether the scenario has a collision, as `in_log`, and not whose each is.
+        def owned(events: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+            return [{"belongs_to": "scenario" if e["in_log"] else "replay", **e} for e in events]
+
+        metrics = dict(document["metrics"])
+        metrics["by_agent"] = {k: {**m, "collisions": owned(m["collisions"])} for k, m in metrics["by_agent"].items()}
+        metrics["collisions"] = owned(metrics["collisions"])
+        if "conflicts" in metrics:
+            renamed = {"log": "scenario"}
+            metrics["conflicts"] = [
+                {**c, "contact": renamed.get(c["contact"], c["contact"])} for c in metrics["conflicts"]
+            ]
+        plain = {k: document[k] for k in ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s")}
         warned = Warnings.from_dict(document["warnings"]) if "warnings" in document else None
-        return cls(agents=agents, left_out=document.get("left_out", {}), warnings=warned, **known)
-
-
-def _add_owners(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """State whose each collision is where an older file only says whether the scenario has it, as `in_log`."""
-
-    def owned(events: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        return [{"belongs_to": "scenario" if e["in_log"] else "replay", **e} for e in events]
-
-    by_agent = {k: {**m, "collisions": owned(m["collisions"])} for k, m in metrics["by_agent"].items()}
-    found = {**metrics, "collisions": owned(metrics["collisions"]), "by_agent": by_agent}
-    if "conflicts" in metrics:
-        renamed = {"log": "scenario"}
-        found["conflicts"] = [{**c, "contact": renamed.get(c["contact"], c["contact"])} for c in metrics["conflicts"]]
-    return found
+        return cls(
+            agents=tuple(agents), metrics=metrics, left_out=document.get("left_out", {}), warnings=warned, **plain
+        )
 
 
 def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
     """Return the scenario with its agents where the replay has them, to be evaluated, plotted or exported."""
     done = {a.id: a for a in replay.agents}
     agents = []
-    for agent in scenario.agents:
-        if agent.id not in done:
-            continue
-        r = done[agent.id]
-        w = agent.waypoints
+    for agent in (a for a in scenario.agents if a.id in done):
+        r, w = done[agent.id], agent.waypoints
         waypoints = Waypoints(
             r.t_s, r.x_m, r.y_m, r.z_m, r.yaw_rad, r.speed_mps,
             observed=np.zeros(len(r), dtype=bool),
@@ -253,32 +265,6 @@ def to_scenario(replay: Replay, scenario: Scenario) -> Scenario:
         agents.append(replace(agent, waypoints=waypoints))
     provenance = {**scenario.provenance, "replay": {"mode": replay.mode, "model": replay.model, "dt_s": replay.dt_s}}
     return replace(scenario, agents=tuple(agents), provenance=provenance, tags=None)
-
-
-def _agent_to_dict(agent: AgentReplay) -> dict[str, Any]:
-    length, width, height = (float(v) for v in agent.size_m)
-    commands, known = agent.commands, agent.cross_track_m is not None
-    return {
-        "id": agent.id, "category": agent.category, "size_m": {"length": length, "width": width, "height": height},
-        "driver": agent.driver, "model": agent.model, "model_reason": agent.model_reason, "flags": list(agent.flags),
-        "states": {k: getattr(agent, k).tolist() for k in AgentReplay.COLUMNS},
-        "commands": {k: getattr(commands, k).tolist() for k in Commands.COLUMNS} if commands is not None else None,
-        "errors": {k: getattr(agent, k).tolist() for k in AgentReplay.ERRORS} if known else None,
-    }  # fmt: skip
-
-
-def _agent_from_dict(entry: Mapping[str, Any]) -> AgentReplay:
-    states = _columns(entry, "states", AgentReplay.COLUMNS)
-    # Files written by 0.1.0 have neither commands nor errors.
-    commands = _columns(entry, "commands", Commands.COLUMNS)
-    if commands:
-        commands["gear"] = commands["gear"].astype(np.int8)
-    length, width, height = (float(entry["size_m"][key]) for key in ("length", "width", "height"))
-    return AgentReplay(
-        **{key: entry[key] for key in ("id", "category", "driver", "model")}, size_m=(length, width, height),
-        flags=tuple(entry["flags"]), model_reason=entry.get("model_reason", ""),
-        commands=Commands(**commands) if commands else None, **states, **_columns(entry, "errors", AgentReplay.ERRORS),
-    )  # fmt: skip
 
 
 def _columns(entry: Mapping[str, Any], group: str, keys: Sequence[str]) -> dict[str, Any]:

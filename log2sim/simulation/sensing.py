@@ -13,8 +13,7 @@ from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.simulation.policy import Controls, Observation, Others, Policy, load_policy, query_policy, reset_policy
 
-CORRELATION_S = 0.5
-"""For how long an error of a place lasts: trackers average over some sweeps."""
+CORRELATION_S = 0.5  # for how long an error of a place lasts: trackers average over some sweeps
 
 
 @dataclass(frozen=True)

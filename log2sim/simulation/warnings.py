@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Sequence, Set
 from copy import copy
 from dataclasses import fields, replace
-from itertools import permutations
+from itertools import chain, permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -26,14 +26,12 @@ from log2sim.simulation.expected_motion import (
     observation_interval_s,
     observed_spans,
 )
-from log2sim.simulation.follower import ControllerMemory, follow_vehicles
 from log2sim.simulation.metrics.realism import signed_distance
-from log2sim.simulation.policy import Controls, EgoState, Observation
+from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.prediction.motion_table import TICK_S, Complex, table_of, tabulate
-from log2sim.simulation.reference import Reference, vehicle_reference_of
+from log2sim.simulation.reference import ControllerMemory, Reference, follow_vehicles, vehicle_reference_of
 from log2sim.simulation.result import CollisionWarning, Moment, Replay, Warnings, to_scenario
-from log2sim.simulation.vehicles.parameters import WHEELED, parameters_for
-from log2sim.simulation.vehicles.vehicle import VehicleState
+from log2sim.simulation.vehicles.vehicle import WHEELED, VehicleState, parameters_for
 
 MAX_LISTED = 5
 
@@ -65,7 +63,7 @@ def count_warnings(warnings: Warnings) -> str:
 
 def describe_warning(warning: CollisionWarning, warnings: Warnings) -> str:
     """Describe a warning: when, how soon and how far off the collision is, whether braking suffices, and since when it is known."""
-    parts, at = [describe_briefly(warning) + "."], warning.warned
+    parts, at, known = [describe_briefly(warning) + "."], warning.warned, warning.known
     if at is not None and warning.way_m is not None:
         verdict = "braking suffices" if warning.braking_suffices else "braking comes too late"
         needed = "" if warning.needed_mps2 is None else f", {warning.needed_mps2:.1f} m/s2 would be needed"
@@ -73,10 +71,8 @@ def describe_warning(warning: CollisionWarning, warnings: Warnings) -> str:
             f"{'The ego' if warning.driver == EGO else warning.driver} drives {at.ego_speed_mps * 3.6:.0f} km/h, {warning.way_m:.1f} m from the "
             f"collision, and stands after {at.stopping_m:.1f} m ({warnings.reaction_s:g} s to react, then {warnings.brake_mps2:g} m/s2): {verdict}{needed}."
         )
-    # Since when the agent is known, and to which end alone.
     in_order = sorted(warning.known_by.items(), key=lambda e: e[1])
     ends = "; ".join(f"to the {end} alone from {t_s:.2f} s" for end, t_s in in_order)
-    known = warning.known
     since = "Never known" if known is None else f"Known since {known.t_s:.2f} s, {known.distance_m:.1f} m away"
     parts.append(f"{since} ({ends})." if ends else f"{since}.")
     if at is not None and warning.collision_s is not None:
@@ -102,15 +98,14 @@ Index = NDArray[np.intp]
 
 
 class Courses(NamedTuple):
-    """Agents that may collide with the ego, by tick."""
+    """Agents that may collide with the ego, by tick; columns (C,)."""
 
-    # agent, row: (C,) index of the agent, and of the state of the ego.
     agent: Index
-    row: Index
-    probability: Array  # (C,)
-    ttc_s: Array  # (C,) time to the collision
-    way_m: Array  # (C,) of the ego until then
-    due: NDArray[np.bool_]  # (C,) whether the ego has to be warned: the collision is probable enough and near enough
+    row: Index  # of the state of the ego
+    probability: Array
+    ttc_s: Array  # time to the collision
+    way_m: Array  # of the ego until then
+    due: NDArray[np.bool_]  # whether the ego has to be warned: the collision is probable enough and near enough
 
 
 class Watch:
@@ -156,46 +151,39 @@ class Watch:
         if self.own is not None:
             kept &= (agent != self.own) & (self.known.source[self.own, ticks[row]] >= 0)
         row, agent = row[kept], agent[kept]
-        kept = self._may_meet(ego.take(row), agent, ticks[row])
-        row, agent = row[kept], agent[kept]
-        tick = ticks[row]
+        # Of these, who is within reach of the ego, and at a height of its path.
+        table, size, source = self.table, self.ego_path.size_m, self.known.source[agent, ticks[row]]
+        place, speed = table.position_m[agent, source], np.abs(table.velocity_mps[agent, source])
+        apart = np.abs(place - (ego.x_m + 1j * ego.y_m)[row])
+        ahead_s = self.settings.horizon_s + (ticks[row] - source) * TICK_S
+        reach = np.abs(ego.speed_mps[row]) * self.settings.horizon_s + (speed + SPARE_MPS) * ahead_s
+        near = np.flatnonzero(apart <= reach + np.hypot(*size[:2]) / 2 + self._radius_m[agent])
+        row, agent, source, apart = row[near], agent[near], source[near], apart[near]
+        path_z = self.ego_path.heights(ego.progress_m[row], apart)
+        z = np.array([table.agents[k].trajectory.heights(table.t_s[[n]])[0] for k, n in zip(agent, source)])
+        room = (self._height_m[agent] + size[2]) / 2 + MAX_SLOPE * apart
+        level = np.abs(path_z - z.reshape(-1, 1)).min(axis=1) < room
+        row, agent = row[level], agent[level]
+        tick, lead_s = ticks[row], self._expected.lead_s
         others = self._expected.at(agent, tick)
-        if seen is not None:
-            others = replace(others, position_m=self._moved(others.position_m, agent, tick, seen))
-        lead_s = self._expected.lead_s
+        if seen is not None:  # ways begin where agents are seen to be, and are as much faster as they are
+            place, speed = seen[0][agent], seen[1][agent]
+            measured = np.isfinite(place) & self.known.observed[agent, tick]
+            usual = np.abs(table.velocity_mps[agent, tick])
+            faster = np.divide(speed, usual, out=np.ones(len(agent)), where=measured & (usual > STANDSTILL_MPS))
+            usually = others.position_m
+            moved = place[:, None] + np.minimum(faster, 2.0)[:, None] * (usually - usually[:, :1])
+            others = replace(others, position_m=np.where(measured[:, None], moved, usually))
         own = self.ego_path.at(ego.take(row), lead_s)
         probability, time_s = expected_contacts(own, others, lead_s)
         gone = np.cumsum(np.abs(np.diff(own.position_m, axis=1, prepend=own.position_m[:, :1])), axis=1)
         way = np.array([np.interp(t, lead_s, w) if np.isfinite(t) else np.inf for t, w in zip(time_s, gone)])
-        due = self.settings.is_due(probability, way, ego.speed_mps[row])
+        # To be warned of when the ego has to react at once; `margin_s` earlier, while there is time, only if it is clear.
+        pace, s = np.abs(ego.speed_mps[row]), self.settings
+        left_m = way - s.stopping_distance_m(pace)
+        due = (probability >= s.early_probability) & (left_m <= pace * s.margin_s)
+        due |= (probability >= s.min_probability) & (left_m <= 0)
         return Courses(agent, row, probability, time_s, way, due)
-
-    def _may_meet(self, ego: EgoStates, agent: Index, tick: Index) -> NDArray[np.bool_]:
-        """Whether agents (C,) are within reach of the ego, and at a height of its path."""
-        source = self.known.source[agent, tick]
-        place, speed = self.table.position_m[agent, source], np.abs(self.table.velocity_mps[agent, source])
-        apart = np.abs(place - (ego.x_m + 1j * ego.y_m))
-        ahead_s = self.settings.horizon_s + (tick - source) * TICK_S
-        size = self.ego_path.size_m
-        reach = np.abs(ego.speed_mps) * self.settings.horizon_s + (speed + SPARE_MPS) * ahead_s
-        near = np.flatnonzero(apart <= reach + np.hypot(*size[:2]) / 2 + self._radius_m[agent])
-        path_z = self.ego_path.heights(ego.progress_m[near], apart[near])
-        z = np.array(
-            [self.table.agents[k].trajectory.heights(self.table.t_s[[n]])[0] for k, n in zip(agent[near], source[near])]
-        )
-        room = (self._height_m[agent[near]] + size[2]) / 2 + MAX_SLOPE * apart[near]
-        meets = np.zeros(len(agent), dtype=bool)
-        meets[near] = np.abs(path_z - z.reshape(-1, 1)).min(axis=1) < room if len(near) else False
-        return meets
-
-    def _moved(self, way: Complex, agent: Index, tick: Index, seen: tuple[Complex, Array]) -> Complex:
-        """Let ways (C, H) begin where agents are seen to be, as much faster as they are."""
-        place, speed = seen[0][agent], seen[1][agent]
-        measured = np.isfinite(place) & self.known.observed[agent, tick]
-        usual = np.abs(self.table.velocity_mps[agent, tick])
-        faster = np.divide(speed, usual, out=np.ones(len(agent)), where=measured & (usual > STANDSTILL_MPS))
-        moved = place[:, None] + np.minimum(faster, 2.0)[:, None] * (way - way[:, :1])
-        return np.where(measured[:, None], moved, way)
 
 
 # The ego's deceleration is that of its speed over this time: three ticks give it to 0.5 m/s2 where a speed is good to
@@ -234,7 +222,7 @@ def warn(
     """
     settings = replace(settings or WarningSettings(), ends=ends)
     moved = to_scenario(replay, scenario) if replay is not None else scenario
-    now = {a.id: a for a in moved.agents}
+    now, source = ({a.id: a for a in s.agents} for s in (moved, scenario))
     drivers = warnable(replace(scenario, agents=tuple(a for a in scenario.agents if a.id in now)))
     table = table_of(moved)
     everybody = Watch(scenario, moved.others, settings, table.t_s)
@@ -244,30 +232,57 @@ def warn(
         for one, two in permutations(event["agents"], 2) if not event.get("from_start", False) else ():
             if one in touched:
                 touched[one][two] = min(touched[one].get(two, np.inf), round(float(event["t_s"]), _DIGITS))
-    sources, row = {a.id: a for a in scenario.agents}, {a.id: k for k, a in enumerate(moved.others)}
+    row = {a.id: k for k, a in enumerate(moved.others)}
     events, driven_s = [], 0.0
     for driver in drivers:
         watch, hit = everybody.for_driver(driver), touched[driver.id]
         ticks = np.flatnonzero(table.present[list(now).index(driver.id)])
-        drive = _Drive(watch, ego_states(now[driver.id], watch, table.t_s[ticks]), table.t_s[ticks], driver.id)
-        own = [replace(e, collision_s=hit.get(e.agent)) for e in _events(drive, watch.courses(drive.ego, ticks))]
+        t_s, path = table.t_s[ticks], now[driver.id].trajectory
+        x, y, _, yaw, speed = path.at(t_s)
+        past_s = np.minimum(t_s - t_s[0], BRAKING_SEEN_S)
+        slower = np.abs(speed) - np.abs(path.at(np.maximum(t_s - BRAKING_SEEN_S, t_s[:1])).speed_mps)
+        accel = np.divide(slower, past_s, out=np.zeros(len(t_s)), where=past_s > TICK_S / 2)
+        drive = _Drive(watch, EgoStates(x, y, yaw, speed, accel, watch.ego_path.paths.progress(0, x, y)), t_s)
+        found = watch.courses(drive.ego, ticks)
+        own = []
+        for k in np.unique(found.agent[found.due]).tolist():
+            rows = np.flatnonzero(found.due & (found.agent == k))
+            first, who = rows[np.argmin(found.row[rows])], watch.table.agents[k]
+            moment, way_m = drive.moment(k, float(t_s[found.row[first]])), float(found.way_m[first])
+            needed = settings.needed_mps2(moment.ego_speed_mps, way_m)
+            own.append(CollisionWarning(
+                agent=who.id, category=who.category, driver=driver.id, known=drive.known(k), warned=moment,
+                probability=round(float(found.probability[first]), _DIGITS),
+                ttc_s=round(float(found.ttc_s[first]), _DIGITS), way_m=round(way_m, _DIGITS),
+                needed_mps2=None if needed is None else round(needed, _DIGITS),
+                braking_suffices=moment.stopping_m <= way_m, spans_s=_spans(np.sort(t_s[found.row[rows]])),
+                collision_s=hit.get(who.id),
+            ))  # fmt: skip
         for agent in hit.keys() - {e.agent for e in own}:  # collisions that nothing was predicted of
-            k, kind = row[agent], now[agent].category
-            own.append(CollisionWarning(agent, kind, drive.known(k), driver=drive.driver, collision_s=hit[agent]))
-        if len(ends_of(scenario)) > 1:
-            own = [replace(e, known_by=_known_by(sources[e.agent], table.t_s, watch.interval_s)) for e in own]
+            known = drive.known(row[agent])
+            own.append(CollisionWarning(agent, now[agent].category, known, driver=driver.id, collision_s=hit[agent]))
+        for n, event in enumerate(own) if len(ends_of(scenario)) > 1 else ():
+            who, known_by, present = source[event.agent], {}, np.ones((1, len(table.t_s)), dtype=bool)
+            for end in ENDS:
+                spans = [observed_spans(who, (end,))]
+                since = known_agents([who], spans, table.t_s, watch.interval_s, present).since_s[0]
+                if np.isfinite(since):
+                    known_by[end] = round(float(since), _DIGITS)
+            own[n] = replace(event, known_by=known_by)
         events += own
-        driven_s += float((np.abs(drive.ego.speed_mps[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
-    used = {f.name: getattr(settings, f.name) for f in fields(settings)}
-    in_order = tuple(sorted(_once(events), key=lambda e: (e.begin_s, e.driver, e.agent)))
+        driven_s += float((np.abs(speed[:-1]) >= STANDSTILL_MPS).sum()) * TICK_S
+    # Of two vehicles that are both drivers, a collision without a warning is told once, and not where there is a warning.
+    once: dict[Set[str], list[CollisionWarning]] = {}
+    for event in sorted(events, key=lambda e: e.warned is None):
+        pair = once.setdefault(frozenset((event.driver, event.agent)), [])
+        if event.warned is not None or not pair:
+            pair.append(event)
+    in_order = sorted(chain(*once.values()), key=lambda e: (e.begin_s, e.driver, e.agent))
     return Warnings(
-        tells_ends=bool(ends_of(scenario)),
-        agents=len(everybody.table.agents),
-        known_agents=int(np.isfinite(everybody.known.since_s).sum()),
-        driven_s=round(driven_s, 1),
-        events=in_order,
-        **used,
-    )
+        tells_ends=bool(ends_of(scenario)), agents=len(everybody.table.agents), driven_s=round(driven_s, 1),
+        known_agents=int(np.isfinite(everybody.known.since_s).sum()), events=tuple(in_order),
+        **{f.name: getattr(settings, f.name) for f in fields(settings)},
+    )  # fmt: skip
 
 
 def warnable(scenario: Scenario) -> list[Agent]:
@@ -286,23 +301,12 @@ def warnable(scenario: Scenario) -> list[Agent]:
     return drivers
 
 
-def ego_states(ego: Agent, watch: Watch, t_s: Array) -> EgoStates:
-    """Return the states of the ego at times (T,), with what it braked just before."""
-    x, y, _, yaw, speed = ego.trajectory.at(t_s)
-    pace = np.abs(speed)
-    before = np.abs(ego.trajectory.at(np.maximum(t_s - BRAKING_SEEN_S, t_s[:1])).speed_mps)
-    past_s = np.minimum(t_s - t_s[0], BRAKING_SEEN_S)
-    accel = np.divide(pace - before, past_s, out=np.zeros(len(t_s)), where=past_s > TICK_S / 2)
-    return EgoStates(x, y, yaw, speed, accel, watch.ego_path.progress(x, y))
-
-
 class _Drive(NamedTuple):
     """The ego's states at its ticks, and what is known of others."""
 
     watch: Watch
     ego: EgoStates
     t_s: Array
-    driver: str
 
     def moment(self, agent: int, t_s: float) -> Moment:
         """Compute how far the ego and an agent are from each other at a time."""
@@ -322,51 +326,11 @@ class _Drive(NamedTuple):
         return self.moment(agent, since_s) if since_s <= self.t_s[-1] + TICK_S else None
 
 
-def _events(drive: _Drive, found: Courses) -> list[CollisionWarning]:
-    """Make a warning of all agents that the ego has to be warned of."""
-    events = []
-    for agent in np.unique(found.agent[found.due]).tolist():
-        rows = np.flatnonzero(found.due & (found.agent == agent))
-        first, who = rows[np.argmin(found.row[rows])], drive.watch.table.agents[agent]
-        moment, way_m = drive.moment(agent, float(drive.t_s[found.row[first]])), float(found.way_m[first])
-        needed = drive.watch.settings.needed_mps2(moment.ego_speed_mps, way_m)
-        event = CollisionWarning(
-            agent=who.id, category=who.category, driver=drive.driver, known=drive.known(agent), warned=moment,
-            probability=round(float(found.probability[first]), _DIGITS),
-            ttc_s=round(float(found.ttc_s[first]), _DIGITS), way_m=round(way_m, _DIGITS),
-            needed_mps2=None if needed is None else round(needed, _DIGITS), braking_suffices=moment.stopping_m <= way_m,
-            spans_s=_spans(np.sort(drive.t_s[found.row[rows]])),
-        )  # fmt: skip
-        events.append(event)
-    return events
-
-
 def _spans(t_s: Array) -> tuple[tuple[float, float], ...]:
     """Join ticks (N,) to spans."""
     edges = np.flatnonzero(np.diff(t_s) > SAME_WARNING_S)
     first, last = np.concatenate([[0], edges + 1]), np.concatenate([edges, [len(t_s) - 1]])
     return tuple((round(float(t_s[a]), _DIGITS), round(float(t_s[b]), _DIGITS)) for a, b in zip(first, last))
-
-
-def _once(events: Iterable[CollisionWarning]) -> list[CollisionWarning]:
-    """Leave out collisions without a warning of pairs that are there already: two vehicles may both be drivers."""
-    out: dict[Set[str], list[CollisionWarning]] = {}
-    for event in sorted(events, key=lambda e: e.warned is None):
-        pair = out.setdefault(frozenset((event.driver, event.agent)), [])
-        if event.warned is not None or not pair:
-            pair.append(event)
-    return [event for pair in out.values() for event in pair]
-
-
-def _known_by(agent: Agent, t_s: Array, interval_s: float) -> dict[str, float]:
-    """Return when each end alone knows an agent first, s."""
-    found = {}
-    present = np.ones((1, len(t_s)), dtype=bool)
-    for end in ENDS:
-        since = known_agents([agent], [observed_spans(agent, (end,))], t_s, interval_s, present).since_s[0]
-        if np.isfinite(since):
-            found[end] = round(float(since), _DIGITS)
-    return found
 
 
 # Of a car that pulls away: twice what the intelligent driver model takes for comfortable in towns.
@@ -376,10 +340,7 @@ CATCH_UP_S = 0.2  # after it has braked, the ego catches up with so much and no 
 
 
 class LateDriver:
-    """Follows the ego's trajectory by the controller of `pid`, by the scenario's time less a delay.
-
-    `ego`: on wheels.
-    """
+    """Follows the trajectory of an ego on wheels by the controller of `pid`, by the scenario's time less a delay."""
 
     def __init__(self, ego: Agent) -> None:
         self._ego, self._parameters = ego, parameters_for([ego])
@@ -401,24 +362,23 @@ class LateDriver:
         return replace(self._follow(seen), accel_mps2=-brake_mps2)
 
     def _follow(self, seen: Observation) -> Controls:
-        p = replace(self._parameters, understeer_s2pm2=np.array([seen.ego.understeer_s2pm2]))
-        commands, self._memory = follow_vehicles(self._row(seen), self._state(seen.ego), self._memory, p, seen.dt_s)
+        row, ego = self._row(seen), seen.ego
+        assert self._reference is not None  # since `_row` has built it
+        x0, y0 = self._reference.trajectory.origin_m
+        # The rear axle, relative to the origin of the reference.
+        x = ego.x_m - ego.rear_axle_offset_m * np.cos(ego.yaw_rad) - x0
+        y = ego.y_m - ego.rear_axle_offset_m * np.sin(ego.yaw_rad) - y0
+        columns = (x, y, ego.yaw_rad, ego.speed_mps, ego.steer_rad, 0.0, 0.0, 0.0)
+        state = VehicleState(*(np.array([c]) for c in columns))
+        p = replace(self._parameters, understeer_s2pm2=np.array([ego.understeer_s2pm2]))
+        commands, self._memory = follow_vehicles(row, state, self._memory, p, seen.dt_s)
         return Controls(float(commands.pedal_mps2[0]), float(commands.steer_rad[0]), bool(commands.reverse[0]))
 
-    def _row(self, seen: Observation) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    def _row(self, seen: Observation) -> Array:
         """Return the reference (C, 1) of the present."""
         if self._reference is None:
             self._reference = vehicle_reference_of(self._ego, seen.dt_s)
         return self._reference.exact(np.array([seen.t_s - self._delay_s])).T
-
-    def _state(self, ego: EgoState) -> VehicleState:
-        """Return the rear axle, relative to the origin of the reference."""
-        assert self._reference is not None
-        x0, y0 = self._reference.trajectory.origin_m
-        x = ego.x_m - ego.rear_axle_offset_m * np.cos(ego.yaw_rad) - x0
-        y = ego.y_m - ego.rear_axle_offset_m * np.sin(ego.yaw_rad) - y0
-        columns = (x, y, ego.yaw_rad, ego.speed_mps, ego.steer_rad, 0.0, 0.0, 0.0)
-        return VehicleState(*(np.array([c]) for c in columns))
 
     def _place_s(self, seen: Observation) -> float:
         """Return when the scenario was at this place; its end beyond."""
@@ -453,19 +413,18 @@ class BrakeWhenWarned:
         if tick > self._tick:
             self._tick = tick
             self._check_danger(seen, min(tick, len(self._watch.table.t_s) - 1))
-        if self.braking(seen.t_s):
+        if self._braking(seen.t_s):
             return self._driver.brake(seen, self.settings.brake_mps2)
         return self._driver.drive(seen)
 
-    def braking(self, t_s: float) -> bool:
-        """Whether the brakes work at a time."""
+    def _braking(self, t_s: float) -> bool:
         return t_s >= self._warned_s + self.settings.reaction_s - 1e-9
 
     def _check_danger(self, seen: Observation, tick: int) -> None:
         """Look for danger, and forget the warning where there was none for `CLEAR_S`."""
         ego, t_s = seen.ego, seen.t_s
         speed, accel = ego.speed_mps, math.copysign(ego.accel_mps2, ego.accel_mps2 * ego.speed_mps)
-        if self.braking(t_s):
+        if self._braking(t_s):
             # Negative where the path is driven in reverse.
             forward = math.cos(float(seen.path.yaw_rad[0]) - ego.yaw_rad)
             speed = math.copysign(max(abs(speed), float(seen.path.speed_mps[0]), MIN_EGO_MPS), forward)

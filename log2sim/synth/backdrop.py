@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -13,24 +12,13 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.synth.ground import GROUND_M_PER_PX, LEVELS, MEADOW, TILE_PX, Ground, GroundPlan, grain
-from log2sim.synth.light import (
-    FAR_M,
-    MIN_FALL,
-    Image,
-    Light,
-    RenderCamera,
-    Texture,
-    light_of,
-    linear,
-    rows_by_level,
-)
-from log2sim.synth.scene import Building, Scene
+from log2sim.synth.light import FAR_M, MIN_FALL, Image, Light, RenderCamera, Texture, light_of, linear, rows_by_level
+from log2sim.synth.scene import Scene
 from log2sim.synth.terrain import Surface, meet
 
 MAX_ERROR_M = 0.05  # of the ground's height where a ray meets it
 MAX_MOSAIC_TILES = 24  # along a side: 113 MB at most
 REACH_M = 250.0  # beyond which the ground is as level as it is under the camera
-Flags = NDArray[np.bool_]
 
 
 def draw_terrain(
@@ -59,20 +47,15 @@ def draw_terrain(
     away = np.where(met, away, level)
     seen = met | (fall[band] > MIN_FALL)
     x, y = eye[0] + away * dx, eye[1] + away * dy
-    lit = linear(_sampled(ground, view, x, y, away, seen), light.on_ground())
+    # For each row from the level of tiles whose resolution fits.
+    texture = np.empty((*x.shape, 3), np.uint8)
+    for tiles, part in rows_by_level(np.median(away, axis=1), max(float(view.map_T_cam[2, 3]), 0.5), view.K[0, 0]):
+        texture[part] = _sampled(ground, tiles, x[part], y[part], seen[part])
+    lit = linear(texture, light.on_ground())
     color[band][seen], depth[band][seen] = lit[seen], away[seen]
 
 
-def _sampled(ground: Ground, view: RenderCamera, x: Image, y: Image, away: Image, seen: Flags) -> Texture:
-    """Colors (H, W, 3) of positions, for each row from the level of tiles whose resolution fits."""
-    out = np.empty((*x.shape, 3), np.uint8)
-    height = max(float(view.map_T_cam[2, 3]), 0.5)
-    for level, rows in rows_by_level(np.median(away, axis=1), height, view.K[0, 0]):
-        out[rows] = sampled_ground(ground, level, x[rows], y[rows], seen[rows])
-    return out
-
-
-def sampled_ground(ground: Ground, level: int, x: Image, y: Image, seen: Flags) -> Texture:
+def _sampled(ground: Ground, level: int, x: Image, y: Image, seen: NDArray[np.bool_]) -> Texture:
     """Colors (H, W, 3) of positions (H, W) from tiles of a level, or of a coarser one where they would be too many."""
     if not seen.any():
         return np.zeros((*x.shape, 3), np.uint8)
@@ -84,18 +67,10 @@ def sampled_ground(ground: Ground, level: int, x: Image, y: Image, seen: Flags) 
     side = step * np.float32(TILE_PX)
     i, j = (np.floor(v[seen] / side).astype(np.int64) for v in (x, y))
     low = (int(i.min()), int(j.min()))
-    shape = (int(j.max()) - low[1] + 1, int(i.max()) - low[0] + 1)
-    touched = np.zeros(shape, bool)
+    touched = np.zeros((int(j.max()) - low[1] + 1, int(i.max()) - low[0] + 1), bool)
     touched[j - low[1], i - low[0]] = True
-    mosaic = np.empty((shape[0] * TILE_PX, shape[1] * TILE_PX, 3), np.uint8)
-    mosaic[:] = MEADOW
-    for row, column in zip(*np.nonzero(touched)):
-        tile = ground.tile(level, low[0] + int(column), low[1] + int(row))
-        mosaic[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX] = tile
-    u, v = (
-        (x - np.float32(low[0]) * side) / step - np.float32(0.5),
-        (y - np.float32(low[1]) * side) / step - np.float32(0.5),
-    )
+    mosaic = ground.mosaic(level, low, touched, MEADOW)
+    u, v = ((c - np.float32(first) * side) / step - np.float32(0.5) for c, first in zip((x, y), low))
     return np.asarray(cv2.remap(mosaic, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
@@ -118,13 +93,36 @@ class Wall:
     seed: tuple[int, ...]  # of its windows and stains
 
     @cached_property
-    def texture(self) -> tuple[NDArray[np.uint8], ...]:
-        """Images (H, W, 3), sRGB as BGR, the first row at the ground, in pixels of `FACADE_M_PER_PX`, then ever twice as large."""
-        levels = [_facade(self.length_m, self.height_m, self.color, self.seed)]
+    def texture(self) -> tuple[Texture, ...]:
+        """Images (H, W, 3), sRGB as BGR, the first row at the ground, in pixels of `FACADE_M_PER_PX`, then ever twice as large.
+
+        Painted are a plinth, floors of windows, and a cornice.
+        """
+        rng, px = np.random.default_rng(self.seed), 1 / FACADE_M_PER_PX
+        h, w = max(8, round(self.height_m * px)), max(8, round(self.length_m * px))
+        color = np.array(self.color[::-1])
+        image = np.empty((h, w, 3), np.uint8)
+        image[:] = color
+        image[: round(0.8 * px)] = color * 0.78
+        image[-round(0.35 * px) :] = np.minimum(color * 1.1, 255)
+        bays, floors = int((self.length_m - 0.8) // BAY_M), int((self.height_m - 1.0) // FLOOR_M)
+        start = (self.length_m - bays * BAY_M) / 2
+        for floor in range(floors):
+            for bay in range(bays):
+                x, z = start + bay * BAY_M + 0.75, 1.1 + floor * FLOOR_M
+                frame = [round(v * px) for v in (z - 0.08, z + 1.63, x - 0.08, x + 1.28)]
+                image[frame[0] : frame[1], frame[2] : frame[3]] = np.minimum(color * 1.12, 255)
+                pane = [round(v * px) for v in (z, z + 1.55, x, x + 1.2)]
+                light = rng.uniform(0.75, 1.15)
+                ramp = np.linspace(0.85, 1.15, pane[1] - pane[0])[:, None, None] * light
+                image[pane[0] : pane[1], pane[2] : pane[3]] = np.clip(ramp * np.array((112, 100, 88)), 0, 255)
+                middle = (pane[2] + pane[3]) // 2
+                image[pane[0] : pane[1], middle - 1 : middle + 1] = np.minimum(color * 1.05, 255)
+        shade = 1 + (grain(self.seed[0], 0, (0, int(rng.integers(1024))), (h, w)) - 1) * np.float32(GRAIN)
+        levels = [np.clip(image * shade[..., None], 0, 255).astype(np.uint8)]
         while len(levels) < FACADE_LEVELS and min(levels[-1].shape[:2]) >= 8:
-            levels.append(
-                np.asarray(cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-            )
+            half = cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            levels.append(np.asarray(half, np.uint8))
         return tuple(levels)
 
 
@@ -140,65 +138,25 @@ class Backdrop:
     @classmethod
     def of(cls, scene: Scene, seed: int) -> Backdrop:
         """Take that of a scene file."""
-        sun = light_of(scene.environment).sun
-        thrown = [_shadow(building, sun) for building in scene.building if building.shadow]
-        return cls(
-            Ground(GroundPlan.of(scene), seed),
-            None,
-            tuple(_walls(building, (seed, 5, k)) for k, building in enumerate(scene.building)),
-            (*(_hull(np.array(s.outline)) for s in scene.shadow), *thrown),
-        )
-
-
-def _shadow(building: Building, sun: tuple[float, float, float]) -> Array:
-    """Outline (P, 2) of the shadow of a building."""
-    length, width, height = building.size_m
-    corners = box_corners_bev(np.array(building.center), length, width, np.deg2rad(building.yaw_deg))[0]
-    top = corners - np.divide(sun[:2], sun[2]) * height
-    return _hull(np.concatenate([corners, top]))
+        sun, walls = light_of(scene.environment).sun, []
+        shadows = [_hull(np.array(s.outline)) for s in scene.shadow]
+        for n, building in enumerate(scene.building):
+            length, width, height = building.size_m
+            corners = box_corners_bev(np.array(building.center), length, width, np.deg2rad(building.yaw_deg))[0]
+            sides = []
+            for k, (a, b) in enumerate(zip(corners, np.roll(corners, -1, axis=0))):
+                span = float(np.linalg.norm(b - a))
+                along = (b - a) / span
+                outward = np.array([along[1], -along[0]])
+                sides.append(Wall(a, along, outward, span, height, building.color, (seed, 5, n, k)))
+            walls.append(tuple(sides))
+            if building.shadow:
+                shadows.append(_hull(np.concatenate([corners, corners - np.divide(sun[:2], sun[2]) * height])))
+        return cls(Ground(GroundPlan.of(scene), seed), None, tuple(walls), tuple(shadows))
 
 
 def _hull(points: Array) -> Array:
     return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float64)
-
-
-def _walls(building: Building, seed: tuple[int, ...]) -> tuple[Wall, ...]:
-    """Make the four sides of a building."""
-    length, width, height = building.size_m
-    corners = box_corners_bev(np.array(building.center), length, width, np.deg2rad(building.yaw_deg))[0]
-    out = []
-    for k in range(4):
-        a, b = corners[k], corners[(k + 1) % 4]
-        span = float(np.linalg.norm(b - a))
-        along = (b - a) / span
-        out.append(Wall(a, along, np.array([along[1], -along[0]]), span, height, building.color, (*seed, k)))
-    return tuple(out)
-
-
-def _facade(length_m: float, height_m: float, color: Sequence[int], seed: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Paint a facade (H, W, 3), sRGB, its first row at the ground: a plinth, floors of windows, a cornice."""
-    rng = np.random.default_rng(seed)
-    px = 1 / FACADE_M_PER_PX
-    h, w = max(8, round(height_m * px)), max(8, round(length_m * px))
-    image = np.empty((h, w, 3), np.uint8)
-    image[:] = color[::-1]
-    image[: round(0.8 * px)] = np.array(color[::-1]) * 0.78
-    image[-round(0.35 * px) :] = np.minimum(np.array(color[::-1]) * 1.1, 255)
-    bays, floors = int((length_m - 0.8) // BAY_M), int((height_m - 1.0) // FLOOR_M)
-    start = (length_m - bays * BAY_M) / 2
-    for floor in range(floors):
-        for bay in range(bays):
-            x, z = start + bay * BAY_M + 0.75, 1.1 + floor * FLOOR_M
-            frame = [round(v * px) for v in (z - 0.08, z + 1.63, x - 0.08, x + 1.28)]
-            image[frame[0] : frame[1], frame[2] : frame[3]] = np.minimum(np.array(color[::-1]) * 1.12, 255)
-            pane = [round(v * px) for v in (z, z + 1.55, x, x + 1.2)]
-            light = rng.uniform(0.75, 1.15)
-            ramp = np.linspace(0.85, 1.15, pane[1] - pane[0])[:, None, None] * light
-            image[pane[0] : pane[1], pane[2] : pane[3]] = np.clip(ramp * np.array((112, 100, 88)), 0, 255)
-            middle = (pane[2] + pane[3]) // 2
-            image[pane[0] : pane[1], middle - 1 : middle + 1] = np.minimum(np.array(color[::-1]) * 1.05, 255)
-    shade = 1 + (grain(seed[0], 0, (0, int(rng.integers(1024))), (h, w)) - 1) * np.float32(GRAIN)
-    return np.clip(image * shade[..., None], 0, 255).astype(np.uint8)
 
 
 SUBPIXEL_BITS = 4  # of the coordinates of polygons
@@ -212,7 +170,7 @@ class _Seen:
     gap_m: float  # distance of the camera from its plane
     polygon: NDArray[np.int32]  # (P, 2): in 1 / 2**SUBPIXEL_BITS px
     rows: slice  # the rectangle around it
-    columns: slice  # the rectangle around it
+    columns: slice
 
     @property
     def region(self) -> tuple[slice, slice]:
@@ -253,7 +211,9 @@ def draw_buildings(
             z = part.depth(view)
             covered = part.mask(part.polygon, cv2.LINE_AA) * np.float32(1 / 255)
             covered *= z < depth[part.region]
-            paint[inner] += linear(_texture(view, part), light.on_wall(part.wall.outward)) * covered[..., None]
+            sun = max(0.0, float(np.dot(part.wall.outward, light.sun[:2])))
+            falling = np.multiply(light.sky_color, 0.75) + np.multiply(light.sun_color, sun)
+            paint[inner] += linear(_texture(view, part), np.asarray(falling, np.float32)) * covered[..., None]
             share[inner] += covered
             away[inner] = np.where(covered >= 0.5, z, away[inner])
         # Where two walls of a building meet, their shares sum to one or more, so that nothing behind shines through.
@@ -314,12 +274,9 @@ def _texture(view: RenderCamera, seen: _Seen) -> Texture:
             continue
         step = FACADE_M_PER_PX * 2**level
         wall_H_texture = np.array([[step, 0, step / 2], [0, step, step / 2], [0, 0, 1]])
+        image_H_texture = image_H_wall @ wall_H_texture
         warped = cv2.warpPerspective(
-            wall.texture[level],
-            image_H_wall @ wall_H_texture,
-            size,
-            flags=cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
+            wall.texture[level], image_H_texture, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
         if len(pieces) == 1:
             return np.asarray(warped, np.uint8)

@@ -7,7 +7,6 @@ x = i * its length, its first row at y = j * its length: columns go east, rows g
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,11 +26,7 @@ PATCHES = ((8, 0.8), (32, 1.3), (256, 1.7))  # sizes in pixels and their strengt
 
 
 def grain(seed: int, level: int, first: tuple[int, int], shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Factors of brightness around 1 for a part of an endless surface.
-
-    Pixels of a `level` are 2**level times as large as the finest. `first`, `shape`: row and column of the first pixel at
-    this level, and the number of rows and columns.
-    """
+    """Factors of brightness around 1 for a part of an endless surface, from row and column `first` of a level on."""
     return _window(_noise(seed, level), first, shape)
 
 
@@ -139,9 +134,9 @@ class RoadLine:
     width_m: float
     color: PaintColor
     dashes: tuple[Array, ...]  # tuple of (Q, 2) float64, m: what is painted of it
-    # Boundary of lanes that it marks: 0 at the right of the road as its line runs, up to its number of lanes at the
-    # left
-    boundary: int
+    boundary: (
+        int  # of lanes that it marks: 0 at the right of the road as its line runs, its number of lanes at the left
+    )
 
     @property
     def strokes(self) -> list[Stroke]:
@@ -173,14 +168,6 @@ def road_lines(road: Road, keeps_right: bool = True) -> list[RoadLine]:
     return out
 
 
-def old_lines(road: Road) -> list[Stroke]:
-    """List what is left of removed lines between lanes."""
-    middle = np.array(road.line)
-    offsets = [(k / road.lanes - 0.5) * road.width_m + old for old in road.old_m for k in range(1, road.lanes)]
-    lines = [_line(road, middle, "dashed", (offset, LINE_M, 0), "white") for offset in offsets]
-    return [stroke for line in lines for stroke in line.strokes]
-
-
 def _line(
     road: Road, middle: Array, kind: Literal["solid", "dashed"], where: tuple[float, float, int], color: PaintColor
 ) -> RoadLine:
@@ -189,7 +176,10 @@ def _line(
     line = parallel(middle, offset) if offset != 0 else middle
     dashes: Sequence[Array] = [line]
     if kind == "dashed":
-        dashes = dashes_of_pieces(line, *DASH_M) if road.dash_m is None else dashes_along(line, *road.dash_m)
+        dashes = dashes_of_pieces(line, *DASH_M)
+        if road.dash_m is not None:  # along the whole line, beginning with half a gap
+            (on_m, off_m), length = road.dash_m, float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+            dashes = [stretch(line, begin, begin + on_m) for begin in np.arange(off_m / 2, length, on_m + off_m)]
     return RoadLine(kind, line, width_m, color, tuple(dashes), boundary)
 
 
@@ -227,12 +217,6 @@ def dashes_of_pieces(line: Array, on_m: float, off_m: float) -> list[Array]:
             begins = np.arange(off_m / 2, length, on_m + off_m) / length
             out += [np.array([a + (b - a) * f, a + (b - a) * min(f + on_m / length, 1.0)]) for f in begins]
     return out
-
-
-def dashes_along(line: Array, on_m: float, off_m: float) -> list[Array]:
-    """Divide a line (P, 2) into dashes, beginning with half a gap."""
-    length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-    return [stretch(line, begin, begin + on_m) for begin in np.arange(off_m / 2, length, on_m + off_m)]
 
 
 def stretch(line: Array, begin_m: float, end_m: float) -> Array:
@@ -273,10 +257,7 @@ SUBPIXELS = 2  # masks are drawn so much finer than tiles
 
 
 class Ground:
-    """The ground of a scene, painted when and where it is looked at.
-
-    `plan`: what is painted on a meadow. `seed`: of grain, stains and wear.
-    """
+    """The ground of a scene, painted when and where it is looked at; the seed is that of grain, stains and wear."""
 
     def __init__(self, plan: GroundPlan, seed: int) -> None:
         self._seed = seed
@@ -287,27 +268,33 @@ class Ground:
         self._curbs = _Strokes([Stroke(s.line, s.width_m + more) for s, more in zip(asphalt, curbs)])
         self._asphalt = _Strokes(asphalt)
         self._layers = _layers(plan)
-        self._tiles: OrderedDict[tuple[int, int, int], Mask] = OrderedDict()
+        self.tile = lru_cache(maxsize=MAX_TILES)(self._paint)  # by level, i and j
 
-    def tile(self, level: int, i: int, j: int) -> Mask:
-        """Return a tile (TILE_PX, TILE_PX, 3), sRGB as BGR."""
-        where = (level, i, j)
-        if where in self._tiles:
-            self._tiles.move_to_end(where)
-            return self._tiles[where]
-        image = self._paint(level, i, j)
-        self._tiles[where] = image
-        if len(self._tiles) > MAX_TILES:
-            self._tiles.popitem(last=False)
-        return image
+    def mosaic(self, level: int, low: tuple[int, int], needed: NDArray[np.bool_], beside: Color) -> Mask:
+        """Join tiles of a level, from i and j `low` on, that are needed (rows, columns); all others have one color."""
+        rows, columns = needed.shape
+        out = np.empty((rows * TILE_PX, columns * TILE_PX, 3), np.uint8)
+        out[:] = beside
+        for row, column in np.argwhere(needed).tolist():
+            tile = self.tile(level, low[0] + column, low[1] + row)
+            out[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX] = tile
+        return out
 
     def _paint(self, level: int, i: int, j: int) -> Mask:
-        canvas = _canvas_of(level, i, j)
+        """Paint a tile (TILE_PX, TILE_PX, 3), sRGB as BGR."""
+        canvas = _Canvas(level, i, j)
         planes = np.empty((3, TILE_PX, TILE_PX), np.float32)
         planes[:] = np.reshape(MEADOW, (3, 1, 1))
         sidewalk = canvas.drawn(self._sidewalks)
         if sidewalk is not None:
-            _blend(planes, PAVING, sidewalk, _joints(level, i, j))
+            # Slabs are darker by the share of joints in a pixel.
+            factor = 2**level
+            fine = [
+                np.arange(first * TILE_PX * factor, (first + 1) * TILE_PX * factor) % SLAB_PX == 0 for first in (j, i)
+            ]
+            joints = [np.asarray(f.reshape(TILE_PX, factor).mean(1), np.float32) for f in fine]
+            plain = np.outer(1 - joints[0], 1 - joints[1])
+            _blend(planes, PAVING, sidewalk, np.asarray(1 - (1 - JOINT_SHADE) * (1 - plain), np.float32))
             _blend(planes, CURB, canvas.drawn(self._curbs))
         asphalt = canvas.drawn(self._asphalt)
         _blend(planes, ASPHALT, asphalt)
@@ -320,8 +307,7 @@ class Ground:
 
     def shade(self, level: int, i: int, j: int, values: Surface) -> NDArray[np.float32]:
         """Return a tile (TILE_PX, TILE_PX) of a value that each surface has, fresh paint among them, without grain."""
-        where = (level, i, j)
-        canvas = _canvas_of(*where)
+        where, canvas = (level, i, j), _Canvas(level, i, j)
         plane = np.full((1, TILE_PX, TILE_PX), values["meadow"], np.float32)
         for name, strokes in (("sidewalk", self._sidewalks), ("curb", self._curbs), ("asphalt", self._asphalt)):
             _blend(plane, (values[name],), canvas.drawn(strokes))
@@ -331,7 +317,14 @@ class Ground:
 
     def _covered(self, layer: _Layer, canvas: _Canvas, where: tuple[int, int, int]) -> Share | None:
         """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that has paint of a layer; None where nothing has."""
-        drawn = layer.drawn(canvas)
+        drawn = canvas.drawn(layer.free)
+        for outline in layer.outlines:
+            drawn = _most(drawn, canvas.filled(outline))
+        for marks, crossing in layer.along:
+            lines = canvas.drawn(marks)
+            if lines is not None:
+                gap = canvas.drawn(crossing)
+                drawn = _most(drawn, lines if gap is None else np.asarray(cv2.subtract(lines, gap), np.uint8))
         if drawn is None or (layer.worn <= 0 and layer.strength >= 1):
             return drawn
         level, i, j = where
@@ -347,22 +340,8 @@ class _Layer:
     worn: float  # share that is missing
     strength: float  # from 0 for what cannot be seen to 1 for fresh paint
     free: _Strokes  # what nothing interrupts
-    # Tuple of (_Strokes, _Strokes): lines along roads, and what interrupts them
-    along: tuple[tuple[_Strokes, _Strokes], ...]
+    along: tuple[tuple[_Strokes, _Strokes], ...]  # lines along roads, and what interrupts them
     outlines: tuple[Array, ...]  # tuple of (P, 2) float64, m
-
-    def drawn(self, canvas: _Canvas) -> Mask | None:
-        """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that was once painted; None where nothing was."""
-        paint = canvas.drawn(self.free)
-        for outline in self.outlines:
-            paint = _most(paint, canvas.filled(outline))
-        for marks, crossing in self.along:
-            drawn = canvas.drawn(marks)
-            if drawn is None:
-                continue
-            gap = canvas.drawn(crossing)
-            paint = _most(paint, drawn if gap is None else np.asarray(cv2.subtract(drawn, gap), np.uint8))
-        return paint
 
 
 def _most(a: Mask | None, b: Mask | None) -> Mask | None:
@@ -382,8 +361,10 @@ def _layers(plan: GroundPlan) -> tuple[_Layer, ...]:
         outlines.setdefault(("white", arrow.worn, 1.0), []).append(arrow_outline(arrow))
     for k, road in enumerate(plan.roads):
         strokes: dict[_Paint, list[Stroke]] = {}
-        if road.old_m:
-            strokes["white", OLD_WORN, OLD_STRENGTH] = old_lines(road)
+        if road.old_m:  # what is left of removed lines between lanes
+            offsets = [(n / road.lanes - 0.5) * road.width_m + old for old in road.old_m for n in range(1, road.lanes)]
+            old = [_line(road, np.array(road.line), "dashed", (offset, LINE_M, 0), "white") for offset in offsets]
+            strokes["white", OLD_WORN, OLD_STRENGTH] = [stroke for line in old for stroke in line.strokes]
         for line in road_lines(road, keeps_right=plan.keeps_right):
             strokes.setdefault((line.color, road.worn, 1.0), []).extend(line.strokes)
         gaps = _Strokes(plan.interruptions(k))
@@ -394,11 +375,6 @@ def _layers(plan: GroundPlan) -> tuple[_Layer, ...]:
         _Layer(*kind, _Strokes(free.get(kind, ())), tuple(along.get(kind, ())), tuple(outlines.get(kind, ())))
         for kind in kinds
     )
-
-
-def _canvas_of(level: int, i: int, j: int) -> _Canvas:
-    step = GROUND_M_PER_PX * 2**level
-    return _Canvas(np.array([i, j]) * TILE_PX * step, step)
 
 
 class _Strokes:
@@ -423,21 +399,21 @@ class _Strokes:
 
 
 class _Canvas:
-    """Draws strokes on masks of one tile, which begins at `low_m` (2,) and has pixels of `step_m`."""
+    """Draws strokes on masks of one tile."""
 
-    def __init__(self, low_m: Array, step_m: float) -> None:
-        self._low, self._step = low_m, step_m / SUBPIXELS
-        self._high = low_m + TILE_PX * step_m
+    def __init__(self, level: int, i: int, j: int) -> None:
+        step = GROUND_M_PER_PX * 2**level
+        self._low, self._step = np.array([i, j]) * TILE_PX * step, step / SUBPIXELS
+        self._high = self._low + TILE_PX * step
 
     def drawn(self, strokes: _Strokes) -> Mask | None:
         """Share of each pixel (TILE_PX, TILE_PX) from 0 to 255 that is covered; None where nothing is."""
-        mask: Mask | None = None
-        for begin, end, width, joined in strokes.within(self._low - self._step, self._high + self._step):
-            if mask is None:
-                mask = np.zeros((TILE_PX * SUBPIXELS,) * 2, np.uint8)
-            self._draw(mask, begin, end, width, joined=joined)
-        if mask is None:
+        pieces = list(strokes.within(self._low - self._step, self._high + self._step))
+        if not pieces:
             return None
+        mask = np.zeros((TILE_PX * SUBPIXELS,) * 2, np.uint8)
+        for begin, end, width, joined in pieces:
+            self._draw(mask, begin, end, width, joined=joined)
         share = np.asarray(cv2.resize(mask, (TILE_PX, TILE_PX), interpolation=cv2.INTER_AREA), np.uint8)
         return share if cv2.countNonZero(share) else None
 
@@ -478,15 +454,3 @@ def _blend(
         part *= shade
     for plane, value in zip(planes, color):
         plane += part * np.float32(value)
-
-
-def _joints(level: int, i: int, j: int) -> NDArray[np.float32]:
-    """Brightness (TILE_PX, TILE_PX) of paving: darker by the share of joints in a pixel."""
-    factor = 2**level
-
-    def covered(first: int) -> NDArray[np.float32]:
-        fine = (np.arange(TILE_PX * factor) + first * TILE_PX * factor) % SLAB_PX == 0
-        return np.asarray(fine.reshape(TILE_PX, factor).mean(1), np.float32)
-
-    plain = np.outer(1 - covered(j), 1 - covered(i))
-    return np.asarray(1 - (1 - JOINT_SHADE) * (1 - plain), np.float32)

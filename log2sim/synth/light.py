@@ -35,7 +35,7 @@ class Light:
     sun_color: Color
     sky_color: Color
     horizon: Color  # the sky at the horizon and overhead
-    zenith: Color  # the sky at the horizon and overhead
+    zenith: Color
     extinction_per_m: float = 1 / 500  # share of light that the air takes on a meter
     lamps: float = 0.0  # brightness of headlights, rear lights and street lights, relative to what surfaces emit by day
     wetness: float = 0.0  # from 0 for a dry road to 1 for a wet one
@@ -48,16 +48,6 @@ class Light:
         """Light (3,) that level ground under the open sky gives back relative to its dry color."""
         dry = np.add(self.sky_color, np.multiply(self.sun_color, self.sun[2]))
         return np.asarray(dry * (1 - (1 - WET_ALBEDO) * self.wetness), np.float32)
-
-    def on_wall(self, outward: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Light (3,) on an upright wall with an outward normal (2,)."""
-        share = max(0.0, float(np.dot(outward, self.sun[:2])))
-        return np.asarray(np.multiply(self.sky_color, 0.75) + np.multiply(self.sun_color, share), np.float32)
-
-    def sun_share(self) -> np.float32:
-        """Share of the light on level ground that comes from the sun, less what houses and trees throw back."""
-        sun = float(np.mean(self.sun_color)) * self.sun[2]
-        return np.float32(0.96 * sun / (sun + float(np.mean(self.sky_color))))
 
     def hazy(self, color: NDArray[np.float32], depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Dim light (..., 3), in place, by the air over distances (...)."""
@@ -101,29 +91,20 @@ def light_of(environment: Environment) -> Light:
 
     Rain takes light besides what clear air takes, fog so much more that the air does not count.
     """
-    light = _in_weather(LIGHTS[environment.light], environment)
+    light, fog = LIGHTS[environment.light], environment.weather == "fog"
+    if environment.weather != "clear":
+        extinction = weather_of(environment).extinction_per_m + (0.0 if fog else light.extinction_per_m)
+        sky = np.add(light.sky_color, np.multiply(light.sun_color, 0.5 * light.sun[2]))
+        gray = (sky + 2 * sky.mean()) / 3 * (1.0 if fog else 0.8)
+        colors = np.multiply(light.sun_color, 0.06), gray, gray * 0.92, gray * (0.88 if fog else 0.7)
+        names = ("sun_color", "sky_color", "horizon", "zenith")
+        changed: dict[str, Any] = {name: tuple(color.tolist()) for name, color in zip(names, colors)}
+        light = replace(
+            light, **changed, extinction_per_m=extinction, lamps=max(light.lamps, 3.0), wetness=0.3 if fog else 1.0,
+            rain_mm_h=0.0 if fog else environment.rain_mm_h, noise=light.noise * 1.3,
+        )  # fmt: skip
     wetness = light.wetness if environment.wetness is None else environment.wetness
     return replace(light, wetness=wetness, glare=environment.glare)
-
-
-def _in_weather(light: Light, environment: Environment) -> Light:
-    if environment.weather == "clear":
-        return light
-    fog = environment.weather == "fog"
-    extinction = weather_of(environment).extinction_per_m + (0.0 if fog else light.extinction_per_m)
-    sky = np.add(light.sky_color, np.multiply(light.sun_color, 0.5 * light.sun[2]))
-    gray = (sky + 2 * sky.mean()) / 3 * (1.0 if fog else 0.8)
-    return replace(
-        light, sun_color=_color(np.multiply(light.sun_color, 0.06)), sky_color=_color(gray),
-        horizon=_color(gray * 0.92), zenith=_color(gray * (0.88 if fog else 0.7)), extinction_per_m=extinction,
-        lamps=max(light.lamps, 3.0), wetness=0.3 if fog else 1.0, rain_mm_h=0.0 if fog else environment.rain_mm_h,
-        noise=light.noise * 1.3,
-    )  # fmt: skip
-
-
-def _color(values: NDArray[np.float64]) -> Color:
-    blue, green, red = (float(v) for v in values)
-    return blue, green, red
 
 
 def reflected(
@@ -151,7 +132,11 @@ def reflected(
     # What mirrors show that look up by this sine: the sky (and how high), houses and the road.
     sky_share = (blend * (1 - below), np.clip(up * 1.6, 0, 1))
     house_share, road_share = (1 - blend) * (1 - below), below
-    glint = 2.0 * surface.gloss * _power_60(np.clip(2 * facing * n_sun - camera_sun, 0, 1))
+    along = np.clip(2 * facing * n_sun - camera_sun, 0, 1)
+    along4 = along * along * along * along
+    along8 = along4 * along4
+    along16 = along8 * along8
+    glint = 2.0 * surface.gloss * (along16 * along16 * along16 * along8 * along4)  # to the power of 60
     surrounding = np.float32(np.mean(light.sky_color) / np.mean(NOON.sky_color))
     emission = np.float32(max(1.0, light.lamps))
     out = np.empty((len(n), 3), np.float32)
@@ -165,14 +150,6 @@ def reflected(
         sparkle = glint * np.float32(light.sun_color[c] / NOON.sun_color[c])
         out[:, c] = surface.albedo[:, c] * lit + surface.glow[:, c] * emission + gloss * mirrored + sparkle
     return out
-
-
-def _power_60(x: NDArray[np.float32]) -> NDArray[np.float32]:
-    x4 = x * x * x * x
-    x8 = x4 * x4
-    x16 = x8 * x8
-    power: NDArray[np.float32] = x16 * x16 * x16 * x8 * x4
-    return power
 
 
 CAMERA_NEAR_M = 0.2  # of the near plane
@@ -192,12 +169,11 @@ class RenderCamera:
         """Take a camera without its distortion."""
         return cls(camera.K, camera.width_px, camera.height_px, map_T_cam)
 
-    def enlarged(self, scale: int) -> RenderCamera:
+    def divided(self, columns: int, rows: int) -> RenderCamera:
         """Divide each pixel into several; whole numbers are pixel centers, before and after."""
-        K = self.K * scale
-        K[:2, 2] += (scale - 1) / 2
-        K[2, 2] = 1.0
-        return RenderCamera(K, self.width_px * scale, self.height_px * scale, self.map_T_cam)
+        K = self.K * [[columns], [rows], [1]]
+        K[:2, 2] += (columns - 1) / 2, (rows - 1) / 2
+        return RenderCamera(K, self.width_px * columns, self.height_px * rows, self.map_T_cam)
 
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Rays with depth 1 in the map, as sums of a part by column (W, 3) and a part by row (H, 3)."""
@@ -211,15 +187,7 @@ class RenderCamera:
         by_column, by_row = self.rays()
         if np.ptp(by_column[:, 2]) < 1e-6:
             by_column = by_column[:1]
-        up: NDArray[np.float32] = by_row[:, None, 2] + by_column[None, :, 2]
-        return up
-
-    def taller(self, factor: int) -> RenderCamera:
-        """Divide each row into several."""
-        K = self.K.copy()
-        K[1] *= factor
-        K[1, 2] += (factor - 1) / 2
-        return RenderCamera(K, self.width_px, self.height_px * factor, self.map_T_cam)
+        return np.asarray(by_row[:, None, 2] + by_column[None, :, 2])
 
     def directions(self, u: NDArray[Any], v: NDArray[Any]) -> Array:
         """Rays (N, 3) of depth 1 in the map through points of the image."""
@@ -288,25 +256,20 @@ def draw_ground(view: RenderCamera, ground: Ground, light: Light, color: Image, 
     band = slice(int(rows[0]), int(rows[-1]) + 1)
     below = fall[band] > MIN_FALL
     away = np.divide(np.float32(height), fall[band], out=np.full(below.shape, FAR_M, np.float32), where=below)
-    lit = linear(_ground_image(view, ground, band), light.on_ground())
+    # Tiles of the ground are warped into rows of the image, for each row from the level whose resolution fits.
+    fine, top = view.divided(1, ROWS_PER_PX), band.start * ROWS_PER_PX
+    middle = fine.ground_depth(np.full(fine.height_px, fine.width_px / 2), np.arange(fine.height_px))
+    part = middle[top : band.stop * ROWS_PER_PX]
+    image = np.empty((len(part), fine.width_px, 3), np.uint8)
+    for level, some in rows_by_level(part, ROWS_PER_PX * fine.map_T_cam[2, 3], fine.K[0, 0]):
+        image[some] = _warped(fine, ground, level, slice(top + some.start, top + some.stop))
+    small = cv2.resize(image, (fine.width_px, band.stop - band.start), interpolation=cv2.INTER_AREA)
+    lit = linear(np.asarray(small, np.uint8), light.on_ground())
     away, below = (np.broadcast_to(x, lit.shape[:2]) for x in (np.minimum(away, FAR_M), below))
     if below.all():
         color[band], depth[band] = lit, away
     else:
         color[band][below], depth[band][below] = lit[below], away[below]
-
-
-def _ground_image(view: RenderCamera, ground: Ground, band: slice) -> Texture:
-    """Warp the tiles of the ground into rows of the image, for each row from the level whose resolution fits."""
-    fine = view.taller(ROWS_PER_PX)
-    top = band.start * ROWS_PER_PX
-    middle = fine.ground_depth(np.full(fine.height_px, fine.width_px / 2), np.arange(fine.height_px))
-    part = middle[top : band.stop * ROWS_PER_PX]
-    out = np.empty((len(part), fine.width_px, 3), np.uint8)
-    for level, rows in rows_by_level(part, ROWS_PER_PX * fine.map_T_cam[2, 3], fine.K[0, 0]):
-        out[rows] = _warped(fine, ground, level, slice(top + rows.start, top + rows.stop))
-    size = (fine.width_px, band.stop - band.start)
-    return np.asarray(cv2.resize(out, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def rows_by_level(away_m: Array, height_m: float, focal_px: float) -> Iterator[tuple[int, slice]]:
@@ -328,11 +291,15 @@ def _warped(fine: RenderCamera, ground: Ground, level: int, rows: slice) -> Text
     away = fine.ground_depth(corner_u, corner_v)[:, None]
     seen = (eye + fine.directions(corner_u, corner_v)[:, :2] * away) / (step * TILE_PX)
     low = np.floor(seen.min(0) - 0.02).astype(int)
-    shape = np.floor(seen.max(0) + 0.02).astype(int) - low + 1  # columns and rows of tiles
-    mosaic = np.zeros((shape[1] * TILE_PX, shape[0] * TILE_PX, 3), np.uint8)
-    for j, i in zip(*np.nonzero(_touched(seen - low, shape))):
-        tile = ground.tile(level, int(low[0] + i), int(low[1] + j))
-        mosaic[j * TILE_PX : (j + 1) * TILE_PX, i * TILE_PX : (i + 1) * TILE_PX] = tile
+    columns, rows_high = (np.floor(seen.max(0) + 0.02).astype(int) - low + 1).tolist()
+    # Which of the tiles the convex outline of what is seen touches.
+    fineness = 8
+    mask = np.zeros((rows_high * fineness, columns * fineness), np.uint8)
+    hull = cv2.convexHull(np.rint(((seen - low) * fineness - 0.5) * 16).astype(np.int32))
+    cv2.fillConvexPoly(mask, hull, 1, cv2.LINE_8, 4)
+    wider = np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
+    touched = wider.reshape(rows_high, fineness, columns, fineness).any(axis=(1, 3))
+    mosaic = ground.mosaic(level, (int(low[0]), int(low[1])), np.asarray(touched), (0, 0, 0))
     corner = low * TILE_PX * step + step / 2 - eye  # of the mosaic's first pixel, relative to the camera
     ground_H_mosaic = np.array([[step, 0, corner[0]], [0, step, corner[1]], [0, 0, 1]])
     shift = np.array([[1, 0, 0], [0, 1, -rows.start], [0, 0, 1.0]])
@@ -340,17 +307,6 @@ def _warped(fine: RenderCamera, ground: Ground, level: int, rows: slice) -> Text
     size = (fine.width_px, rows.stop - rows.start)
     warped = cv2.warpPerspective(mosaic, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(warped, np.uint8)
-
-
-def _touched(corners: Array, shape: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which of a grid of unit squares, `shape` (2,) columns and rows, a convex polygon (P, 2) touches: (rows, columns)."""
-    fineness = 8
-    columns, rows = (int(n) * fineness for n in shape)
-    mask = np.zeros((rows, columns), np.uint8)
-    hull = cv2.convexHull(np.rint((corners * fineness - 0.5) * 16).astype(np.int32))
-    cv2.fillConvexPoly(mask, hull, 1, cv2.LINE_8, 4)
-    wider = np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8)))
-    return np.asarray(wider.reshape(rows // fineness, fineness, columns // fineness, fineness).any(axis=(1, 3)))
 
 
 HEADLIGHT_COLOR: Color = (0.95, 0.95, 0.90)  # LED, 5000 K
@@ -370,8 +326,7 @@ class Lamp:
     """A lamp at one time."""
 
     position_m: Array  # (3,), m
-    # (2,) float64 or None: direction of a headlight; None for a street light, which shines downwards
-    forward: Array | None = None
+    forward: Array | None = None  # (2,): direction of a headlight; None for a street light, which shines downwards
 
 
 def headlights(map_T_vehicle: Array, front_m: float, width_m: float) -> tuple[Lamp, ...]:
@@ -389,9 +344,8 @@ def street_lights(roads: Sequence[Road], around_m: Array) -> tuple[Lamp, ...]:
         for a, b in pairwise(line):
             length = float(np.linalg.norm(b - a))
             middle = float(np.dot(around_m - a, b - a)) / max(length, 1e-9)
-            first = max(
-                np.ceil((middle - MAX_LAMP_DISTANCE_M) / STREET_SPACING_M) * STREET_SPACING_M, STREET_SPACING_M / 2
-            )
+            first = np.ceil((middle - MAX_LAMP_DISTANCE_M) / STREET_SPACING_M) * STREET_SPACING_M
+            first = max(first, STREET_SPACING_M / 2)
             along = np.arange(first, min(length, middle + MAX_LAMP_DISTANCE_M), STREET_SPACING_M)
             lamps += [Lamp(np.append(a + (b - a) * s / length, STREET_HEIGHT_M)) for s in along]
     return tuple(lamps)
@@ -418,26 +372,21 @@ def lamplight(lamps: Sequence[Lamp], exposure: float, points: Image, normals: Im
         away = np.sqrt(np.maximum(square, np.float32(1e-6)))
         if lamp.forward is None:
             strength *= np.asarray(np.clip(-offset[:, 2] / away + 0.1, 0, 1), np.float32)
-        else:
-            strength *= _beam(offset, lamp.forward)
+        else:  # a low beam: wide to the sides, cut off above the horizon
+            fx, fy = lamp.forward.astype(np.float32)
+            along = offset[:, 0] * fx + offset[:, 1] * fy
+            aside = offset[:, 1] * fx - offset[:, 0] * fy
+            ahead = np.maximum(along, np.float32(0.3))
+            wide = np.exp(-((aside / ahead / np.float32(BEAM_HALF_WIDTH)) ** 2))
+            rise = np.clip((CUTOFF_RISE - offset[:, 2] / ahead) / CUTOFF_SOFTNESS, -10, 10)
+            low = ABOVE_CUTOFF + (1 - ABOVE_CUTOFF) / (1 + np.exp(-rise))
+            strength *= np.where(along > 0.3, wide * low, 0).astype(np.float32)
         if normals is not None:
             toward = -np.einsum("ni,ni->n", offset, normals) / away
             strength *= np.clip(np.float32(0.15) + np.float32(0.85) * toward, 0, 1)
         for channel, value in enumerate(STREET_COLOR if lamp.forward is None else HEADLIGHT_COLOR):
             out[:, channel] += strength * np.float32(value)
     return out
-
-
-def _beam(offset: Image, forward: Array) -> Image:
-    """Share of a low beam in a direction: wide to the sides, cut off above the horizon."""
-    fx, fy = forward.astype(np.float32)
-    along = offset[:, 0] * fx + offset[:, 1] * fy
-    aside = offset[:, 1] * fx - offset[:, 0] * fy
-    ahead = np.maximum(along, np.float32(0.3))
-    wide = np.exp(-((aside / ahead / np.float32(BEAM_HALF_WIDTH)) ** 2))
-    rise = np.clip((CUTOFF_RISE - offset[:, 2] / ahead) / CUTOFF_SOFTNESS, -10, 10)
-    low = ABOVE_CUTOFF + (1 - ABOVE_CUTOFF) / (1 + np.exp(-rise))
-    return np.where(along > 0.3, wide * low, 0).astype(np.float32)
 
 
 def light_scenery(view: RenderCamera, lamps: Sequence[Lamp], light: Light, color: Image, depth: Image) -> None:
@@ -453,12 +402,8 @@ def light_scenery(view: RenderCamera, lamps: Sequence[Lamp], light: Light, color
     added[away >= FAR_M] = 0
     dry = np.add(light.sky_color, np.multiply(light.sun_color, light.sun[2])).astype(np.float32)
     factor = 1 + added / np.maximum(dry, np.float32(1e-4))
-    size = (view.width_px, view.height_px)
-    color *= np.where(
-        (depth < FAR_M)[..., None],
-        cv2.resize(factor.reshape(len(v), len(u), 3), size, interpolation=cv2.INTER_LINEAR),
-        1,
-    )
+    whole = cv2.resize(factor.reshape(len(v), len(u), 3), depth.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    color *= np.where((depth < FAR_M)[..., None], whole, 1)
 
 
 def glare(view: RenderCamera, lamps: Sequence[Lamp], light: Light, color: Image, depth: Image) -> None:
@@ -491,6 +436,4 @@ def glare(view: RenderCamera, lamps: Sequence[Lamp], light: Light, color: Image,
     # Fog scatters light around a lamp more widely than a lens does.
     wide = 3.0 + 200 * light.extinction_per_m
     halo = 0.6 * cv2.GaussianBlur(small, (0, 0), 1.5) + 0.4 * cv2.GaussianBlur(small, (0, 0), wide)
-    color += GLARE * cv2.resize(
-        halo.astype(np.float32), (view.width_px, view.height_px), interpolation=cv2.INTER_LINEAR
-    )
+    color += GLARE * cv2.resize(halo.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_LINEAR)

@@ -65,16 +65,14 @@ class Patch:
 
     def set(self, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
         """Paint the points of a mask (Q,)."""
-        self._put(self.rows[mask], albedo, gloss, glow)
-
-    def fill(self, albedo: Any, gloss: float = 0.0) -> None:
-        """Paint all points."""
-        self._put(self.rows, albedo, gloss, 0.0)
-
-    def _put(self, index: Index, albedo: Any, gloss: float, glow: float) -> None:
+        index = self.rows[mask]
         self.out.albedo[index] = albedo
         self.out.gloss[index] = gloss
         self.out.glow[index] = glow * np.asarray(albedo, np.float32)
+
+    def fill(self, albedo: Any, gloss: float = 0.0) -> None:
+        """Paint all points."""
+        self.set(np.ones(len(self.rows), bool), albedo, gloss)
 
 
 GLASS = (0.055, 0.05, 0.045)
@@ -83,9 +81,8 @@ RUBBER = (0.028, 0.027, 0.026)
 
 def paint(appearance: Appearance, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
     """Paint points (P, 3), m, agent frame (box center), with normals (P, 3) and materials (P,)."""
-    out = Paint(
-        np.zeros((len(part), 3), np.float32), np.zeros(len(part), np.float32), np.zeros((len(part), 3), np.float32)
-    )
+    count = len(part)
+    out = Paint(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros((count, 3), np.float32))
     z = points[:, 2] + appearance.size_m[2] / 2
     for value in np.unique(part):
         rows = np.flatnonzero(part == value)
@@ -120,12 +117,6 @@ def _car(patch: Patch) -> None:
     ahead = (n[:, 0] > 0.25) & (h > 0.685) & (h < 0.955) & (np.abs(y) < frame)
     behind = (n[:, 0] < -0.2) & (h > 0.72) & (h < 0.94) & (np.abs(y) < frame * 0.97)
     patch.set(ahead | behind, GLASS, 0.36)
-    _front(patch, h, u)
-    _rear(patch, h, u)
-
-
-def _front(patch: Patch, h: Array, u: Array) -> None:
-    y, n, width = patch.p[:, 1], patch.n, patch.appearance.size_m[1]
     front = (u > 0.44) & (n[:, 0] > 0.2)
     lamp = front & (np.abs(y) > 0.27 * width) & (h > 0.415 + 0.06 * (np.abs(y) / width - 0.27)) & (h < 0.515)
     patch.set(lamp, (0.75, 0.78, 0.78), 0.3, 0.25)
@@ -137,17 +128,12 @@ def _front(patch: Patch, h: Array, u: Array) -> None:
     patch.set(front & (np.abs(y) < 0.26) & (h > 0.30) & (h < 0.37), (0.75, 0.75, 0.75))
     letters = (np.abs(y) < 0.21) & (np.floor(y * 22) % 2 > 0)
     patch.set(front & letters & (np.abs(h - 0.335) < 0.018), (0.05, 0.05, 0.05))
-
-
-def _rear(patch: Patch, h: Array, u: Array) -> None:
-    y, n, width = patch.p[:, 1], patch.n, patch.appearance.size_m[1]
     rear = (u < -0.45) & (n[:, 0] < -0.2)
     lamp = (u < -0.445) & (np.abs(y) > 0.30 * width) & (h > 0.5) & (h < 0.61)
     patch.set(lamp, (0.02, 0.02, 0.45), 0.15, 0.25)
     patch.set(lamp & (np.abs(h - 0.535) < 0.012), (0.6, 0.6, 0.7), 0.2)
     patch.set(rear & (h > 0.635) & (h < 0.645), (0.02, 0.02, 0.02))
     patch.set(rear & (np.abs(y) < 0.26) & (h > 0.44) & (h < 0.515), (0.75, 0.75, 0.75))
-    letters = (np.abs(y) < 0.21) & (np.floor(y * 22) % 2 > 0)
     patch.set(rear & letters & (np.abs(h - 0.477) < 0.018), (0.05, 0.05, 0.05))
     patch.set(rear & (h > 0.225) & (h < 0.3), (0.03, 0.03, 0.03))
 
@@ -286,10 +272,7 @@ MAX_LEVEL = 4
 
 
 class GroundReflectance:
-    """Reflectance of the painted ground where beams meet it.
-
-    `wetness`: from 0 for dry to 1 for wet ground.
-    """
+    """Reflectance of the painted ground where beams meet it; wetness from 0 to 1."""
 
     def __init__(self, ground: Ground, wetness: float = 0.0) -> None:
         self._ground = ground
@@ -310,15 +293,12 @@ class GroundReflectance:
         order = np.argsort(group, kind="stable")
         column, row = (pixel % TILE_PX).T
         for key, rows in zip(keys.tolist(), np.split(order, np.flatnonzero(np.diff(group[order])) + 1)):
-            out[rows] = self._tile(*key)[row[rows], column[rows]]
+            where = (key[0], key[1], key[2])
+            if where not in self._tiles:
+                shade = self._ground.shade(*where, self._values)
+                self._tiles[where] = np.asarray(np.rint(shade * FULL_SCALE), np.uint8)
+            out[rows] = self._tiles[where][row[rows], column[rows]]
         return out / np.float32(FULL_SCALE)
-
-    def _tile(self, level: int, i: int, j: int) -> NDArray[np.uint8]:
-        where = (level, i, j)
-        if where not in self._tiles:
-            shade = self._ground.shade(*where, self._values)
-            self._tiles[where] = np.asarray(np.rint(shade * FULL_SCALE), np.uint8)
-        return self._tiles[where]
 
 
 def spot_m(range_m: NDArray[np.float64], incidence: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -20,12 +20,9 @@ from log2sim.synth.terrain import Surface, meet
 MIN_RANGE_M = 0.4
 WINDOW_MARGIN_RAD = 0.012
 LEAF_MEAN_PATH_M = 0.5
-# Share of rays that a wire mesh or a net lets through.
-MESH_OPENNESS = 0.65
-# Leaves face any way.
-LEAF_INCIDENCE = 0.7
-# Slower motion moves nothing by the noise of a distance within a sweep.
-MIN_DRIFT_MPS = 0.1
+MESH_OPENNESS = 0.65  # share of rays that a wire mesh or a net lets through
+LEAF_INCIDENCE = 0.7  # leaves face any way
+MIN_DRIFT_MPS = 0.1  # slower motion moves nothing by the noise of a distance within a sweep
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +49,8 @@ class SensorState:
 class Rays:
     """The rays of a sweep, L lines by A firings, and what each meets first."""
 
-    azimuth: Array  # (A,), (L,) float64: in the sensor's frame, rad
-    elevation: Array  # (A,), (L,) float64: in the sensor's frame, rad
+    azimuth: Array  # (A,), in the sensor's frame, rad
+    elevation: Array  # (L,), likewise
     direction: NDArray[np.float32]  # (L, A, 3): level frame
     column_s: NDArray[np.float32]  # (A,): times of the firings relative to the middle of the sweep
     range_m: NDArray[np.float32]  # (L, A): infinite without a hit
@@ -70,7 +67,7 @@ class Windows:
     azimuth: Array
     half: Array
     elevation: Array
-    low: Array
+    low: Array  # (S, 3): corners of the bounding box of each, in its frame
     high: Array
 
 
@@ -94,9 +91,8 @@ def windows_of(solids: Sequence[Solid], sensor: SensorState) -> Windows:
     off = wrap_angle(azimuth - middle[:, None])
     half = np.column_stack([off.min(axis=1) - margin, off.max(axis=1) + margin])
     half[(near < 1.0) | (np.ptp(off, axis=1) > 5.5)] = -np.pi, np.pi
-    return Windows(
-        near, middle, half, np.column_stack([elevation.min(axis=1) - margin, elevation.max(axis=1) + margin]), low, high
-    )
+    rise = np.column_stack([elevation.min(axis=1) - margin, elevation.max(axis=1) + margin])
+    return Windows(near, middle, half, rise, low, high)
 
 
 def cast_solid(
@@ -149,7 +145,15 @@ def cast_solid(
     enter = np.where((enter < leave) & (enter > MIN_RANGE_M), enter, np.float32(np.inf))
     for k in np.flatnonzero(np.isfinite(enter).any(axis=1)).tolist():
         if parts[k].material in (Material.LEAVES, Material.GLASS, Material.MESH):
-            enter[k] = _passed(enter[k], leave[k], parts[k].material, solid, rng)
+            # What is not solid lets rays through: leaves by a mean free path, windows and nets by a share.
+            some = np.flatnonzero(np.isfinite(enter[k]))
+            if parts[k].material == Material.LEAVES:
+                depth = rng.exponential(LEAF_MEAN_PATH_M, len(some)).astype(np.float32)
+                inside = depth < leave[k, some] - enter[k, some]
+                enter[k, some] = np.where(inside, enter[k, some] + depth, np.float32(np.inf))
+            else:
+                share = solid.glass_passes if parts[k].material == Material.GLASS else MESH_OPENNESS
+                enter[k, some[rng.random(len(some)) < share]] = np.inf
     part = enter.argmin(axis=0)
     t = enter[part, np.arange(len(part))]
     ray = np.flatnonzero(t < rays.range_m[line, firing])
@@ -169,25 +173,8 @@ def cast_solid(
     rays.incidence[line, firing] = incidence
 
 
-def _passed(
-    enter: NDArray[np.float32], leave: NDArray[np.float32], material: Material, solid: Solid, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Let rays through what is not solid: leaves by a mean free path, windows and nets by a share."""
-    met = np.flatnonzero(np.isfinite(enter))
-    out = enter.copy()
-    if material == Material.LEAVES:
-        depth = rng.exponential(LEAF_MEAN_PATH_M, len(met)).astype(np.float32)
-        inside = depth < leave[met] - enter[met]
-        out[met] = np.where(inside, enter[met] + depth, np.float32(np.inf))
-    else:
-        share = solid.glass_passes if material == Material.GLASS else MESH_OPENNESS
-        out[met[rng.random(len(met)) < share]] = np.inf
-    return out
-
-
 GROUND, NOTHING = -1, -2
-# Departure of the ground's surface from the ray that Newton's method must reach.
-MAX_GROUND_ERROR_M = 0.03
+MAX_GROUND_ERROR_M = 0.03  # departure of the ground's surface from the ray that Newton's method must reach
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,15 @@ def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
     out = np.full(len(ray), np.inf)
     if len(ray) == 0 or len(triangles) == 0:
         return out
-    groups = _groups_of(triangles)
+    # Divided at medians into groups that lie together.
+    means, groups = triangles.mean(1), [np.arange(len(triangles))]
+    while len(groups[0]) > MIN_TRIANGLES_PER_GROUP and len(groups) < MAX_GROUPS:
+        halves = []
+        for rows in groups:
+            axis = int(np.ptp(means[rows], axis=0).argmax())
+            order = rows[np.argsort(means[rows, axis], kind="stable")]
+            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
+        groups = halves
     ordered = triangles[np.concatenate(groups)]
     ends = np.cumsum([len(rows) for rows in groups])
     planes, starts = _Planes.of(ordered), np.concatenate([[0], ends[:-1]])
@@ -45,19 +53,6 @@ def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
             some = near[k : k + step]
             out[some] = np.minimum(out[some], own.nearest_hit(origin[some], ray[some], moment[some]))
     return out
-
-
-def _groups_of(triangles: Array) -> list[NDArray[np.intp]]:
-    """Divide triangles (F, 3, 3) at medians into groups that lie together: the indices of each."""
-    middle, groups = triangles.mean(1), [np.arange(len(triangles))]
-    while len(groups[0]) > MIN_TRIANGLES_PER_GROUP and len(groups) < MAX_GROUPS:
-        halves = []
-        for rows in groups:
-            axis = int(np.ptp(middle[rows], axis=0).argmax())
-            order = rows[np.argsort(middle[rows, axis], kind="stable")]
-            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
-        groups = halves
-    return groups
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +103,11 @@ class Fragments:
     """The nearest surface of a mesh at each pixel that it covers, by ascending row and column."""
 
     u: Index  # (P,) int32: column and row
-    v: Index  # (P,) int32: column and row
+    v: Index
     depth_m: NDArray[np.float32]  # (P,), m: along the optical axis
     face: Index  # (P,) int32
-    # (F, 3 vertices, 3) float64: for each face and each of its vertices the coefficients of u, v and 1 of a linear
-    # function of the image: the barycentric weight of the vertex divided by the depth
+    # (F, 3 vertices, 3): for each face and each of its vertices the coefficients of u, v and 1 of a linear function of the
+    # image: the barycentric weight of the vertex divided by the depth
     planes: Array
 
     def pixel(self, width_px: int) -> Index:
@@ -141,7 +136,7 @@ class Samples:
     nearness: NDArray[np.float32]  # (P,), 1/m: inverse depth
     row: Index  # (P,) int32: which row of which face
     row_face: Index  # (R,) int32: face and row of the image of each row
-    row_v: Index  # (R,) int32: face and row of the image of each row
+    row_v: Index
     planes: Array  # (F, 3 vertices, 3): as in `Fragments`
     width_px: int
 
@@ -160,7 +155,14 @@ class Samples:
         Greer, Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).
         """
         triangles = vertices_cam[faces]  # (F, 3 vertices, 3)
-        planes, facing = _edge_planes(triangles, K)
+        # Weights over depth as linear functions of u, v, 1: (F, 3, 3); and whether a face looks at the camera (F,).
+        a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+        normals = np.stack([cross_products(b, c), cross_products(c, a), cross_products(a, b)], 1)
+        volume = np.einsum("fi,fi->f", a, normals[:, 0])
+        facing = volume < -MIN_VOLUME_M3
+        by_ray = normals / np.where(facing, volume, -1.0)[:, None, None]
+        slope_u, slope_v = by_ray[..., 0] / K[0, 0], by_ray[..., 1] / K[1, 1]
+        planes = np.stack([slope_u, slope_v, by_ray[..., 2] - slope_u * K[0, 2] - slope_v * K[1, 2]], 2)
         low, high = _row_ranges(triangles, K, height_px)
         kept = np.flatnonzero(facing & (high > low) & (triangles[:, :, 2].max(1) > NEAR_M)).astype(np.int32)
         # Near faces last, so that they are written over far ones.
@@ -217,7 +219,14 @@ class ZBuffer:
 
 def nearest_of(samples: Samples) -> Fragments:
     """Select the nearest sample of each pixel, by ascending pixel."""
-    return samples.fragments(_nearest(samples.pixel, samples.nearness))
+    if len(samples.pixel) == 0:
+        return samples.fragments(np.zeros(0, np.int32))
+    at = samples.pixel - samples.pixel.min()
+    best = np.zeros(int(at.max()) + 1, np.float32)
+    winners = _win(best, at, samples.nearness)
+    slot = np.full(len(best), -1, np.int32)
+    slot[at[winners]] = winners
+    return samples.fragments(slot[slot >= 0])
 
 
 def _counted(counts: Index) -> Index:
@@ -225,18 +234,6 @@ def _counted(counts: Index) -> Index:
     ends = np.cumsum(counts, dtype=np.int32)
     total = int(ends[-1]) if len(ends) else 0
     return np.arange(total, dtype=np.int32) - np.repeat(ends - counts, counts)
-
-
-def _edge_planes(triangles: Array, K: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Weights over depth as linear functions of u, v, 1: (F, 3, 3); and whether a face looks at the camera (F,)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    normals = np.stack([cross_products(b, c), cross_products(c, a), cross_products(a, b)], 1)
-    volume = np.einsum("fi,fi->f", a, normals[:, 0])
-    facing = volume < -MIN_VOLUME_M3
-    by_ray = normals / np.where(facing, volume, -1.0)[:, None, None]
-    slope_u, slope_v = by_ray[..., 0] / K[0, 0], by_ray[..., 1] / K[1, 1]
-    constant = by_ray[..., 2] - slope_u * K[0, 2] - slope_v * K[1, 2]
-    return np.stack([slope_u, slope_v, constant], 2), facing
 
 
 def _row_ranges(triangles: Array, K: Array, height_px: int) -> tuple[Index, Index]:
@@ -285,17 +282,4 @@ def _win(best: NDArray[np.float32], at: Index, nearness: NDArray[np.float32]) ->
         places, values = at[left], nearness[left]
         best[places] = values
         left = left[values > best[places]]
-    won: Index = candidates[nearness[candidates] == best[at[candidates]]]
-    return won
-
-
-def _nearest(pixel: Index, nearness: NDArray[np.float32]) -> Index:
-    """Index of the nearest sample of each pixel, by ascending pixel."""
-    if len(pixel) == 0:
-        return np.zeros(0, np.int32)
-    at = pixel - pixel.min()
-    best = np.zeros(int(at.max()) + 1, np.float32)
-    winners = _win(best, at, nearness)
-    slot = np.full(len(best), -1, np.int32)
-    slot[at[winners]] = winners
-    return slot[slot >= 0]
+    return np.asarray(candidates[nearness[candidates] == best[at[candidates]]])

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, cross_slab, inverse, rotation_from_rpy, transform
-from log2sim.synth.actors import EGO_COLOR, Actor, MovingScene
+from log2sim.synth.actors import EGO_COLOR, MovingScene
 from log2sim.synth.light import weather_of
 from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
 from log2sim.synth.raster import first_hit
 from log2sim.synth.render import triangles_of
-from log2sim.synth.returns import ReturnModel, Weather, backscattered, detected, reflected
+from log2sim.synth.returns import ReturnModel, backscattered, detected, reflected
 from log2sim.synth.scene import LidarSpec, Scene
 
 GROUND, BUILDING, EGO, AIR = -1, -2, -3, -4
@@ -45,8 +45,7 @@ def sweep_stamps(spec: LidarSpec, scene: Scene) -> NDArray[np.int64]:
     first = int(np.ceil((period * _share(spec) - spec.offset_s) * spec.rate_hz - 1e-9))
     last = int(np.floor((scene.duration_s - spec.offset_s) * spec.rate_hz + 1e-9))
     t = np.arange(first, last + 1) * period + spec.offset_s
-    stamps: NDArray[np.int64] = scene.start_ns + np.rint(t * NS_PER_S).astype(np.int64)
-    return stamps
+    return np.asarray(scene.start_ns + np.rint(t * NS_PER_S).astype(np.int64))
 
 
 def _share(spec: LidarSpec) -> float:
@@ -96,18 +95,38 @@ def cast_sweep(
         closer = nearer < distance
         distance[closer], hit[closer] = nearer[closer], BUILDING
     for triangles in triangles_of(scene):
-        rows, nearer = _standing_distance(triangles, origin, ray)
+        corners = triangles.reshape(-1, 3)
+        middle = (corners.min(0) + corners.max(0)) / 2
+        rows = _near(middle, float(np.linalg.norm(corners - middle, axis=1).max()), origin, ray)
+        nearer = first_hit(origin[rows], ray[rows], triangles)
         closer = nearer < distance[rows]
         distance[rows[closer]], hit[rows[closer]] = nearer[closer], BUILDING
-    t_s = (moments - scene.start_ns) / NS_PER_S
-    for index, actor in enumerate(moving.seen_from(spec.mount)):
-        rows, nearer = _actor_distance(actor, t_s, column, origin, ray)
+    for index, actor in enumerate(moving.seen_from(spec.mount)):  # each ray meets it at its own time
+        t_s, box = (moments - scene.start_ns) / NS_PER_S, np.array(actor.spec.box_m)
+        states = actor.at(t_s)
+        rows = _near(states.center_m[column], float(np.linalg.norm(box)) / 2, origin, ray)
+        if len(rows) == 0:
+            continue
+        mesh = actor.mesh(float(t_s[column[rows]].mean()))
+        agent_T_map = inverse(states.map_T_agent())[column[rows]]
+        o = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], origin[rows]) + agent_T_map[:, :3, 3]
+        d = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], ray[rows])
+        meets = np.isfinite(slab_distance(box + 2 * MESH_MARGIN_M, o, d, from_inside=True))
+        rows, nearer = rows[meets], first_hit(o[meets], d[meets], mesh.vertices_m[mesh.faces])
         closer = nearer < distance[rows]
         distance[rows[closer]], hit[rows[closer]] = nearer[closer], index if index < len(moving.actors) else EGO
     # Drawn for every ray, so that a change of the scene moves no other ray's noise.
     noise, lost = rng.normal(0.0, 1.0, len(ray)) * spec.noise_m, rng.random(len(ray)) < spec.dropout
     distance[distance > spec.range_m] = np.inf
-    _through_air(distance, hit, weather_of(scene.environment), rng)
+    weather = weather_of(scene.environment)
+    if weather.kind != "clear":  # some returns are lost to rain and fog, and others come back from the air
+        air = backscattered(distance.astype(np.float32), weather, rng)
+        solid = np.flatnonzero(np.isfinite(distance))
+        usual = np.ones(len(solid), np.float32)
+        signal = reflected(distance[solid].astype(np.float32), usual * USUAL_REFLECTANCE, usual, weather)
+        distance[solid[~detected(signal, ReturnModel(dropout=0.0), rng)]] = np.inf
+        early = np.isfinite(air)
+        distance[early], hit[early] = air[early], AIR
     keep = np.isfinite(distance) & (distance > MIN_RANGE_M) & ~lost
     xyz = directions[keep] * (distance + noise)[keep, None]
     if spec.resolution_m > 0:
@@ -116,8 +135,8 @@ def cast_sweep(
     if ground is not None:
         # What is no ground is taken to face the sensor. The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`,
         # counted from the end.
-        solid = [body_reflectance(agent.color) for agent in scene.agent]
-        by_hit = [*solid, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
+        bodies = [body_reflectance(agent.color) for agent in scene.agent]
+        by_hit = [*bodies, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
         reflectance = np.array(by_hit, np.float32)[hit[keep]]
         incidence = np.ones(len(reflectance), np.float32)
         met, on = hit[keep] == GROUND, np.flatnonzero(keep)[hit[keep] == GROUND]
@@ -127,19 +146,6 @@ def cast_sweep(
     # Column after column in memory, which packs a quarter smaller.
     points = np.asfortranarray(xyz, dtype=np.float32)
     return LabeledSweep(Sweep(stamp_ns, points, "lidar", t_ns[keep], intensity=intensity), hit[keep])
-
-
-def _through_air(distance: Array, hit: NDArray[np.int64], weather: Weather, rng: np.random.Generator) -> None:
-    """Lose returns (N,) to rain and fog and let others come back from the air, in place; nothing in clear weather."""
-    if weather.kind == "clear":
-        return
-    air = backscattered(distance.astype(np.float32), weather, rng)
-    solid = np.isfinite(distance)
-    usual = np.ones(int(solid.sum()), np.float32)
-    signal = reflected(distance[solid].astype(np.float32), usual * USUAL_REFLECTANCE, usual, weather)
-    distance[np.flatnonzero(solid)[~detected(signal, ReturnModel(dropout=0.0), rng)]] = np.inf
-    early = np.isfinite(air)
-    distance[early], hit[early] = air[early], AIR
 
 
 def slab_distance(size_m: Array, origin: Array, ray: Array, *, from_inside: bool = False) -> Array:
@@ -159,27 +165,3 @@ def _near(middle: Array, radius: float, origin: Array, ray: Array) -> NDArray[np
     along = np.einsum("ni,ni->n", to, ray)
     off = np.einsum("ni,ni->n", to, to) - along**2
     return np.flatnonzero((off < radius**2) & (along > -radius))
-
-
-def _standing_distance(triangles: Array, origin: Array, ray: Array) -> tuple[NDArray[np.intp], Array]:
-    """Rays that pass near triangles (F, 3, 3) in the map, and their distances to them."""
-    corners = triangles.reshape(-1, 3)
-    middle = (corners.min(0) + corners.max(0)) / 2
-    rows = _near(middle, float(np.linalg.norm(corners - middle, axis=1).max()), origin, ray)
-    return rows, first_hit(origin[rows], ray[rows], triangles)
-
-
-def _actor_distance(
-    actor: Actor, t_s: Array, column: NDArray[np.int64], origin: Array, ray: Array
-) -> tuple[NDArray[np.intp], Array]:
-    """Rays that meet the actor's box at their own time, and their distances to its shape."""
-    states = actor.at(t_s)
-    rows = _near(states.center_m[column], float(np.linalg.norm(actor.spec.box_m)) / 2, origin, ray)
-    if len(rows) == 0:
-        return rows, np.zeros(0)
-    mesh = actor.mesh(float(t_s[column[rows]].mean()))
-    agent_T_map = inverse(states.map_T_agent())[column[rows]]
-    o = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], origin[rows]) + agent_T_map[:, :3, 3]
-    d = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], ray[rows])
-    meets = np.isfinite(slab_distance(np.array(actor.spec.box_m) + 2 * MESH_MARGIN_M, o, d, from_inside=True))
-    return rows[meets], first_hit(o[meets], d[meets], mesh.vertices_m[mesh.faces])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
@@ -56,8 +56,7 @@ class Body:
     map_T_body: Array  # (4, 4)
     size_m: tuple[float, float, float]  # of the box
     painter: Painter
-    # (K,) float32 or None: share of samples through which one sees what is behind, by material; None for a solid body
-    passes: NDArray[np.float32] | None = None
+    passes: Values | None = None  # (K,): by material, the share of samples that show what is behind; None: solid
 
     @classmethod
     def of(cls, actor: Actor, t_s: float) -> Body:
@@ -66,29 +65,29 @@ class Body:
         return cls(actor.mesh(t_s), pose, actor.spec.box_m, partial(paint, actor.appearance))
 
 
-def near_first(view: RenderCamera, bodies: Sequence[Body]) -> list[int]:
-    """Order bodies by the distance of their middles from the camera, so that those behind others are found early."""
-    return sorted(
-        range(len(bodies)), key=lambda k: float(np.linalg.norm(bodies[k].map_T_body[:3, 3] - view.map_T_cam[:3, 3]))
-    )
+def near_first(view: RenderCamera, bodies: Sequence[Body], nearness: Image) -> Iterator[int]:
+    """Yield bodies by the distance of their middles from the camera, but those around which all pixels show something nearer.
 
-
-def is_hidden(view: RenderCamera, body: Body, nearness: Image) -> bool:
-    """Decide whether all pixels around a body show something nearer, by a flat image of inverse depths."""
-    if len(body.mesh.vertices_m) == 0:
-        return True
-    ends = np.stack([body.mesh.vertices_m.min(0), body.mesh.vertices_m.max(0)])
-    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
-    p = apply(inverse(view.map_T_cam) @ body.map_T_body, corners)
-    if p[:, 2].max() < NEAR_M:
-        return True
-    if p[:, 2].min() < NEAR_M:
-        return False
-    uv = p[:, :2] / p[:, 2:] * np.diag(view.K)[:2] + view.K[:2, 2]
-    size = [view.width_px, view.height_px]
-    low, high = (np.clip(np.floor(v), 0, size).astype(int) for v in (uv.min(0), uv.max(0) + 1))
-    part = nearness.reshape(view.height_px, view.width_px)[low[1] : high[1], low[0] : high[0]]
-    return part.size == 0 or float(part.min()) > 1 / float(p[:, 2].min())
+    `nearness`: a flat image of inverse depths, into which each body that is yielded may be drawn before the next one.
+    """
+    away = [float(np.linalg.norm(body.map_T_body[:3, 3] - view.map_T_cam[:3, 3])) for body in bodies]
+    for index in sorted(range(len(bodies)), key=away.__getitem__):
+        vertices = bodies[index].mesh.vertices_m
+        if len(vertices) == 0:
+            continue
+        ends = np.stack([vertices.min(0), vertices.max(0)])
+        corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
+        p = apply(inverse(view.map_T_cam) @ bodies[index].map_T_body, corners)
+        if p[:, 2].max() < NEAR_M:
+            continue
+        if p[:, 2].min() >= NEAR_M:
+            uv = p[:, :2] / p[:, 2:] * np.diag(view.K)[:2] + view.K[:2, 2]
+            size = [view.width_px, view.height_px]
+            low, high = (np.clip(np.floor(v), 0, size).astype(int) for v in (uv.min(0), uv.max(0) + 1))
+            part = nearness.reshape(view.height_px, view.width_px)[low[1] : high[1], low[0] : high[0]]
+            if part.size == 0 or float(part.min()) > 1 / float(p[:, 2].min()):
+                continue
+        yield index
 
 
 def samples_of(view: RenderCamera, body: Body) -> Samples:
@@ -100,52 +99,39 @@ def samples_of(view: RenderCamera, body: Body) -> Samples:
 
 def draw_bodies(view: RenderCamera, bodies: Sequence[Body], lit: SceneInstant, color: Image, depth: Image) -> None:
     """Draw bodies where they are nearer than the depth (H, W) so far, softening their outlines."""
-    fine = view.enlarged(SAMPLES)
+    fine = view.divided(SAMPLES, SAMPLES)
     behind = np.repeat(np.repeat((1 / depth).astype(np.float32), SAMPLES, axis=0), SAMPLES, axis=1)
     buffer = ZBuffer(behind.ravel())
     drawn: dict[int, tuple[Fragments, NDArray[np.int32], int]] = {}
-    for index in near_first(fine, bodies):
-        if not is_hidden(fine, bodies[index], buffer.nearness):
-            drawn[index] = buffer.add(samples_of(fine, bodies[index]))
+    for index in near_first(fine, bodies, buffer.nearness):
+        drawn[index] = buffer.add(samples_of(fine, bodies[index]))
+    # Of each pixel the light, and the share of it that bodies cover.
     light, share = np.zeros((depth.size, 3), np.float32), np.zeros(depth.size, np.float32)
-    for index, (fragments, pixel, first) in drawn.items():
-        left = buffer.still_seen(pixel, first)
-        if len(left):
-            _add(view, fine, bodies[index], lit, fragments.part(left), light, share)
+    for index, (samples, pixel, number) in drawn.items():
+        fragments, body = samples.part(buffer.still_seen(pixel, number)), bodies[index]
+        if not len(fragments.u):
+            continue
+        # The pixel that each sample lies in.
+        coarse = (fragments.v >> SAMPLES_SHIFT) * np.int32(view.width_px) + (fragments.u >> SAMPLES_SHIFT)
+        first = int(coarse.min())
+        coarse -= np.int32(first)
+        count = np.bincount(coarse).astype(np.float32) / SAMPLES**2
+        part = slice(first, first + len(count))
+        share[part] += count
+        if len(coarse) <= MAX_SHADED_SAMPLES:
+            shaded = shade(fine, body, lit, fragments)
+            for channel in range(3):
+                light[part, channel] += np.bincount(coarse, shaded[:, channel]) / SAMPLES**2
+        else:  # one sample stands for all of its pixel
+            slot = np.empty(len(count), np.int32)
+            slot[coarse] = np.arange(len(coarse), dtype=np.int32)
+            chosen = np.flatnonzero(count)
+            shaded = shade(fine, body, lit, fragments.part(slot[chosen]))
+            shaded *= count[chosen][:, None]
+            light[first + chosen] += shaded
     color *= (1 - share).reshape(*depth.shape, 1)
     color += light.reshape(color.shape)
     depth[:] = 1 / buffer.nearness.reshape(behind.shape)[::SAMPLES, ::SAMPLES]
-
-
-def _add(
-    view: RenderCamera,
-    fine: RenderCamera,
-    body: Body,
-    lit: SceneInstant,
-    fragments: Fragments,
-    light: Image,
-    share: Image,
-) -> None:
-    """Add samples of a body to the light (N, 3) of the pixels and to the shares (N,) of them that bodies cover."""
-    # The pixel that each sample lies in.
-    coarse = (fragments.v >> SAMPLES_SHIFT) * np.int32(view.width_px) + (fragments.u >> SAMPLES_SHIFT)
-    first = int(coarse.min())
-    coarse -= np.int32(first)
-    count = np.bincount(coarse).astype(np.float32) / SAMPLES**2
-    part = slice(first, first + len(count))
-    share[part] += count
-    if len(coarse) <= MAX_SHADED_SAMPLES:
-        shaded = shade(fine, body, lit, fragments)
-        for channel in range(3):
-            light[part, channel] += np.bincount(coarse, shaded[:, channel]) / SAMPLES**2
-        return
-    # One sample stands for all of its pixel.
-    slot = np.empty(len(count), np.int32)
-    slot[coarse] = np.arange(len(coarse), dtype=np.int32)
-    chosen = np.flatnonzero(count)
-    shaded = shade(fine, body, lit, fragments.part(slot[chosen]))
-    shaded *= count[chosen][:, None]
-    light[first + chosen] += shaded
 
 
 def shade(view: RenderCamera, body: Body, lit: SceneInstant, fragments: Fragments) -> NDArray[np.float32]:
@@ -178,13 +164,11 @@ def draw_shadows(
 
     `standing`: convex outlines (P, 2), m, of further shadows on level ground.
     """
-    sun = np.zeros(ground.shape, np.uint8)
-    sky = np.zeros(ground.shape, np.uint8)
-    slope = np.divide(lit.light.sun[:2], lit.light.sun[2])
+    light, sun, sky = lit.light, np.zeros(ground.shape, np.uint8), np.zeros(ground.shape, np.uint8)
+    slope = np.divide(light.sun[:2], light.sun[2])
     for body in bodies:
-        if np.linalg.norm(body.map_T_body[:2, 3] - view.map_T_cam[:2, 3]) > SHADOW_RANGE_M:
-            continue
-        if len(body.mesh.vertices_m) == 0:
+        far = np.linalg.norm(body.map_T_body[:2, 3] - view.map_T_cam[:2, 3]) > SHADOW_RANGE_M
+        if far or len(body.mesh.vertices_m) == 0:
             continue
         vertices = apply(body.map_T_body, body.mesh.vertices_m)
         floor = body.map_T_body[2, 3] - body.size_m[2] / 2
@@ -206,10 +190,11 @@ def draw_shadows(
     if len(rows) == 0:
         return
     band = slice(max(int(rows[0]) - 5, 0), int(rows[-1]) + 6)
-    soft_sun, soft_sky = (
-        cv2.GaussianBlur(m[band], (0, 0), s) * np.float32(1 / 255) for m, s in ((sun, 1.6), (sky, 1.8))
-    )
-    share = lit.light.sun_share()
+    soft_sun = cv2.GaussianBlur(sun[band], (0, 0), 1.6) * np.float32(1 / 255)
+    soft_sky = cv2.GaussianBlur(sky[band], (0, 0), 1.8) * np.float32(1 / 255)
+    # The share of the light that comes from the sun, less what houses and trees throw back.
+    bright = float(np.mean(light.sun_color)) * light.sun[2]
+    share = np.float32(0.96 * bright / (bright + float(np.mean(light.sky_color))))
     factor = (1 - share * soft_sun) * (1 - 0.5 * soft_sky)
     color[band] *= np.where(ground[band], factor, np.float32(1))[..., None]
 
@@ -248,9 +233,8 @@ def bodies_at(scene: Scene, t_s: float) -> list[Body]:
     """Traffic lights as they look at a time in s since the start."""
     out = []
     for light, signal in zip(scene.traffic_light, signals_of(scene)):
-        mesh, pose = _mesh(light), _pose(light)
         size = (DEPTH_M, WIDTH_M, 2 * light.position[2])  # so that its ground is that of the scene
-        out.append(Body(mesh, pose, size, partial(_paint, str(signal.at(t_s)[0]))))
+        out.append(Body(*_housing(light), size, partial(_paint, str(signal.at(t_s)[0]))))
     return out
 
 
@@ -258,34 +242,29 @@ def triangles_of(scene: Scene) -> tuple[Array, ...]:
     """Triangles (F, 3, 3) in the map of each traffic light, as a LiDAR meets them."""
     out = []
     for light in scene.traffic_light:
-        mesh, pose = _mesh(light), _pose(light)
+        mesh, pose = _housing(light)
         vertices = mesh.vertices_m @ pose[:3, :3].T + pose[:3, 3]
         out.append(vertices[mesh.faces])
     return tuple(out)
 
 
-def _pose(light: TrafficLight) -> Array:
-    return transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(light.yaw_deg)), np.array(light.position))
-
-
-def _mesh(light: TrafficLight) -> Mesh:
-    """Shape a traffic light around the middle of its housing, which faces +x."""
+def _housing(light: TrafficLight) -> tuple[Mesh, Array]:
+    """Shape a traffic light around the middle of its housing, which faces +x; and return its pose (4, 4) in the map."""
     low, high = [-DEPTH_M / 2, -WIDTH_M / 2, -HEIGHT_M / 2], [DEPTH_M / 2, WIDTH_M / 2, HEIGHT_M / 2]
-    parts = [block(low, high, HOUSING), *(_lens(1 - k, part) for k, part in enumerate(LAMPS))]
+    parts = [block(low, high, HOUSING)]
+    angle, k = np.arange(CORNERS) * 2 * np.pi / CORNERS, np.arange(CORNERS)
+    x = DEPTH_M / 2 + LENS_AHEAD_M
+    ring = np.stack([np.full(CORNERS, x), np.cos(angle), np.sin(angle)], 1) * [1, LENS_RADIUS_M, LENS_RADIUS_M]
+    faces = np.stack([k, (k + 1) % CORNERS, np.full(CORNERS, CORNERS)], 1)
+    for row, part in enumerate(LAMPS):
+        lens = np.concatenate([ring, [[x, 0.0, 0.0]]]) + np.array([0, 0, (1 - row) * LENS_SPACING_M])
+        parts.append(surface(lens, faces, part))
     if light.pole:
         behind = -DEPTH_M / 2 - POLE_M
         low, high = [behind, -POLE_M / 2, -light.position[2]], [-DEPTH_M / 2, POLE_M / 2, HEIGHT_M / 2]
         parts.append(block(low, high, POLE))
-    return merged(parts)
-
-
-def _lens(row: int, part: int) -> Mesh:
-    angle = np.arange(CORNERS) * 2 * np.pi / CORNERS
-    x = DEPTH_M / 2 + LENS_AHEAD_M
-    ring = np.stack([np.full(CORNERS, x), np.cos(angle), np.sin(angle)], 1) * [1, LENS_RADIUS_M, LENS_RADIUS_M]
-    vertices = np.concatenate([ring, [[x, 0.0, 0.0]]]) + np.array([0, 0, row * LENS_SPACING_M])
-    k = np.arange(CORNERS)
-    return surface(vertices, np.stack([k, (k + 1) % CORNERS, np.full(CORNERS, CORNERS)], 1), part)
+    pose = transform(rotation_from_rpy(0.0, 0.0, np.deg2rad(light.yaw_deg)), np.array(light.position))
+    return merged(parts), pose
 
 
 def _paint(state: str, part: NDArray[np.int64], p: Values, n: Values) -> Paint:
@@ -472,10 +451,9 @@ def segment(camera: Camera, map_T_cam: Array, instant: SceneInstant) -> list[Vis
     buffer = ZBuffer(np.reciprocal(depth).ravel())
     out: list[Visibility | None] = [None] * len(instant.bodies)
     added: dict[int, tuple[Fragments, NDArray[np.int32], int, Fragments]] = {}
-    for index in near_first(view, instant.bodies):
-        if not is_hidden(view, instant.bodies[index], buffer.nearness):
-            samples = samples_of(view, instant.bodies[index])
-            added[index] = (*buffer.add(samples), nearest_of(samples))
+    for index in near_first(view, instant.bodies, buffer.nearness):
+        samples = samples_of(view, instant.bodies[index])
+        added[index] = (*buffer.add(samples), nearest_of(samples))
     for index, (fragments, pixel, first, whole) in added.items():
         visible = fragments.part(buffer.still_seen(pixel, first))
         if len(visible.u):

@@ -157,8 +157,7 @@ def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int) ->
 
 def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int) -> Mesh:
     """Make a thin tire around an axle along y."""
-    count = 28
-    c = np.asarray(center, dtype=np.float64)
+    count, c = 28, np.asarray(center, dtype=np.float64)
     angle = -np.arange(count) * 2 * np.pi / count
     out = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], 1)
     rings = [
@@ -171,22 +170,9 @@ def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int) -> M
 class Material(IntEnum):
     """Material of a face; `paint` assigns its colors."""
 
-    CAR_BODY = 0
-    WHEEL = 1
-    CAB = 2
-    CARGO = 3
-    CHASSIS = 4
-    BUS_BODY = 5
-    SKIN = 6
-    SHIRT = 7
-    TROUSERS = 8
-    SHOE = 9
-    HAIR = 10
-    FRAME = 11
-    TIRE = 12
-    MIRROR = 13
-    BARK = 14
-    LEAVES = 15
+    CAR_BODY, WHEEL, CAB, CARGO, CHASSIS, BUS_BODY = range(6)
+    SKIN, SHIRT, TROUSERS, SHOE, HAIR = range(6, 11)
+    FRAME, TIRE, MIRROR, BARK, LEAVES = range(11, 16)
 
 
 # Side view of a sedan and a hatchback: position along the length and height of the top as fractions, rear to front.
@@ -209,49 +195,34 @@ def car(size_m: tuple[float, float, float], kind: str) -> Mesh:
     """Shape a car: one skin from nose to tail and four wheels."""
     length, width, height = size_m
     line = roof_line(kind)
-    u = np.unique(np.concatenate([line[:, 0], np.linspace(-0.47, 0.47, 26)]))
-    top = np.interp(u, line[:, 0], line[:, 1])
-    rings = np.array([_car_section(ui, ti) for ui, ti in zip(u, top)]) * [length, width, height]
-    skin = loft(rings, Material.CAR_BODY)
+    at = np.unique(np.concatenate([line[:, 0], np.linspace(-0.47, 0.47, 26)]))
+    rings = []
+    for u, top in zip(at, np.interp(at, line[:, 0], line[:, 1])):  # in fractions of length, width and height
+        end = abs(2 * u)
+        half = 0.5 * (1 - 0.16 * end**5 - 0.05 * end**12)
+        low = 0.16 + 0.05 * max(0.0, end - 0.8) * 5
+        shoulder = min(BELT, top - 0.035)
+        roof_half = half * (0.93 - 0.62 * max(0.0, top - shoulder - 0.03))
+        lean, rise = 0.93 * half - roof_half, top - shoulder
+        side = [
+            (0.0, low), (0.8 * half, low), (0.95 * half, low + 0.06), (0.99 * half, min(0.36, shoulder - 0.06)),
+            (half, min(0.5, shoulder - 0.04)), (0.985 * half, shoulder - 0.02), (0.95 * half, shoulder),
+            (0.93 * half - 0.33 * lean, shoulder + rise * 0.33), (0.93 * half - 0.66 * lean, shoulder + rise * 0.66),
+            (roof_half, top - rise * 0.12), (roof_half - 0.035, top - rise * 0.03), (0.5 * roof_half, top),
+            (0.0, top + 0.004),
+        ]  # fmt: skip
+        # Both ends lie in the middle; the one at the top is drawn once, from the right.
+        rings.append([(u, y, z) for y, z in side[:-1] + [(-y, z) for y, z in side[:0:-1]]])
+    skin = loft(np.array(rings) * [length, width, height], Material.CAR_BODY)
     floor = block(
         [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Material.CHASSIS
     )
     hubs = [[s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M] for s in (-1, 1) for side in (-1, 1)]
     wheels = [disc_wheel(hub, WHEEL_RADIUS_M, 0.22, Material.WHEEL) for hub in hubs]
-    mirrors = [block(*_mirror(length, width, height, side), Material.MIRROR, bevel_m=0.03) for side in (-1, 1)]
+    mirrors, x, z = [], 0.165 * length, 0.63 * height
+    for near, far in ((-width * 0.5, -width * 0.44), (width * 0.44, width * 0.5)):
+        mirrors.append(block([x, near, z], [x + 0.12, far, z + 0.13], Material.MIRROR, bevel_m=0.03))
     return merged([skin, floor, *wheels, *mirrors]).fitted(size_m)
-
-
-def _mirror(length: float, width: float, height: float, side: int) -> tuple[list[float], list[float]]:
-    inner, outer = side * width * 0.44, side * width * 0.5
-    x, z = 0.165 * length, 0.63 * height
-    return [x, min(inner, outer), z], [x + 0.12, max(inner, outer), z + 0.13]
-
-
-def _car_section(u: float, top: float) -> Array:
-    """Ring (K, 3) at fraction `u` of the length, in fractions of length, width and height."""
-    end = abs(2 * u)
-    half = 0.5 * (1 - 0.16 * end**5 - 0.05 * end**12)
-    low = 0.16 + 0.05 * max(0.0, end - 0.8) * 5
-    shoulder = min(BELT, top - 0.035)
-    roof_half = half * (0.93 - 0.62 * max(0.0, top - shoulder - 0.03))
-    side = [
-        (0.0, low),
-        (0.8 * half, low),
-        (0.95 * half, low + 0.06),
-        (0.99 * half, min(0.36, shoulder - 0.06)),
-        (half, min(0.5, shoulder - 0.04)),
-        (0.985 * half, shoulder - 0.02),
-        (0.95 * half, shoulder),
-        (0.93 * half - 0.33 * (0.93 * half - roof_half), shoulder + (top - shoulder) * 0.33),
-        (0.93 * half - 0.66 * (0.93 * half - roof_half), shoulder + (top - shoulder) * 0.66),
-        (roof_half, top - (top - shoulder) * 0.12),
-        (roof_half - 0.035, top - (top - shoulder) * 0.03),
-        (0.5 * roof_half, top),
-        (0.0, top + 0.004),
-    ]
-    # Both ends lie in the middle; the one at the top is drawn once, from the right.
-    return np.array([(u, y, z) for y, z in side[:-1] + [(-y, z) for y, z in side[:0:-1]]])
 
 
 def _mirrored(x: float, side: list[tuple[float, float]]) -> list[tuple[float, float, float]]:
@@ -333,17 +304,14 @@ def pedestrian(size_m: tuple[float, float, float], phase: int, standing: bool) -
 
 @lru_cache(maxsize=2 * PHASES)
 def _step(phase: int, standing: bool) -> Mesh:
-    return _grounded(_walker(2 * np.pi * phase / PHASES, standing))
+    mesh = _walker(2 * np.pi * phase / PHASES, standing)
+    return Mesh(mesh.vertices_m - [0, 0, mesh.vertices_m[:, 2].min()], mesh.normals, mesh.faces, mesh.part)
 
 
 @lru_cache(maxsize=2)
 def _gait_extent(standing: bool) -> tuple[Array, Array]:
     poses = [_step(k, standing).vertices_m for k in range(PHASES)]
     return np.min([p.min(0) for p in poses], axis=0), np.max([p.max(0) for p in poses], axis=0)
-
-
-def _grounded(mesh: Mesh) -> Mesh:
-    return Mesh(mesh.vertices_m - [0, 0, mesh.vertices_m[:, 2].min()], mesh.normals, mesh.faces, mesh.part)
 
 
 def _walker(phase: float, standing: bool) -> Mesh:

@@ -51,26 +51,24 @@ GNSS_CORRELATION_S = 2.0  # time constant of the errors of GNSS and IMU
 def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Log, Scenario]:
     """Make a log, whose records are rendered and cast when read, and its exact truth.
 
-    Parameters
-    ----------
-    observe
-        Compute the visibility of each agent in every frame and sweep, for the truth's `visible` and the log's labels;
-        both are omitted without it.
-
-    Returns
-    -------
-    log : Log
-        `ego` has the errors of GNSS and IMU. A sweep's stamp is its end; its points are in the lidar frame at their own
-        time. Record `i` of a sensor depends on the seed, the sensor's index in the scene and `i` alone.
-    truth : Scenario
-        Every agent and the ego ("ego") each 0.05 s; x, y, z of box centers. `visible` is true where one LiDAR sweep has
-        20 points or more on the agent and one camera shows a third or more of its silhouette, at least half of its box.
-        Its map features are all that is painted, where roads end, and their lanes.
+    In the log, `ego` has the errors of GNSS and IMU. A sweep's stamp is its end; its points are in the lidar frame at their
+    own time. Record `i` of a sensor depends on the seed, the sensor's index in the scene and `i` alone. The truth has every
+    agent and the ego ("ego") each 0.05 s; x, y, z of box centers. `visible` is true where one LiDAR sweep has 20 points or
+    more on the agent and one camera shows a third or more of its silhouette, at least half of its box; without `observe`
+    it is omitted, and so are the log's labels. Its map features are all that is painted, where roads end, and their lanes.
     """
     moving = MovingScene.of(scene)
     cameras = {spec.name: camera_of(spec) for spec in scene.camera}
     lidars = {spec.name: Lidar(spec.name, spec.mount, raycast.mount_T_lidar(spec)) for spec in scene.lidar}
-    cast = _caster(moving, seed)
+    specs = {spec.name: (index, spec) for index, spec in enumerate(scene.lidar)}
+    rays = max((len(raycast.ray_pattern(spec)[0]) for spec in scene.lidar), default=1)
+
+    @lru_cache(maxsize=max(1, MAX_CACHED_BYTES // (BYTES_PER_RAY * rays)))
+    def cast(name: str, i: int) -> raycast.LabeledSweep:
+        index, spec = specs[name]
+        stamp, rng = int(raycast.sweep_stamps(spec, scene)[i]), np.random.default_rng([seed, 4, index, i])
+        return raycast.cast_sweep(spec, moving, stamp, rng, _ground_reflectance(scene, seed))
+
     streams = _image_streams(moving, cameras, seed)
     for spec in scene.lidar:
         stamps = raycast.sweep_stamps(spec, scene)
@@ -146,21 +144,6 @@ def _ground_reflectance(scene: Scene, seed: int) -> GroundReflectance:
     return GroundReflectance(Ground(GroundPlan.of(scene), seed), light_of(scene.environment).wetness)
 
 
-def _caster(moving: MovingScene, seed: int) -> Caster:
-    """Return a function that casts sweep `i` of the LiDAR of a name; the last sweeps are cached."""
-    specs = {spec.name: (index, spec) for index, spec in enumerate(moving.scene.lidar)}
-    rays = max((len(raycast.ray_pattern(spec)[0]) for _, spec in specs.values()), default=1)
-
-    @lru_cache(maxsize=max(1, MAX_CACHED_BYTES // (BYTES_PER_RAY * rays)))
-    def cast(name: str, i: int) -> raycast.LabeledSweep:
-        index, spec = specs[name]
-        stamp = int(raycast.sweep_stamps(spec, moving.scene)[i])
-        rng = np.random.default_rng([seed, 4, index, i])
-        return raycast.cast_sweep(spec, moving, stamp, rng, _ground_reflectance(moving.scene, seed))
-
-    return cast
-
-
 def _measured_poses(ego: Actor, scene: Scene, rng: np.random.Generator) -> PoseTrack:
     """Poses of GNSS and IMU: each coordinate with a first-order Gauss-Markov error."""
     count = int(np.floor(scene.duration_s * scene.gnss.rate_hz + 1e-9)) + 1
@@ -225,19 +208,10 @@ def write_synthetic(
 ) -> None:
     """Write a scene's log as a native log folder with its truth as `truth.json` in it, whole or not at all.
 
-    Parameters
-    ----------
-    out
-        The folder; one that is there already is replaced only with `overwrite`, and only if it is a log.
-    jpeg_quality
-        1 to 100.
-    progress
-        Called as `progress(done, total)` after each record.
+    A folder `out` that is there already is replaced only with `overwrite`, and only if it is a log. `jpeg_quality`: 1 to
+    100. `progress(done, total)` is called after each record.
 
-    Raises
-    ------
-    ConfigError
-        When the folder may not be replaced or cannot be written.
+    Raises `ConfigError` when the folder may not be replaced or cannot be written.
     """
     from log2sim.logs.native.writer import refuse_target, write_log
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from log2sim.synth import ground, raycast
 from log2sim.synth.actors import Actor, MovingScene
 from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.render import Body, SceneInstant, frame_stamps, segment
-from log2sim.synth.scene import Road, Scene, Zebra
+from log2sim.synth.scene import Road, Scene
 
 CELL_M = 1.0
 MAX_RANGE_M = 40.0
@@ -34,7 +34,21 @@ def seen_ground(moving: MovingScene, cameras: Mapping[str, Camera], cast: Caster
 
     Cell (i, j) reaches from (i, j) to (i + 1, j + 1) times `cell_m` in the map.
     """
-    parts = [*_shown(moving, cameras), *_met(moving, cast)]
+    parts = []
+    for camera_spec in moving.scene.camera:  # cells whose middles cameras show
+        camera, stamps = cameras[camera_spec.name], frame_stamps(camera_spec, moving.scene)
+        poses = moving.map_T_mount(camera.mount, stamps) @ camera.mount_T_cam
+        parts += [_in_view(moving, camera, poses[i], int(stamps[i])) for i in _every(stamps)]
+    for spec in moving.scene.lidar:  # cells that beams met
+        for i in _every(raycast.sweep_stamps(spec, moving.scene)):
+            labeled = cast(spec.name, int(i))
+            on = (labeled.hit == raycast.GROUND) & (np.linalg.norm(labeled.sweep.xyz_m, axis=1) < MAX_RANGE_M)
+            stamps = np.full(1, labeled.sweep.stamp_ns) if labeled.sweep.t_ns is None else labeled.sweep.t_ns[on]
+            moments, column = np.unique(stamps, return_inverse=True)
+            map_T_lidar = moving.map_T_mount(spec.mount, moments) @ raycast.mount_T_lidar(spec)
+            xyz = labeled.sweep.xyz_m[on].astype(np.float64)
+            at = np.einsum("nij,nj->ni", map_T_lidar[column, :3, :3], xyz) + map_T_lidar[column, :3, 3]
+            parts.append(np.unique(np.floor(at[:, :2] / CELL_M).astype(np.int64), axis=0))
     cells = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *parts]), axis=0)
     cells = cells[np.lexsort((cells[:, 0], cells[:, 1]))]
     new = np.ones(len(cells), dtype=bool)
@@ -48,29 +62,6 @@ def _every(t_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     """Choose records at least `STEP_S` apart."""
     _, first = np.unique((t_ns - t_ns[:1]) // int(STEP_S * NS_PER_S), return_index=True)
     return np.asarray(first)
-
-
-def _met(moving: MovingScene, cast: Caster) -> Iterator[Cells]:
-    """Yield cells (N, 2) that beams met."""
-    for spec in moving.scene.lidar:
-        for i in _every(raycast.sweep_stamps(spec, moving.scene)):
-            labeled = cast(spec.name, int(i))
-            on = (labeled.hit == raycast.GROUND) & (np.linalg.norm(labeled.sweep.xyz_m, axis=1) < MAX_RANGE_M)
-            stamps = np.full(1, labeled.sweep.stamp_ns) if labeled.sweep.t_ns is None else labeled.sweep.t_ns[on]
-            moments, column = np.unique(stamps, return_inverse=True)
-            map_T_lidar = moving.map_T_mount(spec.mount, moments) @ raycast.mount_T_lidar(spec)
-            xyz = labeled.sweep.xyz_m[on].astype(np.float64)
-            at = np.einsum("nij,nj->ni", map_T_lidar[column, :3, :3], xyz) + map_T_lidar[column, :3, 3]
-            yield np.unique(np.floor(at[:, :2] / CELL_M).astype(np.int64), axis=0)
-
-
-def _shown(moving: MovingScene, cameras: Mapping[str, Camera]) -> Iterator[Cells]:
-    """Yield cells (N, 2) whose middles cameras show."""
-    for spec in moving.scene.camera:
-        camera, stamps = cameras[spec.name], frame_stamps(spec, moving.scene)
-        poses = moving.map_T_mount(camera.mount, stamps) @ camera.mount_T_cam
-        for i in _every(stamps):
-            yield _in_view(moving, camera, poses[i], int(stamps[i]))
 
 
 def _in_view(moving: MovingScene, camera: Camera, map_T_cam: Array, t_ns: int) -> Cells:
@@ -88,22 +79,18 @@ def _in_view(moving: MovingScene, camera: Camera, map_T_cam: Array, t_ns: int) -
     cells, middle = cells[inside], middle[inside]
     free = np.ones(len(cells), dtype=bool)
     ray = middle - eye
-    for map_T_box, size in _boxes(moving, camera.mount, t_ns):
+    # Poses and sizes (3,) of all that hides the ground.
+    t_s, seen = moving.seconds(t_ns), moving.seen_from(camera.mount)
+    boxes = [(actor.at(t_s).map_T_agent()[0], np.array(actor.spec.box_m)) for actor in seen]
+    for building in moving.scene.building:
+        turn, at = rotation_from_rpy(0.0, 0.0, np.deg2rad(building.yaw_deg)), [*building.center, building.size_m[2] / 2]
+        boxes.append((transform(turn, np.array(at)), np.array(building.size_m)))
+    for map_T_box, size in boxes:
         box_T_map = inverse(map_T_box)
         start = np.tile(apply(box_T_map, eye[None]), (len(ray), 1))
         hit = raycast.slab_distance(size, start, ray @ box_T_map[:3, :3].T)
         free &= ~(hit < 1.0)
     return cells[free]
-
-
-def _boxes(moving: MovingScene, mount: Any, t_ns: int) -> Iterator[tuple[Array, Array]]:
-    """Yield poses and sizes (3,) of all that hides the ground."""
-    for building in moving.scene.building:
-        size = np.array(building.size_m)
-        turn = rotation_from_rpy(0.0, 0.0, np.deg2rad(building.yaw_deg))
-        yield transform(turn, np.array([*building.center, size[2] / 2])), size
-    for actor in moving.seen_from(mount):
-        yield actor.at(moving.seconds(t_ns)).map_T_agent()[0], np.array(actor.spec.box_m)
 
 
 MIN_PIECE_M = 0.05  # of a line; less is what rounding leaves
@@ -130,10 +117,24 @@ def map_features_of(scene: Scene) -> MapFeatures:
         own = [_pieces_of(line, area_of(plan.interruptions(k)), f"line_{k}_{n}") for n, line in enumerate(lines)]
         markings += [piece for pieces in own for piece in pieces]
         crossed = area_of([ground.Stroke(np.array(r.line), r.width_m) for n, r in enumerate(plan.roads) if n != k])
-        sides = _borders(road, crossed, k)
+        sides: list[list[RoadBorder]] = []  # the ends of the road at its right and its left, as its line runs
+        for name, side in (("right", -1), ("left", 1)):
+            edge, kind = (
+                ground.parallel(np.array(road.line), side * road.width_m / 2),
+                "curb" if road.sidewalk_m > 0 else "edge",
+            )
+            left = _along(LineString(edge), LineString(edge).difference(crossed))
+            free = [_on_ground(ground.stretch(edge, *interval)) for interval in left]
+            sides.append([RoadBorder(f"border_{k}_{name}_{n}", kind, points) for n, points in enumerate(free)])
         borders += [piece for pieces in sides for piece in pieces]
         lanes += _lanes(road, k, plan.keeps_right, tuple(zip(lines, own)), sides, crossed)
-    markings += [_crosswalk(zebra, k) for k, zebra in enumerate(plan.zebras)]
+    for k, zebra in enumerate(plan.zebras):
+        stripes, whole = ground.crosswalk_stripes(zebra), LineString(np.array(zebra.line))
+        ends = (whole.project(Point(p)) for p in (stripes[0].line[0], stripes[-1].line[-1]))
+        middle = ground.stretch(np.array(zebra.line), *ends)
+        edges = [ground.parallel(middle, side * zebra.width_m / 2) for side in (-1, 1)]
+        outline = _on_ground(np.concatenate([edges[0], edges[1][::-1]]))
+        markings.append(Marking(f"crosswalk_{k}", "crosswalk", outline, zebra.width_m, "white"))
     for k, stop in enumerate(plan.stop_lines):
         line = _on_ground(np.array(stop.line))
         markings.append(Marking(f"stop_line_{k}", "stop_line", line, stop.width_m, stop.color))
@@ -156,13 +157,8 @@ def area_of(strokes: Sequence[ground.Stroke]) -> BaseGeometry:
     return shapely.union_all(parts)
 
 
-def _left_over(line: Array, area: BaseGeometry) -> list[Interval]:
-    """Parts of a line (P, 2) outside an area, as distances along it in ascending order."""
-    whole = LineString(line)
-    return _along(whole, whole.difference(area))
-
-
 def _along(whole: LineString, part: BaseGeometry) -> list[Interval]:
+    """Parts of a line, as distances along it in ascending order."""
     pieces = [p for p in shapely.get_parts(part) if p.geom_type == "LineString" and p.length >= MIN_PIECE_M]
     ends = [[float(whole.project(Point(p.coords[n]))) for n in (0, -1)] for p in pieces]
     # Pieces that meet at a point of the line are one.
@@ -181,7 +177,7 @@ def _pieces_of(line: ground.RoadLine, gaps: BaseGeometry, name: str) -> list[Mar
     painted = [_along(whole, LineString(dash).difference(gaps)) for dash in line.dashes if len(dash) > 1]
     dashes = [interval for intervals in painted for interval in intervals]
     out: list[Marking] = []
-    for begin, end in _left_over(line.line, gaps):
+    for begin, end in _along(whole, whole.difference(gaps)):
         inside = [(a, b) for a, b in dashes if a >= begin - MIN_PIECE_M and b <= end + MIN_PIECE_M]
         if inside:
             points = ground.stretch(line.line, min(a for a, _ in inside), max(b for _, b in inside))
@@ -189,35 +185,12 @@ def _pieces_of(line: ground.RoadLine, gaps: BaseGeometry, name: str) -> list[Mar
     return out
 
 
-def _borders(road: Road, crossed: BaseGeometry, k: int) -> tuple[list[RoadBorder], list[RoadBorder]]:
-    """List the ends of the road at its right and its left, as its line runs."""
-    kind = "curb" if road.sidewalk_m > 0 else "edge"
-    sides = []
-    for name, side in (("right", -1), ("left", 1)):
-        line = ground.parallel(np.array(road.line), side * road.width_m / 2)
-        pieces = [ground.stretch(line, *interval) for interval in _left_over(line, crossed)]
-        sides.append([RoadBorder(f"border_{k}_{name}_{n}", kind, _on_ground(p)) for n, p in enumerate(pieces)])
-    return sides[0], sides[1]
-
-
-def _crosswalk(zebra: Zebra, k: int) -> Marking:
-    stripes = ground.crosswalk_stripes(zebra)
-    whole = LineString(np.array(zebra.line))
-    begin = whole.project(Point(stripes[0].line[0]))
-    end = whole.project(Point(stripes[-1].line[-1]))
-    middle = ground.stretch(np.array(zebra.line), begin, end)
-    outline = np.concatenate(
-        [ground.parallel(middle, -zebra.width_m / 2), ground.parallel(middle, zebra.width_m / 2)[::-1]]
-    )
-    return Marking(f"crosswalk_{k}", "crosswalk", _on_ground(outline), zebra.width_m, "white")
-
-
 def _lanes(
     road: Road,
     number: int,
     keeps_right: bool,
     lines: Sequence[tuple[ground.RoadLine, list[Marking]]],
-    borders: tuple[list[RoadBorder], list[RoadBorder]],
+    borders: Sequence[list[RoadBorder]],
     crossed: BaseGeometry,
 ) -> list[MapLane]:
     """List the lanes of a road from its right to its left, in the directions in which they are driven.
@@ -230,7 +203,11 @@ def _lanes(
     for boundary in range(road.lanes + 1):
         own = [(line, pieces) for line, pieces in lines if line.boundary == boundary]
         if own:
-            offsets = [_offset(road, line) for line, _ in own]
+            a, b = np.array(road.line[:2])
+            ahead = (b - a) / np.linalg.norm(b - a)
+            offsets = [
+                float((line.line[0] - a) @ [-ahead[1], ahead[0]]) for line, _ in own
+            ]  # to the left of the road's line
             at[boundary] = np.mean(offsets)
             # Of a double line each lane has the one that is nearer.
             sides.append((own[int(np.argmin(offsets))][1], own[int(np.argmax(offsets))][1]))
@@ -268,13 +245,6 @@ def _lanes(
                     beside[field if same else "opposite"] = parts[other][n].id
             out.append(replace(piece, **beside))
     return out
-
-
-def _offset(road: Road, line: ground.RoadLine) -> float:
-    """How far a line lies to the left of its road's line, m."""
-    a, b = np.array(road.line[:2])
-    ahead = (b - a) / np.linalg.norm(b - a)
-    return float((line.line[0] - a) @ [-ahead[1], ahead[0]])
 
 
 def _beside(points: Array, pieces: Sequence[Marking | RoadBorder]) -> str | None:
@@ -324,21 +294,18 @@ def visibility_by_camera(
             parts = segment(camera, map_T_cam, SceneInstant(backdrop, bodies))[: len(moving.actors)]
             unoccluded = np.array([0.0 if p is None else p.visible_px / p.silhouette_px for p in parts])
             boxes = np.array([np.full(4, np.nan) if p is None else p.box_px for p in parts]).reshape(-1, 4)
-            inside = np.array([_box_inside(camera, inverse(map_T_cam), a, t_s) for a in moving.actors])
+            # Of the rectangle around each projected 3D box; 0 unless all corners are ahead.
+            inside = np.zeros(len(moving.actors))
+            for k, actor in enumerate(moving.actors):
+                state = actor.at(t_s)
+                corners = box_corners(state.center_m, actor.spec.box_m, state.yaw_rad)[0]
+                uv, _ = project(camera, apply(inverse(map_T_cam), corners))
+                if np.all(np.isfinite(uv)):
+                    low, high = uv.min(0), uv.max(0)
+                    shown = np.minimum(high, [camera.width_px, camera.height_px]) - np.maximum(low, 0)
+                    inside[k] = np.clip(shown, 0, None).prod() / (high - low).prod()
             out[spec.name].append(FrameVisibility(int(t_ns), unoccluded, inside, boxes))
     return out
-
-
-def _box_inside(camera: Camera, cam_T_map: Array, actor: Actor, t_s: float) -> float:
-    """Share of the rectangle around the projected 3D box that lies inside the image; 0 unless all corners are ahead."""
-    state = actor.at(t_s)
-    uv, _ = project(camera, apply(cam_T_map, box_corners(state.center_m, actor.spec.box_m, state.yaw_rad)[0]))
-    if not np.all(np.isfinite(uv)):
-        return 0.0
-    low, high = uv.min(0), uv.max(0)
-    size = np.array([camera.width_px, camera.height_px])
-    inside = np.clip(np.minimum(high, size) - np.maximum(low, 0), 0, None)
-    return float(inside.prod() / (high - low).prod())
 
 
 def visible_at(
@@ -399,12 +366,9 @@ def labels_3d(
         t_ns = raycast.sweep_stamps(scene.lidar[0], scene)
     t_s = (t_ns - scene.start_ns) / NS_PER_S
     states = [a.at(t_s) for a in actors]
+    ids, kinds = (np.repeat([getattr(a.spec, key) for a in actors], len(t_ns)) for key in ("id", "category"))
     return Labels(
-        t_ns=np.tile(t_ns, len(actors)),
-        track_id=np.repeat([a.spec.id for a in actors], len(t_ns)),
-        category=np.repeat([a.spec.category for a in actors], len(t_ns)),
-        center_m=np.concatenate([s.center_m for s in states]),
-        size_m=np.repeat([a.spec.box_m for a in actors], len(t_ns), axis=0),
-        yaw_rad=np.concatenate([s.yaw_rad for s in states]),
-        visible=None,
-    )
+        t_ns=np.tile(t_ns, len(actors)), track_id=ids, category=kinds,
+        center_m=np.concatenate([s.center_m for s in states]), yaw_rad=np.concatenate([s.yaw_rad for s in states]),
+        size_m=np.repeat([a.spec.box_m for a in actors], len(t_ns), axis=0), visible=None,
+    )  # fmt: skip

@@ -15,10 +15,9 @@ from benchmarks.table import markdown
 from log2sim.agents.smooth import MotionModel, smooth_track
 from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import wrap_angle
-from log2sim.simulation.prediction.displacement import CHI2_95
 from log2sim.simulation.prediction.motion_table import MotionTable, table_of
-from log2sim.simulation.prediction.prediction import METHODS, leads_of, predict_table
-from log2sim.synth.motion import RoundedPath
+from log2sim.simulation.prediction.prediction import CHI2_95, METHODS, leads_of, predict_table
+from log2sim.synth.actors import RoundedPath
 
 Array = NDArray[np.float64]
 TICK_S, DURATION_S, WARM_UP_S = 0.1, 20.0, 15.0

@@ -20,9 +20,8 @@ from scipy.integrate import odeint, solve_ivp
 
 from benchmarks.table import markdown, timed
 from log2sim.geometry import Array, cos_sin
-from log2sim.simulation.vehicles.parameters import published_parameters
 from log2sim.simulation.vehicles.single_track import Chassis, Slips, StepInput, linear_displacement, linear_slips
-from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2
+from log2sim.simulation.vehicles.vehicle import GRAVITY_MPS2, published_parameters
 
 VEHICLE = published_parameters(2, rear_axle_offset_m=1.4)
 CHASSIS = Chassis.of(VEHICLE)

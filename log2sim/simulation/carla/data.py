@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
-from log2sim.simulation.follower import GAINS
-from log2sim.simulation.reference import vehicle_limits, vehicle_reference
-from log2sim.simulation.vehicles.parameters import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
+from log2sim.simulation.reference import GAINS, vehicle_limits, vehicle_reference
+from log2sim.simulation.vehicles.vehicle import PEDAL_LAG_S, STEER_LAG_S, WHEELED, parameters_for, rear_axle_offset
 
 Size = tuple[float, float, float]
 
@@ -65,16 +64,11 @@ BICYCLES: Mapping[str, Size] = {
 }
 
 # The box of a walker is its capsule; adults, older and younger children have one size each.
-_SMALL, _CHILDREN = ("0009", "0010", "0011", "0048", "0049"), ("0012", "0013", "0014")
-
-
-def _walker(number: str) -> Size:
-    if number in _SMALL:
-        return (0.50, 0.50, 1.10)
-    return (0.38, 0.38, 1.30) if number in _CHILDREN else (0.38, 0.38, 1.86)
-
-
-WALKERS: Mapping[str, Size] = {f"walker.pedestrian.{k:04}": _walker(f"{k:04}") for k in range(1, 53)}
+_CHILDREN = {
+    **dict.fromkeys((9, 10, 11, 48, 49), (0.50, 0.50, 1.10)),
+    **dict.fromkeys((12, 13, 14), (0.38, 0.38, 1.30)),
+}
+WALKERS: Mapping[str, Size] = {f"walker.pedestrian.{k:04}": _CHILDREN.get(k, (0.38, 0.38, 1.86)) for k in range(1, 53)}
 PROPS: Mapping[str, Size] = {
     "static.prop.barrel": (0.46, 0.47, 0.81), "static.prop.busstop": (3.88, 1.89, 2.74),
     "static.prop.clothcontainer": (1.24, 1.89, 1.81), "static.prop.constructioncone": (0.34, 0.34, 0.59),
@@ -176,35 +170,30 @@ def _trajectories(
     agent: Agent, trajectory: Trajectory, *, drives: bool
 ) -> tuple[dict[str, list[float]], dict[str, list[float]] | None]:
     """Return columns of the trajectory and, for a vehicle that drives, of the feasible one; both of the box center."""
-    t_s = _times(agent, trajectory)
+    t_s = trajectory.t_s[:1]
+    if not agent.static:  # regular samples, every waypoint, and one just before a discontinuity
+        regular = np.arange(trajectory.t_s[0], trajectory.t_s[-1], SAMPLE_S)
+        k = np.searchsorted(trajectory.t_s, regular, side="right")
+        after = trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)]
+        gap_s = np.minimum(regular - trajectory.t_s[k - 1], after - regular)
+        before_jumps = trajectory.discontinuity_times() - DISCONTINUITY_S
+        t_s = np.sort(np.concatenate([regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, before_jumps]))
     x, y, yaw, _ = trajectory.relative(t_s)
     z = trajectory.heights(t_s) - agent.size_m[2] / 2
     origin_x, origin_y = trajectory.origin_m
+    exact = _left_handed(t_s, x + origin_x, y + origin_y, z, yaw)
     if not drives:
-        return {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), "curvature_1pm": [0.0] * len(t_s)}, None
+        return {**exact, "curvature_1pm": [0.0] * len(t_s)}, None
     limits = vehicle_limits(agent)
     reference = vehicle_reference(trajectory, limits, accel_ahead_s=0.0, curvature_ahead_s=0.0)
     rear_x, rear_y, rear_yaw, speed, accel, curvature, gear, stands = reference.exact(t_s).T
     center_x, center_y = rear_x + limits.offset_m * np.cos(rear_yaw), rear_y + limits.offset_m * np.sin(rear_yaw)
     bend = {"curvature_1pm": _rounded(-curvature)}
-    exact = {**_left_handed(t_s, x + origin_x, y + origin_y, z, yaw), **bend}
     pid = {
         **_left_handed(t_s, center_x + origin_x, center_y + origin_y, z, rear_yaw), **bend,
         "speed_mps": _rounded(speed), "accel_mps2": _rounded(accel), "gear": _rounded(gear), "stands": _rounded(stands),
     }  # fmt: skip
-    return exact, pid
-
-
-def _times(agent: Agent, trajectory: Trajectory) -> Array:
-    """Return the sample times: regular ones, every waypoint, and one just before a discontinuity."""
-    if agent.static:
-        return trajectory.t_s[:1]
-    regular = np.arange(trajectory.t_s[0], trajectory.t_s[-1], SAMPLE_S)
-    k = np.searchsorted(trajectory.t_s, regular, side="right")
-    after = trajectory.t_s[np.minimum(k, len(trajectory.t_s) - 1)]
-    gap_s = np.minimum(regular - trajectory.t_s[k - 1], after - regular)
-    before_jumps = trajectory.discontinuity_times() - DISCONTINUITY_S
-    return np.sort(np.concatenate([regular[gap_s > 10 * DISCONTINUITY_S], trajectory.t_s, before_jumps]))
+    return {**exact, **bend}, pid
 
 
 def _left_handed(t_s: Array, x: Array, y: Array, z: Array, yaw: Array) -> dict[str, list[float]]:

@@ -107,14 +107,9 @@ class CarlaActor:
     def transform(self, x: float, y: float, z: float, yaw: float) -> Any:
         """Return the actor's transform for which its box is centered at x, y and stands at z."""
         cos, sin = math.cos(yaw), math.sin(yaw)
-        return self.carla.Transform(
-            self.carla.Location(
-                x=x - self._box_x * cos + self._box_y * sin,
-                y=y - self._box_x * sin - self._box_y * cos,
-                z=z - self._bottom,
-            ),
-            self.carla.Rotation(pitch=0.0, yaw=wrapped_deg(yaw), roll=0.0),
-        )
+        at_x, at_y = x - self._box_x * cos + self._box_y * sin, y - self._box_x * sin - self._box_y * cos
+        place = self.carla.Location(x=at_x, y=at_y, z=z - self._bottom)
+        return self.carla.Transform(place, self.carla.Rotation(pitch=0.0, yaw=wrapped_deg(yaw), roll=0.0))
 
     def pose(self) -> tuple[float, float, float, float, float]:
         """Return box center x, y, lowest face z, yaw in rad and speed along it, after the last tick."""
@@ -128,13 +123,9 @@ class CarlaActor:
         speed = velocity.x * cos + velocity.y * sin
         return x, y, at.z + self._bottom, yaw, speed if abs(speed) >= STANDSTILL_MPS else 0.0
 
-    def steer_angle(self, curvature: float) -> float:
-        """Return the angle of the front wheels in rad for a curvature."""
-        return math.atan(self.wheelbase_m * curvature)
-
     def show_steering(self, curvature: float) -> None:
         """Turn the front wheels visually, which CARLA allows while physics is off."""
-        angle_deg = math.degrees(self.steer_angle(curvature))
+        angle_deg = math.degrees(math.atan(self.wheelbase_m * curvature))
         if abs(angle_deg - self._shown_deg) > SHOWN_DEG:  # every call is one to the server
             self._shown_deg = angle_deg
             for wheel in self._front:
@@ -148,7 +139,7 @@ class CarlaActor:
         with speed.
         """
         (share,) = self._steering.at(abs(speed) * KMH_PER_MPS, "share")
-        steer = self.steer_angle(curvature) / (self.max_steer_rad * max(share, 0.1))
+        steer = math.atan(self.wheelbase_m * curvature) / (self.max_steer_rad * max(share, 0.1))
         rolls_back = reverse if speed == 0 else speed < 0
         return self.carla.VehicleControl(
             throttle=clamp(pedal_mps2 / self.agent["max_throttle_mps2"], 0.0, 1.0),
@@ -159,7 +150,7 @@ class CarlaActor:
 
 
 class VehicleController:
-    """PID with feed-forward for one vehicle, the scalar form of `log2sim.simulation.follower`; gains come with the data."""
+    """PID with feed-forward for one vehicle, the scalar form of `log2sim.simulation.reference`; gains come with the data."""
 
     def __init__(
         self, gains: SimpleNamespace, max_throttle_mps2: float, max_brake_mps2: float, max_curvature_1pm: float
@@ -167,12 +158,6 @@ class VehicleController:
         self.gains = gains
         self.max_throttle, self.max_brake, self.max_curvature = max_throttle_mps2, max_brake_mps2, max_curvature_1pm
         self.along_integral = self.across_integral = self.along_rate = self.across_slope = 0.0
-
-    @classmethod
-    def of(cls, actor: CarlaActor, gains: SimpleNamespace) -> VehicleController:
-        """Create the controller of an actor."""
-        limit = math.tan(min(actor.max_steer_rad, 1.4)) / actor.wheelbase_m
-        return cls(gains, actor.agent["max_throttle_mps2"], actor.agent["max_brake_mps2"], limit)
 
     def step(
         self, wanted: Sequence[float], at: tuple[float, float, float], speed: float, dt_s: float
@@ -191,36 +176,23 @@ class VehicleController:
         self.along_rate += blend * (wanted_speed - speed - self.along_rate)
         self.across_slope += blend * (slope - self.across_slope)
         gear = wanted_gear if speed == 0 else math.copysign(1.0, speed)
-        held = stands > 0.5 and abs(speed) < g.hold_below_mps and along * wanted_gear < g.hold_within_m
-        pedal = self._pedal(along, accel, gear, held, dt_s)
-        return pedal, self._curvature(across, gear * self.across_slope, curvature, speed, dt_s), wanted_gear < 0
-
-    def _pedal(self, along: float, accel: float, gear: float, held: bool, dt_s: float) -> float:
-        """Compute the pedal in m/s2: PID on the error along the path; the brake holds while the reference stands."""
-        g = self.gains
-        wanted = accel + along / g.along_s**2 + 2 * g.damping * self.along_rate / g.along_s + self.along_integral
-        limited = clamp(wanted * gear, -self.max_brake, self.max_throttle)
-        if held:
-            self.along_integral = 0.0
-            result: float = -g.hold_brake_mps2
-            return result
+        push = accel + along / g.along_s**2 + 2 * g.damping * self.along_rate / g.along_s + self.along_integral
+        pedal = clamp(push * gear, -self.max_brake, self.max_throttle)
+        if stands > 0.5 and abs(speed) < g.hold_below_mps and along * wanted_gear < g.hold_within_m:
+            pedal, self.along_integral = -g.hold_brake_mps2, 0.0  # the brake holds while the reference stands
         # Anti-windup: no integration while the actuator is at its limit, or the vehicle far behind.
-        if abs(along) < g.max_along_m and (limited == wanted * gear or along * wanted <= 0):
+        elif abs(along) < g.max_along_m and (pedal == push * gear or along * push <= 0):
             grown = self.along_integral + along * dt_s / (g.along_s**2 * g.integral_s)
             self.along_integral = clamp(grown, -g.integral_limit_mps2, g.integral_limit_mps2)
-        return limited
-
-    def _curvature(self, across: float, slope: float, curvature: float, speed: float, dt_s: float) -> float:
-        """Compute the curvature in 1/m: PID on the error across the path, within steering and grip."""
-        g = self.gains
         length = max(abs(speed) * g.across_s, g.across_min_m)
-        wanted = curvature + across / length**2 + 2 * g.damping * slope / length + self.across_integral
+        damped = 2 * g.damping * gear * self.across_slope / length
+        turn = curvature + across / length**2 + damped + self.across_integral
         grip = g.max_lateral_accel_mps2 / max(speed**2, g.max_lateral_accel_mps2 / self.max_curvature)
-        limited = clamp(wanted, -grip, grip)
-        if speed != 0 and (limited == wanted or across * wanted <= 0):
+        limited = clamp(turn, -grip, grip)
+        if speed != 0 and (limited == turn or across * turn <= 0):
             self.across_integral += across * dt_s / (length**2 * g.integral_s)
         self.across_integral = clamp(self.across_integral, -g.integral_share * grip, g.integral_share * grip)
-        return limited
+        return pedal, limited, wanted_gear < 0
 
 
 class CarlaSession:
@@ -251,13 +223,29 @@ class CarlaSession:
             self.world.apply_settings(self._before)
 
     def spawn(self, agent: dict[str, Any], place: BoxPose, physics: bool) -> CarlaActor:
-        """Spawn the actor of an agent above its place; a command puts it there before the next tick."""
-        blueprint, size_m = self._blueprint(agent)
+        """Spawn the nearest asset that this server has above the place of an agent, in its color if possible.
+
+        A command puts it on its place before the next tick.
+        """
+        names = [asset["blueprint"] for asset in agent["assets"]]
+        found = [
+            (library[0], a["size_m"]) for a in agent["assets"] if len(library := self.library.filter(a["blueprint"]))
+        ]
+        if not found:
+            raise ReplayError(
+                f"agent '{agent['id']}': this server has none of {', '.join(names)}; the data are for CARLA 0.9.16", 4
+            )
+        blueprint, size_m = found[0]
+        settings = {"role_name": "hero" if agent["id"] == "ego" else agent["id"], "is_invincible": "true"}
+        if agent["color"] is not None:
+            settings["color"] = ",".join(str(c) for c in agent["color"])
+        for name, value in settings.items():
+            if blueprint.has_attribute(name):
+                blueprint.set_attribute(name, value)
         x, y, z, yaw = place
         for height in SPAWN_HEIGHTS_M:
-            above = self.carla.Transform(
-                self.carla.Location(x, y, z + height), self.carla.Rotation(yaw=wrapped_deg(yaw))
-            )
+            turn = self.carla.Rotation(yaw=wrapped_deg(yaw))
+            above = self.carla.Transform(self.carla.Location(x, y, z + height), turn)
             handle = self.world.try_spawn_actor(blueprint, above)
             if handle is not None:
                 break
@@ -273,26 +261,6 @@ class CarlaSession:
             self.send([self.carla.command.SetSimulatePhysics(handle.id, False)])
         return actor
 
-    def _blueprint(self, agent: dict[str, Any]) -> tuple[Any, Sequence[float]]:
-        """Return the nearest asset that this server has, in the agent's color if possible, and its size as exported."""
-        for asset in agent["assets"]:
-            found = self.library.filter(asset["blueprint"])
-            if len(found):
-                blueprint, size_m = found[0], asset["size_m"]
-                break
-        else:
-            names = ", ".join(a["blueprint"] for a in agent["assets"])
-            raise ReplayError(
-                f"agent '{agent['id']}': this server has none of {names}; the data are for CARLA 0.9.16", 4
-            )
-        settings = {"role_name": "hero" if agent["id"] == "ego" else agent["id"], "is_invincible": "true"}
-        if agent["color"] is not None:
-            settings["color"] = ",".join(str(c) for c in agent["color"])
-        for name, value in settings.items():
-            if blueprint.has_attribute(name):
-                blueprint.set_attribute(name, value)
-        return blueprint, size_m
-
     def remove(self, name: str) -> None:
         """Remove the actor of an agent."""
         self.send([self.carla.command.DestroyActor(self.actors.pop(name).handle.id)])
@@ -307,9 +275,8 @@ class CarlaSession:
         """Put the spectator behind and above a place."""
         x, y, z, yaw = place
         at = self.carla.Location(x - 9.0 * math.cos(yaw), y - 9.0 * math.sin(yaw), z + 5.0)
-        self.world.get_spectator().set_transform(
-            self.carla.Transform(at, self.carla.Rotation(pitch=-20.0, yaw=wrapped_deg(yaw)))
-        )
+        turn = self.carla.Rotation(pitch=-20.0, yaw=wrapped_deg(yaw))
+        self.world.get_spectator().set_transform(self.carla.Transform(at, turn))
 
 
 class ScenarioPlayer:
@@ -379,47 +346,40 @@ class ScenarioPlayer:
             start = (x - vx * self.session.dt_s, y - vy * self.session.dt_s, z, yaw)
             actor = actor or self.session.spawn(agent, start, True)
             if actor.is_vehicle:
-                self.controllers[name] = VehicleController.of(actor, self.gains)
+                limit = math.tan(min(actor.max_steer_rad, 1.4)) / actor.wheelbase_m
+                most = agent["max_throttle_mps2"], agent["max_brake_mps2"], limit
+                self.controllers[name] = VehicleController(self.gains, *most)
             yield self.carla.command.ApplyTransform(actor.handle.id, actor.transform(*start))
             yield self.carla.command.ApplyTargetVelocity(actor.handle.id, self.carla.Vector3D(vx, vy, 0.0))
             now_s = t_s  # the error is zero at the end of this tick
         else:
-            x, y, yaw, speed = self._physics_pose(agent, actor, now_s)
+            x, y, z, yaw, speed = actor.pose()  # where physics has moved the agent
+            logged = self.logged[name].place(now_s)
+            self.require_ground(agent, z, logged)
+            self.drift_m.setdefault(name, []).append(math.hypot(x - logged[0], y - logged[1]))
         if actor.is_walker:
             logged_x, logged_y, *_ = self.logged[name].place(now_s)
-            yield self.walk(
-                actor, vx + (logged_x - x) / self.gains.point_s, vy + (logged_y - y) / self.gains.point_s, yaw
-            )
-        else:
-            wanted, axle = self._reference(trajectory, actor.axle_m, now_s), point_behind(x, y, yaw, actor.axle_m)
-            pedal, curvature, reverse = self.controllers[name].step(wanted, (*axle, yaw), speed, self.session.dt_s)
+            catch_up = (logged_x - x) / self.gains.point_s, (logged_y - y) / self.gains.point_s
+            yield self.walk(actor, vx + catch_up[0], vy + catch_up[1], yaw)
+        else:  # the reference of the rear axle, with acceleration and curvature ahead by the lags of the actuators
+            wanted_x, wanted_y, _, wanted_yaw = trajectory.place(now_s)
+            axle = point_behind(wanted_x, wanted_y, wanted_yaw, actor.axle_m)
+            wanted_speed, gear, stands = trajectory.at(now_s, "speed_mps", "gear", "stands")
+            held_s = self.session.dt_s / 2
+            (accel,) = trajectory.at(now_s + self.gains.pedal_lag_s + held_s, "accel_mps2")
+            (bend,) = trajectory.at(now_s + self.gains.steer_lag_s + held_s, "curvature_1pm")
+            wanted = (*axle, wanted_yaw, wanted_speed, accel, bend, gear, stands)
+            at = (*point_behind(x, y, yaw, actor.axle_m), yaw)
+            pedal, curvature, reverse = self.controllers[name].step(wanted, at, speed, self.session.dt_s)
             control = actor.control(pedal, curvature, speed, reverse)
             yield self.carla.command.ApplyVehicleControl(actor.handle.id, control)
-
-    def _physics_pose(self, agent: dict[str, Any], actor: CarlaActor, t_s: float) -> BoxPose:
-        """Return where physics has moved an agent: box center x, y, yaw and speed."""
-        x, y, z, yaw, speed = actor.pose()
-        logged = self.logged[agent["id"]].place(t_s)
-        self.require_ground(agent, z, logged)
-        self.drift_m.setdefault(agent["id"], []).append(math.hypot(x - logged[0], y - logged[1]))
-        return x, y, yaw, speed
-
-    def _reference(self, trajectory: SampledTrajectory, axle_m: float, t_s: float) -> tuple[float, ...]:
-        """Return the reference of the rear axle at a time, with acceleration and curvature ahead by the lags of the actuators."""
-        x, y, _, yaw = trajectory.place(t_s)
-        speed, gear, stands = trajectory.at(t_s, "speed_mps", "gear", "stands")
-        held_s = self.session.dt_s / 2
-        (accel,) = trajectory.at(t_s + self.gains.pedal_lag_s + held_s, "accel_mps2")
-        (curvature,) = trajectory.at(t_s + self.gains.steer_lag_s + held_s, "curvature_1pm")
-        return (*point_behind(x, y, yaw, axle_m), yaw, speed, accel, curvature, gear, stands)
 
     def walk(self, actor: CarlaActor, vx: float, vy: float, yaw: float) -> Any:
         """Return the command that lets a walker walk with a velocity, or stand with a heading."""
         speed = math.hypot(vx, vy)
         way = (vx / speed, vy / speed) if speed > STANDSTILL_MPS else (math.cos(yaw), math.sin(yaw))
-        control = self.carla.WalkerControl(
-            self.carla.Vector3D(*way, 0.0), speed if speed > STANDSTILL_MPS else 0.0, False
-        )
+        pace = speed if speed > STANDSTILL_MPS else 0.0
+        control = self.carla.WalkerControl(self.carla.Vector3D(*way, 0.0), pace, False)
         return self.carla.command.ApplyWalkerControl(actor.handle.id, control)
 
     def _velocity(self, agent: dict[str, Any], t_s: float) -> tuple[float, float]:
@@ -435,9 +395,8 @@ class ScenarioPlayer:
 
     def _jumps(self, agent: dict[str, Any], t_s: float) -> bool:
         """Whether its trajectory has a discontinuity within the tick that begins at a time."""
-        return any(
-            t_s + MARGIN_S < jump_s <= t_s + self.session.dt_s + MARGIN_S for jump_s in agent["discontinuities_s"]
-        )
+        end_s = t_s + self.session.dt_s
+        return any(t_s + MARGIN_S < jump_s <= end_s + MARGIN_S for jump_s in agent["discontinuities_s"])
 
     def grounded(self, agent: dict[str, Any], place: BoxPose, *, falls: bool = False) -> BoxPose:
         """Return the place at the height of the nearest road; without a road near, as it is, or an error if it `falls` then."""
@@ -573,34 +532,24 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--map", metavar="TOWN", help="load this town first")
-    road = Path(__file__).with_name("road.xodr")
+    road, add = Path(__file__).with_name("road.xodr"), parser.add_argument
     where.add_argument(
-        "--opendrive",
-        type=Path,
-        nargs="?",
-        const=road,
-        metavar="FILE.xodr",
+        "--opendrive", type=Path, nargs="?", const=road, metavar="FILE.xodr",
         help="make a world of this road network first (default: the one exported)",
-    )
-    parser.add_argument(
-        "--mode", choices=("exact", "pid"), help="as in the scenario, or driven along it (default: as exported)"
-    )
-    parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=2000)
-    parser.add_argument(
-        "--timeout", type=float, default=60.0, metavar="S", help="how long the server may take, e.g. to load a world"
-    )
-    parser.add_argument("--dt", type=float, default=0.05, metavar="S", help="length of a tick, at most 0.1")
-    parser.add_argument(
-        "--physics", action="store_true", help="with exact: leave physics on, so that velocities are seen"
-    )
-    parser.add_argument(
-        "--ground", choices=("log", "map"), help="heights from the scenario (log; exact) or the nearest road (map; pid)"
-    )
-    parser.add_argument("--follow", default="ego", metavar="ID", help="agent that the spectator follows, or 'none'")
-    parser.add_argument("--pace", type=float, default=1.0, help="1 is real time, 0 as fast as the server can")
-    parser.add_argument("--table", action="store_true", help="print the table of assets and end")
-    parser.add_argument("--data", type=Path, default=Path(__file__).with_name("scenario_carla.json"), metavar="FILE")
+    )  # fmt: skip
+    add("--mode", choices=("exact", "pid"), help="as in the scenario, or driven along it (default: as exported)")
+    add("--host", default="127.0.0.1")
+    add("--port", type=int, default=2000)
+    patience = "how long the server may take, e.g. to load a world"
+    add("--timeout", type=float, default=60.0, metavar="S", help=patience)
+    add("--dt", type=float, default=0.05, metavar="S", help="length of a tick, at most 0.1")
+    add("--physics", action="store_true", help="with exact: leave physics on, so that velocities are seen")
+    heights = "heights from the scenario (log; exact) or the nearest road (map; pid)"
+    add("--ground", choices=("log", "map"), help=heights)
+    add("--follow", default="ego", metavar="ID", help="agent that the spectator follows, or 'none'")
+    add("--pace", type=float, default=1.0, help="1 is real time, 0 as fast as the server can")
+    add("--table", action="store_true", help="print the table of assets and end")
+    add("--data", type=Path, default=Path(__file__).with_name("scenario_carla.json"), metavar="FILE")
     parsed = parser.parse_args(words)
     if not 0 < parsed.dt <= 0.1:
         parser.error(

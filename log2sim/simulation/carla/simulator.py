@@ -36,7 +36,7 @@ class CarlaServer:
 
 
 class CarlaSimulator:
-    """The groups of a replay in a CARLA world; see `log2sim.simulation.simulators.ExternalSimulator`."""
+    """The groups of a replay in a CARLA world; which from then on only decide their controls; a step of the replay is one tick."""
 
     name = "carla"
     max_dt_s = 0.1  # as far as CARLA's physics goes with its substeps
@@ -57,7 +57,11 @@ class CarlaSimulator:
         xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in all_agents])
         x, y = whole_kilometers(xy)
         self.offset_m = float(x), float(y)
-        data = {d["id"]: d for d in carla_agents([_shifted(a, self.offset_m) for a in all_agents])}
+        shifted = []
+        for a in all_agents:
+            w = replace(a.waypoints, x_m=a.waypoints.x_m - self.offset_m[0], y_m=a.waypoints.y_m - self.offset_m[1])
+            shifted.append(replace(a, waypoints=w))
+        data = {d["id"]: d for d in carla_agents(shifted)}
         self._data, self._trajectories = data, {k: player.SampledTrajectory(d["exact"]) for k, d in data.items()}
         self._read: dict[str, tuple[float, float]] = {}
         with _translated_errors():
@@ -124,11 +128,10 @@ class CarlaSimulator:
         actor = self.session.actors.get(name)
         if actor is None or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
             x, y = self._to_carla(group, slot, float(state.x_m[slot]), float(state.y_m[slot]))
-            center = (x + offset_m * math.cos(yaw), y + offset_m * math.sin(yaw))
-            place = self._player.grounded(self._data[name], (*center, self._height(group, slot, step), yaw), falls=True)
-            actor = actor or self.session.spawn(self._data[name], place, True)
+            center = (x + offset_m * math.cos(yaw), y + offset_m * math.sin(yaw), yaw)
+            actor, placed = self._placed(group, slot, step, center, physics=True, falls=True)
             velocity = self.carla.Vector3D(speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
-            yield command.ApplyTransform(actor.handle.id, actor.transform(*place))
+            yield placed
             yield command.ApplyTargetVelocity(actor.handle.id, velocity)
         controls = group.commands
         curvature = -math.tan(controls.steer_rad[slot]) / float(group.living.wheelbase_m[slot])
@@ -145,10 +148,9 @@ class CarlaSimulator:
             goal_x, goal_y = self._to_carla(group, slot, float(goal.x_m[slot]), float(goal.y_m[slot]))
             actor, walks = self.session.actors.get(name), self._data[name]["drive"] == "walker"
             if actor is None or not walks or self._read.get(name) != (state.x_m[slot], state.y_m[slot]):
-                at = (x, y) if walks else (goal_x, goal_y)
-                place = self._player.grounded(self._data[name], (*at, self._height(group, slot, step), yaw))
-                actor = actor or self.session.spawn(self._data[name], place, walks)
-                yield self.carla.command.ApplyTransform(actor.handle.id, actor.transform(*place))
+                at = (x, y, yaw) if walks else (goal_x, goal_y, yaw)
+                actor, placed = self._placed(group, slot, step, at, physics=walks)
+                yield placed
             if walks:
                 yield self._player.walk(actor, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
 
@@ -160,10 +162,9 @@ class CarlaSimulator:
             x, y = float(now.x_m[slot]) - self.offset_m[0], -float(now.y_m[slot]) + self.offset_m[1]
             vx, vy = speed * math.cos(yaw), speed * math.sin(yaw)
             walks = self._data[name]["drive"] == "walker"
-            at = (x, y) if walks else (x + vx * dt_s, y + vy * dt_s)
-            place = self._player.grounded(self._data[name], (*at, self._height(group, slot, step), yaw))
-            actor = self.session.actors.get(name) or self.session.spawn(self._data[name], place, False)
-            yield self.carla.command.ApplyTransform(actor.handle.id, actor.transform(*place))
+            at = (x, y, yaw) if walks else (x + vx * dt_s, y + vy * dt_s, yaw)
+            actor, placed = self._placed(group, slot, step, at, physics=False)
+            yield placed
             if walks:
                 yield self._player.walk(actor, vx, vy, yaw)
 
@@ -195,10 +196,22 @@ class CarlaSimulator:
             x[slot], y[slot] = self._read[name] = self._from_carla(group, slot, *self.session.actors[name].pose()[:2])
         group.state = PointState(x, y, (x - state.x_m) / dt_s, (y - state.y_m) / dt_s)
 
-    def _height(self, group: AgentGroup, slot: int, step: int) -> float:
-        """Return the scenario's height of an agent's lowest face at its present place."""
-        trajectory = self._trajectories[group.agents[group.live[slot]].id]
-        return trajectory.place(float(group.log_times(self.clock.time(step))[slot]))[2]
+    def _placed(
+        self,
+        group: AgentGroup,
+        slot: int,
+        step: int,
+        at: tuple[float, float, float],
+        *,
+        physics: bool,
+        falls: bool = False,
+    ) -> tuple[player.CarlaActor, Any]:
+        """Return an agent's actor, spawned if need be, and the command that puts it at x, y, yaw and the scenario's height."""
+        name, (x, y, yaw) = group.agents[group.live[slot]].id, at
+        z = self._trajectories[name].place(float(group.log_times(self.clock.time(step))[slot]))[2]
+        place = self._player.grounded(self._data[name], (x, y, z, yaw), falls=falls)
+        actor = self.session.actors.get(name) or self.session.spawn(self._data[name], place, physics)
+        return actor, self.carla.command.ApplyTransform(actor.handle.id, actor.transform(*place))
 
     def _to_carla(self, group: AgentGroup, slot: int, x: float, y: float) -> tuple[float, float]:
         """Convert a position of a group's state, relative to the agent's first waypoint, to CARLA's frame."""
@@ -209,12 +222,6 @@ class CarlaSimulator:
         """Convert a position in CARLA's frame to that of a group's state."""
         i = group.live[slot]
         return x + self.offset_m[0] - group.origin_x_m[i], -y + self.offset_m[1] - group.origin_y_m[i]
-
-
-def _shifted(agent: Agent, offset_m: tuple[float, float]) -> Agent:
-    """Subtract an offset from an agent's coordinates."""
-    w = agent.waypoints
-    return replace(agent, waypoints=replace(w, x_m=w.x_m - offset_m[0], y_m=w.y_m - offset_m[1]))
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, BoxTracks, c
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
 from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.result import AgentReplay, Replay
-from log2sim.simulation.vehicles.parameters import WHEELED
+from log2sim.simulation.vehicles.vehicle import WHEELED
 from log2sim.simulation.warnings import describe_warnings
 
 SEARCH_S = 1.0
@@ -35,7 +35,6 @@ OFF_PATH_M = 0.5
 class TrackingErrors:
     """Distance of an agent from the scenario at its rows (S,); left, ahead, faster and counter-clockwise are positive."""
 
-    # across_m, along_m, speed_mps, yaw_rad: (S,)
     across_m: Array
     along_m: Array
     speed_mps: Array
@@ -90,16 +89,6 @@ def tracking_errors(
     return left[k] * (dy * cos[k] - dx * sin[k]), along
 
 
-def agent_metrics(errors: TrackingErrors) -> dict[str, Any]:
-    """Return the tracking errors of one agent, and the share of its rows that are farther than `OFF_PATH_M` from its path."""
-    across = np.abs(errors.across_m)
-    return {
-        "cross_track_rms_m": round(_rms(errors.across_m), 6), "cross_track_max_m": round(float(np.max(across)), 6),
-        "along_track_rms_m": round(_rms(errors.along_m), 6), "speed_rms_mps": round(_rms(errors.speed_mps), 6),
-        "yaw_rms_rad": round(_rms(errors.yaw_rad), 6), "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
-    }  # fmt: skip
-
-
 def _mean(values: Mapping[str, float], samples: Mapping[str, int]) -> float:
     """Return the mean of the values weighted by their samples; 0 without any."""
     total = sum(samples.values())
@@ -110,9 +99,8 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-ACCEL_WINDOW_S = 0.75
 # Lengths of the fits. Shorter ones show the steps of the controller and the noise of the scenario.
-JERK_WINDOW_S = 1.5
+ACCEL_WINDOW_S, JERK_WINDOW_S = 0.75, 1.5
 
 # Fewest rows of a window: a cubic with one degree of freedom left. With sparse rows the windows are longer.
 MIN_ROWS = 5
@@ -167,7 +155,7 @@ MIN_SPEED_MPS = 0.05  # below this a vehicle stands, and what its acceleration i
 
 
 def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path: Trajectory) -> dict[str, Any]:
-    """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`.
+    """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`; its smallest gap is to the agent of a column.
 
     `index`: its column in `boxes`. `boxes`: of all agents. `t_s` (S,), s: times of the rows of `boxes`. `path`: of the
     ego in the scenario.
@@ -176,60 +164,40 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     gone_m = table.progress(0, ego.x_m, ego.y_m)
     length_m = float(table.at(np.zeros(1, dtype=np.intp), np.array([path.t_s[-1]])).distance_m[0])
     steps_m = np.hypot(np.diff(ego.x_m), np.diff(ego.y_m))
-    return {
-        "driven_m": round(float(steps_m.sum()), 3), "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
-        "path_m": round(length_m, 3), "min_gap": smallest_gap(boxes, index, t_s), "max_brake": hardest_brake(ego),
-    }  # fmt: skip
-
-
-def hardest_brake(ego: AgentReplay) -> dict[str, float] | None:
-    """Return the largest deceleration, m/s2, and when it was; None where the ego never slows down."""
     # What the actuators do between two states shows in the speed at its end, so the larger of both speeds says if it moves.
-    speed = np.abs(ego.speed_mps)
-    moves = np.maximum(speed, np.r_[speed[:1], speed[:-1]]) > MIN_SPEED_MPS
-    direction = np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, np.r_[ego.speed_mps[:1], ego.speed_mps[:-1]]))
-    brake = np.where(moves, -ego.accel_mps2 * direction, 0.0)
-    k = int(np.argmax(brake)) if len(brake) else 0
-    if not len(brake) or brake[k] <= 0:
-        return None
-    return {"mps2": round(float(brake[k]), 3), "t_s": round(float(ego.t_s[k]), 6)}
-
-
-def smallest_gap(boxes: BoxTracks, index: int, t_s: Array) -> dict[str, Any] | None:
-    """Return the smallest distance of an agent's box, m, from another one at the rows, of which agent (column) and when.
-
-    It is 0 where they overlap. Boxes at different heights, as on a bridge, are not compared. None without any other agent.
-    """
-    rows, others = _near_pairs(boxes, index)
-    if not len(rows):
-        return None
-    gaps = []
-    for begin in range(0, len(rows), MAX_PAIRS):
-        r, a = rows[begin : begin + MAX_PAIRS], others[begin : begin + MAX_PAIRS]
-        away = boxes.x_m[r, a] - boxes.x_m[r, index] + 1j * (boxes.y_m[r, a] - boxes.y_m[r, index])
-        size, yaws = np.broadcast_to(boxes.size_m[index], (len(r), 3)), (boxes.yaw_rad[r, index], boxes.yaw_rad[r, a])
-        gaps.append(np.maximum(signed_distance(away, *yaws, size, boxes.size_m[a]), 0.0))
-    gap = np.concatenate(gaps)
-    k = int(np.argmin(gap))
-    return {"m": round(float(gap[k]), 3), "t_s": round(float(t_s[rows[k]]), 6), "agent": int(others[k])}
-
-
-def _near_pairs(boxes: BoxTracks, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows and agents, (P,) each, among which the nearest box is, whatever the directions of the boxes."""
-    far, nearest = boxes.radius_m + boxes.radius_m[index], np.inf
-    height = (boxes.size_m[:, 2] + boxes.size_m[index, 2]) / 2
-    count = max(1, MAX_PAIRS // len(boxes.size_m))
-    found = [np.zeros((2, 0), dtype=np.intp)]
+    speed, before = np.abs(ego.speed_mps), np.r_[ego.speed_mps[:1], ego.speed_mps[:-1]]
+    moves = np.maximum(speed, np.abs(before)) > MIN_SPEED_MPS
+    brake = np.where(moves, -ego.accel_mps2 * np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, before)), 0.0)
+    k, hardest = int(np.argmax(brake)) if len(brake) else 0, None
+    if len(brake) and brake[k] > 0:
+        hardest = {"mps2": round(float(brake[k]), 3), "t_s": round(float(ego.t_s[k]), 6)}
+    # Rows and agents among which the nearest box is, whatever the directions of the boxes; those at different heights, as
+    # on a bridge, are not compared.
+    far, height = boxes.radius_m + boxes.radius_m[index], (boxes.size_m[:, 2] + boxes.size_m[index, 2]) / 2
+    nearest, found, count = np.inf, [np.zeros((2, 0), dtype=np.intp)], max(1, MAX_PAIRS // len(boxes.size_m))
     for begin in range(0, len(boxes.x_m), count):
-        rows = slice(begin, begin + count)
-        dx, dy, dz = (c[rows] - c[rows, index][:, None] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
+        part = slice(begin, begin + count)
+        dx, dy, dz = (c[part] - c[part, index][:, None] for c in (boxes.x_m, boxes.y_m, boxes.z_m))
         distance = np.where(np.abs(dz) < height, np.hypot(dx, dy), np.inf)  # NaN where one of them is absent: not level
         distance[:, index] = np.inf
         nearest = min(nearest, float(distance.min(initial=np.inf)))
         row, agent = np.nonzero(np.isfinite(distance) & (distance - far <= nearest))
         found.append(np.stack([row + begin, agent]))
-    rows_near, agents_near = np.concatenate(found, axis=1)
-    return rows_near, agents_near
+    rows, others = np.concatenate(found, axis=1)
+    gaps = [np.zeros(0)]
+    for begin in range(0, len(rows), MAX_PAIRS):
+        r, a = rows[begin : begin + MAX_PAIRS], others[begin : begin + MAX_PAIRS]
+        away = boxes.x_m[r, a] - boxes.x_m[r, index] + 1j * (boxes.y_m[r, a] - boxes.y_m[r, index])
+        size, yaws = np.broadcast_to(boxes.size_m[index], (len(r), 3)), (boxes.yaw_rad[r, index], boxes.yaw_rad[r, a])
+        gaps.append(np.maximum(signed_distance(away, *yaws, size, boxes.size_m[a]), 0.0))
+    gap, smallest = np.concatenate(gaps), None
+    if len(gap):
+        k = int(np.argmin(gap))
+        smallest = {"m": round(float(gap[k]), 3), "t_s": round(float(t_s[rows[k]]), 6), "agent": int(others[k])}
+    return {
+        "driven_m": round(float(steps_m.sum()), 3), "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
+        "path_m": round(length_m, 3), "min_gap": smallest, "max_brake": hardest,
+    }  # fmt: skip
 
 
 LOWER_LIMITS = ("min_ttc_s", "min_pet_s")
@@ -330,20 +298,20 @@ def replay_metrics(
     events = collisions(replayed, source, moves, t_s, ids, source_kind=source_kind)
     near = conflicts(replayed, moves, t_s, ids, events)
     events_of, near_of = _by_agent(events), _by_agent(near)
-    by_agent = {
-        a.id: {
-            **agent_metrics(errors[a.id]),
+    by_agent: dict[str, dict[str, Any]] = {}
+    for a in (a for a in agents if a.id in errors):
+        e = errors[a.id]
+        across = np.abs(e.across_m)
+        # Not of pedestrians, nor where the scenario has a discontinuity.
+        felt = a.category in WHEELED and not len(trajectories[a.id].discontinuity_times())
+        by_agent[a.id] = {
+            "cross_track_rms_m": round(_rms(e.across_m), 6), "cross_track_max_m": round(float(np.max(across)), 6),
+            "along_track_rms_m": round(_rms(e.along_m), 6), "speed_rms_mps": round(_rms(e.speed_mps), 6),
+            "yaw_rms_rad": round(_rms(e.yaw_rad), 6), "off_path_share": round(float(np.mean(across > OFF_PATH_M)), 6),
             "min_ttc_s": (most_critical(near_of[a.id], "min_ttc") or {}).get("s"),
             "min_pet_s": (most_critical(near_of[a.id], "pet") or {}).get("s"),
-            # Not of pedestrians, nor where the scenario has a discontinuity.
-            "comfort": comfort(a.t_s, a.x_m, a.y_m, a.yaw_rad)
-            if a.category in WHEELED and not len(trajectories[a.id].discontinuity_times())
-            else None,
-            "collisions": events_of[a.id],
-        }
-        for a in agents
-        if a.id in errors
-    }
+            "comfort": comfort(a.t_s, a.x_m, a.y_m, a.yaw_rad) if felt else None, "collisions": events_of[a.id],
+        }  # fmt: skip
     on_time = {a.id: len(a) for a in agents if a.driver == "pid"}
     on_way = on_time | {a.id: len(a) for a in agents if a.driver == "reactive"}
     driven = next((k for k, agent in enumerate(agents) if agent.driver == "policy"), None)
@@ -353,13 +321,13 @@ def replay_metrics(
         figures = ego_figures(agents[driven], driven, replayed, t_s, path)
         gap = figures["min_gap"]
         ego["ego"] = {**figures, "min_gap": None if gap is None else {**gap, "agent": ids[gap["agent"]]}}
-    # Average the errors over all followers, every stored sample counting alike; 0 without followers.
+    # Errors averaged over all followers, every stored sample counting alike; 0 without followers.
     out: dict[str, Any] = {}
     for key, samples in (
         ("cross_track_rms_m", on_way), ("along_track_rms_m", on_time), ("speed_rms_mps", on_time), ("yaw_rms_rad", on_time),
     ):  # fmt: skip
         out[key] = round(float(np.sqrt(_mean({k: e[key] ** 2 for k, e in by_agent.items()}, samples))), 6)
-    out["cross_track_max_m"] = max((e["cross_track_max_m"] for k, e in by_agent.items() if k in on_way), default=0.0)
+    out["cross_track_max_m"] = max((m["cross_track_max_m"] for k, m in by_agent.items() if k in on_way), default=0.0)
     out["off_path_share"] = round(_mean({k: e["off_path_share"] for k, e in by_agent.items()}, on_way), 6)
     out["followers"] = len(on_time)
     return {
@@ -413,7 +381,18 @@ def summarize(replay: Replay, *, limit: int | None = MAX_LISTED) -> str:
     m = replay.metrics
     events = sorted(m["collisions"], key=lambda e: (e["belongs_to"] != REPLAY, e["t_s"]))
     drivers = {a.driver for a in replay.agents}
-    lines = _ego_lines(m) if "ego" in m else []
+    lines = []
+    if "ego" in m:
+        ego, gap, brake = m["ego"], m["ego"]["min_gap"], m["ego"]["max_brake"]
+        share = f" ({ego['progress_m'] / ego['path_m']:.0%})" if ego["path_m"] > 0 else ""
+        own_events = [(next(id for id in e["agents"] if id != EGO), e) for e in m["collisions"] if EGO in e["agents"]]
+        hits = [f"{id} at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s)" for id, e in own_events]
+        lines = [
+            f"ego: progress {ego['progress_m']:.1f} of {ego['path_m']:.1f} m along its path{share}",
+            "  smallest gap " + ("-" if gap is None else f"{gap['m']:.2f} m to {gap['agent']} at {gap['t_s']:.2f} s"),
+            "  hardest brake " + ("-" if brake is None else f"{brake['mps2']:.1f} m/s2 at {brake['t_s']:.2f} s"),
+            f"  collisions {'none' if not hits else 'with ' + ', '.join(hits)}",
+        ]
     on_time, across, along, speed = bool(drivers & {*SCENARIO_FOLLOWERS}), "-", "-", "-"
     if on_time or "reactive" in drivers:
         across = f"{m['cross_track_rms_m']:.3f} m rms, {m['cross_track_max_m']:.3f} m max"
@@ -423,11 +402,8 @@ def summarize(replay: Replay, *, limit: int | None = MAX_LISTED) -> str:
     counts = f"{len(events)} collision{'' if len(events) == 1 else 's'}"
     if events:
         owners = Counter(e["belongs_to"] for e in m["collisions"])
-        parts = [
-            f"{owners[REPLAY]} of the replay",
-            *(f"{n} of the {k} itself" for k, n in owners.items() if k != REPLAY),
-        ]
-        counts += f", {' and '.join(parts)}"
+        own = [f"{n} of the {k} itself" for k, n in owners.items() if k != REPLAY]
+        counts += f", {' and '.join([f'{owners[REPLAY]} of the replay', *own])}"
     whose = " of the ego" if "policy" in drivers else ""
     times = []
     for key in ("min_ttc", "pet"):
@@ -461,18 +437,3 @@ def _first(lines: list[str], limit: int | None) -> list[str]:
     """Return the first lines, and one that counts the others."""
     rest = 0 if limit is None else len(lines) - limit
     return [*lines[:limit], f"  and {rest} more"] if rest > 0 else lines
-
-
-def _ego_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Say how the ego fared: progress, smallest gap, hardest brake, collisions."""
-    ego, events = metrics["ego"], [e for e in metrics["collisions"] if EGO in e["agents"]]
-    gap, brake, path_m = ego["min_gap"], ego["max_brake"], ego["path_m"]
-    share = f" ({ego['progress_m'] / path_m:.0%})" if path_m > 0 else ""
-    others = [next(id for id in e["agents"] if id != EGO) for e in events]
-    hits = [f"{id} at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s)" for id, e in zip(others, events)]
-    return [
-        f"ego: progress {ego['progress_m']:.1f} of {path_m:.1f} m along its path{share}",
-        "  smallest gap " + ("-" if gap is None else f"{gap['m']:.2f} m to {gap['agent']} at {gap['t_s']:.2f} s"),
-        "  hardest brake " + ("-" if brake is None else f"{brake['mps2']:.1f} m/s2 at {brake['t_s']:.2f} s"),
-        f"  collisions {'none' if not hits else 'with ' + ', '.join(hits)}",
-    ]

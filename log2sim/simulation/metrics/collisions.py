@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -188,20 +187,16 @@ def first_contact(motion: RelativeMotion) -> Array:
         moving = motion.take(active)
         free = moving.free_for(u)
         hit = free == 0
-        touch[active[hit]] = _bisected(moving.take(hit), before[hit], u[hit])
+        met, apart, overlapping = moving.take(hit), before[hit], u[hit]
+        for _ in range(BISECTIONS if hit.any() else 0):
+            middle = (apart + overlapping) / 2
+            inside = met.free_for(middle) == 0
+            apart, overlapping = np.where(inside, apart, middle), np.where(inside, middle, overlapping)
+        touch[active[hit]] = overlapping
         on = ~hit & (u < 1) & (u + free < 1)
         active, before, step = active[on], u[on], np.maximum(free[on], 1 / MAX_STEPS)
         u = np.minimum(before + step, 1.0)
     return touch
-
-
-def _bisected(motion: RelativeMotion, apart: Array, overlapping: Array) -> Array:
-    """Bisect for the first share (N,) with an overlap, between one without and one with it."""
-    for _ in range(BISECTIONS):
-        middle = (apart + overlapping) / 2
-        inside = motion.free_for(middle) == 0
-        apart, overlapping = np.where(inside, apart, middle), np.where(inside, middle, overlapping)
-    return overlapping
 
 
 def _gap_duration(gap: Array, rate: Array) -> Array:
@@ -228,11 +223,9 @@ REPLAY, RECONSTRUCTION, SCENARIO = "replay", "reconstruction", "scenario"
 class Contacts(Columns):
     """Contacts (N,) of boxes a < b."""
 
-    # a, b: (N,)
     a: RowIndex
     b: RowIndex
-    # first_row, last_row: (N,) fractional rows of the first and last overlap within one step.
-    first_row: Array
+    first_row: Array  # fractional rows of the first and last overlap within one step
     last_row: Array
 
 
@@ -246,10 +239,14 @@ def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_]
     Raises `ScenarioError` for more than `MAX_CONTACTS`, of agents that lie on top of each other.
     """
     found, count = [Contacts(*np.zeros((2, 0), dtype=np.intp), *np.zeros((2, 0)))], 0
-    for k, a, b in _in_batches(_candidates(boxes, moves, only)):
-        first_row, last_row = _contact_rows(boxes, k, a, b)
-        hit = ~np.isnan(first_row)
-        found.append(Contacts(a[hit], b[hit], first_row[hit], last_row[hit]))
+    for k, a, b in _candidates(boxes, moves, only):
+        motion = _relative_motion(boxes, k, a, b)
+        first = first_contact(motion)
+        hit = np.flatnonzero(~np.isnan(first))
+        k, a, b, first = k[hit], a[hit], b[hit], first[hit]
+        on = boxes.moves_on[k, a] & boxes.moves_on[k, b]
+        last = np.where(on, 1.0 - first_contact(motion.take(hit).reversed()), 0.0)
+        found.append(Contacts(a, b, k + first, k + np.fmax(first, last)))
         count += len(found[-1].a)
         if count > MAX_CONTACTS:
             raise ScenarioError(
@@ -259,23 +256,11 @@ def contacts(boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_]
     return Contacts(*(np.concatenate([getattr(f, c) for f in found]) for c in ("a", "b", "first_row", "last_row")))
 
 
-def _in_batches(candidates: Iterator[tuple[RowIndex, RowIndex, RowIndex]]) -> Iterator[NDArray[np.intp]]:
-    """Yield candidates (3, N) joined and cut to at most `BATCH`."""
-    waiting, count = list[NDArray[np.intp]](), 0
-    for part in chain(candidates, [None]):
-        if part is not None:
-            waiting.append(np.stack(part))
-            count += waiting[-1].shape[1]
-        if count and (part is None or count >= BATCH):
-            joined = np.concatenate(waiting, axis=1)
-            yield from (joined[:, begin : begin + BATCH] for begin in range(0, count, BATCH))
-            waiting, count = [], 0
-
-
 def _candidates(
     boxes: BoxTracks, moves: NDArray[np.bool_], only: NDArray[np.bool_] | None
-) -> Iterator[tuple[RowIndex, RowIndex, RowIndex]]:
-    """Yield rows and pairs (3, N) that may touch before the next row."""
+) -> Iterator[NDArray[np.intp]]:
+    """Yield rows and pairs (3, N) that may touch before the next row, some `BATCH` at a time."""
+    waiting, count = [np.zeros((3, 0), dtype=np.intp)], 0
     for begin in range(0, len(boxes.x_m), CHUNK):
         rows = slice(begin, begin + CHUNK + 1)
         present = boxes.present[begin : begin + CHUNK]
@@ -283,18 +268,13 @@ def _candidates(
             row, pair = np.nonzero(present[:, i] & present[:, j])
             k, a, b = row + begin, i[pair], j[pair]
             near = _relative_motion(boxes, k, a, b).may_touch()
-            yield k[near], a[near], b[near]
-
-
-def _contact_rows(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> tuple[Array, Array]:
-    """Return fractional rows (N,) of the first and last overlap from rows `k` to the next; NaN without overlap."""
-    motion = _relative_motion(boxes, k, a, b)
-    first, last = first_contact(motion), np.zeros(len(k))
-    hit = np.flatnonzero(~np.isnan(first))
-    on = boxes.moves_on[k[hit], a[hit]] & boxes.moves_on[k[hit], b[hit]]
-    last[hit] = np.where(on, 1.0 - first_contact(motion.take(hit).reversed()), 0.0)
-    rows = k.astype(np.float64)
-    return rows + first, rows + np.fmax(first, last)
+            waiting.append(np.stack([k, a, b])[:, near])
+            count += waiting[-1].shape[1]
+            if count >= BATCH:
+                joined = np.concatenate(waiting, axis=1)
+                yield from (joined[:, first : first + BATCH] for first in range(0, count, BATCH))
+                waiting, count = waiting[:1], 0
+    yield np.concatenate(waiting, axis=1)
 
 
 def _relative_motion(boxes: BoxTracks, k: RowIndex, a: RowIndex, b: RowIndex) -> RelativeMotion:
@@ -357,12 +337,17 @@ def collisions(
     for (a, b), contact in _by_pair(touching).items():
         own_s = np.interp(own_contacts.get((a, b), np.zeros((2, 0))), rows, t_s)
         together = max(replayed.first_row[a], replayed.first_row[b])
-        for begin_row, end_row in _merged_contacts(contact, SAME_CONTACT_S / spacing_s(t_s)):
+        first, last = contact
+        new = np.flatnonzero(first[1:] - last[:-1] > SAME_CONTACT_S / spacing_s(t_s)) + 1
+        for begin_row, end_row in ((f[0], t[-1]) for f, t in zip(np.split(first, new), np.split(last, new))):
             begin, end = np.interp([begin_row, end_row], rows, t_s)
+            k = int(begin_row)
+            now, then = (velocity[:, r, b] - velocity[:, r, a] for r in (k, min(k + 1, len(t_s) - 1)))
+            relative = now if np.isnan(then).any() else now + (begin_row - k) * (then - now)
             own = (own_s[0] <= end + SCENARIO_WINDOW_S) & (own_s[1] >= begin - SCENARIO_WINDOW_S)
             events.append({
                 "agents": [ids[a], ids[b]], "t_s": round(float(begin), 6), "until_s": round(float(end), 6),
-                "relative_speed_mps": round(_relative_speed(velocity, begin_row, a, b), 3),
+                "relative_speed_mps": round(float(np.hypot(*relative)), 3),
                 "belongs_to": source_kind if own.any() else REPLAY, "in_log": bool(own.any()),
                 "from_start": bool(begin_row == together),
             })  # fmt: skip
@@ -376,18 +361,3 @@ def _by_pair(found: Contacts) -> dict[tuple[int, int], Array]:
     rows = np.split(np.stack([found.first_row, found.last_row]), new, axis=1)
     begins = np.concatenate([[0], new])[: len(found.a)]
     return dict(zip(zip(found.a[begins].tolist(), found.b[begins].tolist()), rows))
-
-
-def _merged_contacts(contact: Array, gap: float) -> list[tuple[float, float]]:
-    """Return begin and end of contacts (2, K), merging those at most `gap` apart."""
-    first, last = contact
-    new = np.flatnonzero(first[1:] - last[:-1] > gap) + 1
-    return [(float(f[0]), float(t[-1])) for f, t in zip(np.split(first, new), np.split(last, new))]
-
-
-def _relative_speed(velocity: Array, row: float, a: int, b: int) -> float:
-    """Interpolate the relative speed at a fractional row, from velocities (2, S, A)."""
-    k = int(row)
-    after = min(k + 1, velocity.shape[1] - 1)
-    now, then = (velocity[:, r, b] - velocity[:, r, a] for r in (k, after))
-    return float(np.hypot(*(now if np.isnan(then).any() else now + (row - k) * (then - now))))

@@ -24,11 +24,10 @@ BLOCK = 256  # rows and agents of one broad phase, so that its arrays stay small
 class TimesToCollision(Columns):
     """Pairs a < b (N,) on a collision course."""
 
-    # a, b: (N,)
     a: RowIndex
     b: RowIndex
-    time_s: Array  # (N,) least time to collision
-    row: RowIndex  # (N,) the row at which it occurs
+    time_s: Array  # least time to collision
+    row: RowIndex  # at which it occurs
 
 
 def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: float) -> TimesToCollision:
@@ -58,10 +57,9 @@ def times_to_collision(boxes: BoxTracks, moves: NDArray[np.bool_], spacing_s: fl
             # Whether pairs (N,) are at the same height at rows k, or will be after a time, on a common slope.
             apart_m = boxes.z_m[k, j] - boxes.z_m[k, i]
             then_m = apart_m + time * (climb[k, j] - climb[k, i])
-            result: NDArray[np.bool_] = (
-                np.minimum(np.abs(apart_m), np.abs(then_m)) < (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
-            )
-            found.append(_least_per_pair(np.stack([i, j, time, k])[:, result]))
+            height_m = (boxes.size_m[i, 2] + boxes.size_m[j, 2]) / 2
+            level = np.minimum(np.abs(apart_m), np.abs(then_m)) < height_m
+            found.append(_least_per_pair(np.stack([i, j, time, k])[:, level]))
     a, b, time, row = _least_per_pair(np.concatenate(found, axis=1))
     return TimesToCollision(a.astype(np.intp), b.astype(np.intp), time, row.astype(np.intp))
 
@@ -89,8 +87,7 @@ def touching(
         place, rate = dx * nx + dy * ny, vx * nx + vy * ny
         moves = rate != 0
         never = np.where(np.abs(place) < reach, -np.inf, np.inf)  # of a shadow that keeps its place
-        ends = (np.divide(side * reach - place, rate, out=never.copy(), where=moves) for side in (-1.0, 1.0))
-        one, other = ends
+        one, other = (np.divide(side * reach - place, rate, out=never.copy(), where=moves) for side in (-1.0, 1.0))
         enter = np.maximum(enter, np.minimum(one, other))
         leave = np.minimum(leave, np.where(moves, np.maximum(one, other), -never))
     return enter, leave
@@ -157,11 +154,9 @@ PARTS, ZOOMS = 4, 4  # a row is divided into so many parts so many times: 50 ms 
 class PostEncroachmentTimes(Columns):
     """Pairs (N,) of agents on crossing paths."""
 
-    # first, second: (N,) the agent that was at the place first, and second.
-    first: RowIndex
+    first: RowIndex  # the agent that was at the place first, and second
     second: RowIndex
-    # left_row, came_row: (N,) fractional rows at which the first left and the second arrived.
-    left_row: Array
+    left_row: Array  # fractional rows at which the first left and the second arrived
     came_row: Array
 
 
@@ -201,14 +196,14 @@ def post_encroachment_times(boxes: BoxTracks, spacing_s: float) -> PostEncroachm
     """
     lag = HORIZON_S / spacing_s
     hulls = [_SweptRectangles(boxes, COARSE // FINER**level) for level in range(LEVELS)]
-    found: list[_Pairs] = []
-    for pairs in _overlapping_blocks(hulls[0], _agents_that_move(boxes), lag):
+    # Who changes neither place nor heading neither leaves nor arrives.
+    columns = (boxes.x_m, boxes.y_m, boxes.yaw_rad)
+    moves = np.any([np.fmax.reduce(c, axis=0) > np.fmin.reduce(c, axis=0) for c in columns], axis=0)
+    found = [_Pairs(*np.zeros((4, 0), dtype=np.intp))]
+    for pairs in _overlapping_blocks(hulls[0], moves, lag):
         for hull in hulls[1:]:
             pairs = hull.met(pairs.divided())
         found.append(_shortest(_crossings(boxes, pairs.divided(), lag)))
-    if not found:
-        none = np.zeros(0, dtype=np.intp)
-        return PostEncroachmentTimes(none, none, np.zeros(0), np.zeros(0))
     pairs = _shortest(_Pairs(*(np.concatenate(column) for column in zip(*found))))
     left, came = np.zeros(len(pairs.a)), np.zeros(len(pairs.a))
     for begin in range(0, len(left), BATCH):
@@ -261,13 +256,6 @@ class _SweptRectangles:
 def _extent(values: Array, half: Array) -> tuple[Array, Array]:
     """Return minimum and maximum (K, A) of intervals (K, R, A) around values; NaN where all are."""
     return np.fmin.reduce(values - half, axis=1), np.fmax.reduce(values + half, axis=1)
-
-
-def _agents_that_move(boxes: BoxTracks) -> NDArray[np.bool_]:
-    """Mark (A,) the agents that change place or heading: who stays neither leaves nor arrives."""
-    columns = (boxes.x_m, boxes.y_m, boxes.yaw_rad)
-    changes = np.stack([np.fmax.reduce(c, axis=0) > np.fmin.reduce(c, axis=0) for c in columns])
-    return np.asarray(changes.any(axis=0))
 
 
 def _overlapping_blocks(hulls: _SweptRectangles, moves: NDArray[np.bool_], lag: float) -> Iterator[_Pairs]:
@@ -348,9 +336,9 @@ def conflicts(
 
     def record(a: int, b: int) -> dict[str, Any]:
         pair = (min(a, b), max(a, b))
-        if pair not in by_pair:
-            by_pair[pair] = _new_record(ids[pair[0]], ids[pair[1]])
-        return by_pair[pair]
+        agents = [ids[k] for k in pair]
+        times = dict.fromkeys(("min_ttc_s", "min_ttc_t_s", "pet_s", "pet_t_s", "pet_first"))
+        return by_pair.setdefault(pair, {"agents": agents, "ego": EGO in agents, "contact": "none", **times})
 
     close = times_to_collision(boxes, moves, step_s)
     for a, b, time_s, row in zip(*(c.tolist() for c in (close.a, close.b, close.time_s, close.row))):
@@ -367,7 +355,11 @@ def conflicts(
             entry.update(contact="new", min_ttc_s=0.0, min_ttc_t_s=t, pet_s=0.0, pet_t_s=t, pet_first=None)
         elif event["belongs_to"] != REPLAY and entry["contact"] == "none":
             entry["contact"] = "scenario"
-    return sorted(by_pair.values(), key=lambda e: (_urgency_s(e), e["agents"]))
+
+    def urgency(entry: Event) -> tuple[float, list[str]]:
+        return min((v for v in (entry["min_ttc_s"], entry["pet_s"]) if v is not None), default=np.inf), entry["agents"]
+
+    return sorted(by_pair.values(), key=urgency)
 
 
 def most_critical(found: Iterable[Event], key: str) -> dict[str, Any] | None:
@@ -380,14 +372,3 @@ def most_critical(found: Iterable[Event], key: str) -> dict[str, Any] | None:
         return None
     first = min(known, key=lambda e: (e[f"{key}_s"], e["agents"]))
     return {"s": first[f"{key}_s"], "t_s": first[f"{key}_t_s"], "agents": list(first["agents"])}
-
-
-def _new_record(a: str, b: str) -> dict[str, Any]:
-    return {
-        "agents": [a, b], "ego": EGO in (a, b), "contact": "none",
-        "min_ttc_s": None, "min_ttc_t_s": None, "pet_s": None, "pet_t_s": None, "pet_first": None,
-    }  # fmt: skip
-
-
-def _urgency_s(entry: Event) -> float:
-    return min((v for v in (entry["min_ttc_s"], entry["pet_s"]) if v is not None), default=np.inf)

@@ -40,17 +40,15 @@ COMPONENTS = {
     "distance_to_road_edge": Component(-20.0, 40.0, 10, 0.1, 0.1),
     "off_road": Component(-0.5, 1.5, 2, 0.001, 0.25),
 }
+# Components that say whether something ever happens in a rollout, and the distance that is below, or beyond, 0 then.
 EVENTS = {"collision": "distance_to_nearest_object", "off_road": "distance_to_road_edge"}
-"""Components that say whether something ever happens in a rollout, and the distance that is below, or beyond, 0 then."""
-
 MAX_TTC_S = 5.0
+# Who is ahead counts for the time to collision up to this difference of headings, and up to the second one if the
+# overlap is small.
 FOLLOWING_RAD, GRAZING_RAD, GRAZING_M = np.radians(75.0), np.radians(10.0), 0.5
-"""Who is ahead counts for the time to collision up to this difference of headings, and up to the second one if the overlap is small."""
-
 FAR_M = 1e3
 CELL_M = 0.25
-GAP_M = 1.5
-"""Gaps between lanes up to this width belong to the road."""
+GAP_M = 1.5  # gaps between lanes up to this width belong to the road
 
 
 def sizes_of(agents: Sequence[Agent]) -> Array:

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Scenario
 from log2sim.geometry import Array
 
-TICK_S = 0.1
-"""Interval of ticks: the rate of most LiDARs, at which a driver's reaction takes ten ticks."""
+TICK_S = 0.1  # interval of ticks: the rate of most LiDARs, at which a driver's reaction takes ten ticks
 
 Complex = NDArray[np.complex128]
 
@@ -83,30 +82,20 @@ def tabulate(agents: Sequence[Agent], t_s: Array, tick_s: float) -> MotionTable:
     return MotionTable(*columns, tick_s, velocity, sigma, observed, piece)
 
 
+# Time constants to choose from, of velocity and of turn rate: 0 takes the latest value, and infinity none, so that the
+# agent goes straight on.
 CONSTANTS_S = tuple(itertools.product((0.0, 0.3, 0.6, 1.2), (0.0, 0.3, 0.6, 1.2, 2.4, np.inf)))
-"""Time constants to choose from, of velocity and of turn rate: 0 takes the latest value, and infinity none, so that the agent
-goes straight on."""
-
+# Log-odds, before anything is known, of taking the latest velocity as it is: states of scenarios are smoothed already.
 LATEST_ADVANTAGE = 3.0
-"""Log-odds, before anything is known, of taking the latest velocity as it is: states of scenarios are smoothed already."""
-
-PROOF_S = 1.0
-"""Constants are judged by predictions over this time, of which the outcome is known already."""
-
+PROOF_S = 1.0  # constants are judged by predictions over this time, of which the outcome is known already
+# What such a prediction is off by usually: a tenth of what 0.6 m/s2 make of three seconds; smaller differences prove
+# nothing.
 USUAL_ERROR_M = 0.3
-"""What such a prediction is off by usually: a tenth of what 0.6 m/s2 make of three seconds; smaller differences prove nothing."""
-
-USUAL_ERRORS = 2.0
-"""How many errors of the past `USUAL_ERROR_M` counts as."""
-
+USUAL_ERRORS = 2.0  # how many errors of the past `USUAL_ERROR_M` counts as
+# Of slower agents the velocity does not tell the course: smoothed speeds err by 0.15 m/s, which is 17 degrees here.
 MIN_COURSE_MPS = 0.5
-"""Of slower agents the velocity does not tell the course: smoothed speeds err by 0.15 m/s, which is 17 degrees here."""
-
-MAX_LATERAL_MPS2 = 8.8
-"""Tires on dry asphalt hold about 0.9 g."""
-
-MAX_CURVATURE_1PM = 0.3
-"""Beyond it a vehicle's motion is infeasible for Waymax (Gulino et al., 2023)."""
+MAX_LATERAL_MPS2 = 8.8  # tires on dry asphalt hold about 0.9 g
+MAX_CURVATURE_1PM = 0.3  # beyond it a vehicle's motion is infeasible for Waymax (Gulino et al., 2023)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,54 +141,36 @@ def smooth_motion(table: MotionTable) -> SmoothedMotion:
     averaged: while little is known, that errs less than the likeliest alone. Errors of overlapping times count as one for
     each `PROOF_S`. Cost: linear in agents, ticks and constants.
     """
-    judge = _Judge(len(table.agents), round(PROOF_S / table.tick_s), table.tick_s)
-    fresh, rates = table.begins, turn_rates(table)
-    share_v, share_w = (_shares(np.array(c), table.tick_s) for c in zip(*CONSTANTS_S))
+    fresh, rates, constants = table.begins, turn_rates(table), np.array(CONSTANTS_S)
+    # Weights of the latest value by time constants; 1 for a constant of 0.
+    share_v, share_w = -np.expm1(
+        -np.divide(table.tick_s, constants.T, out=np.full((2, len(constants)), np.inf), where=constants.T > 0)
+    )
     velocity = np.zeros((len(table.agents), len(CONSTANTS_S)), dtype=complex)
     turn = np.zeros(velocity.shape)
     out = SmoothedMotion(np.empty_like(table.velocity_mps), np.empty(rates.shape), np.empty((*rates.shape, 2)))
-    constants = np.array(CONSTANTS_S)
+    # Predictions whose outcome is not known yet, and the errors of those whose outcome is.
+    ticks = round(PROOF_S / table.tick_s)
+    pending = np.full((ticks, *velocity.shape), np.nan, dtype=complex)
+    squares, errors, usual = np.zeros(velocity.shape), np.zeros((len(velocity), 1)), USUAL_ERRORS * USUAL_ERROR_M**2
+    advantage = LATEST_ADVANTAGE * (constants[:, 0] == 0)
     for n in range(len(table.t_s)):
-        new, latest = fresh[:, n, None], table.velocity_mps[:, n, None]
+        new, latest, position = fresh[:, n, None], table.velocity_mps[:, n, None], table.position_m[:, n, None]
         turn = np.where(new, 0.0, turn + share_w * (rates[:, n, None] - turn))
         velocity = velocity * np.exp(1j * table.tick_s * turn)
         velocity = np.where(new, latest, velocity + share_v * (latest - velocity))
-        weight = judge.weigh(n, table.position_m[:, n, None], fresh[:, n], velocity, turn)
+        pending[:, fresh[:, n]] = np.nan
+        squares[fresh[:, n]] = errors[fresh[:, n]] = 0.0
+        error = position - pending[n % ticks]
+        square = error.real**2 + error.imag**2
+        known = np.isfinite(square)
+        squares += np.where(known, 1.0 / ticks * square, 0.0)
+        errors += 1.0 / ticks * known[:, :1]
+        pending[n % ticks] = position + displacement(velocity, turn, ticks * table.tick_s)
+        likelihood = -(USUAL_ERRORS + errors) * np.log(usual + squares)
+        likelihood += advantage
+        weight = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+        weight = weight / weight.sum(axis=1, keepdims=True)
         out.velocity_mps[:, n], out.turn_radps[:, n] = (weight * velocity).sum(axis=1), (weight * turn).sum(axis=1)
         out.constants_s[:, n] = constants[weight.argmax(axis=1)]
     return out
-
-
-def _shares(constants_s: Array, tick_s: float) -> Array:
-    """Weights of the latest value by time constants; 1 for a constant of 0."""
-    rate = np.divide(tick_s, constants_s, out=np.full(len(constants_s), np.inf), where=constants_s > 0)
-    return np.asarray(-np.expm1(-rate))
-
-
-class _Judge:
-    """Weighs constants by predictions whose outcome is known."""
-
-    def __init__(self, agents: int, ticks: int, tick_s: float) -> None:
-        shape = (agents, len(CONSTANTS_S))
-        self._ticks, self._weight = ticks, 1.0 / ticks
-        self._lead_s = ticks * tick_s
-        self._pending = np.full((ticks, *shape), np.nan, dtype=complex)
-        self._before = LATEST_ADVANTAGE * np.array([velocity_s == 0 for velocity_s, _ in CONSTANTS_S])
-        self._squares, self._errors = np.zeros(shape), np.zeros((agents, 1))
-
-    def weigh(self, n: int, position: Complex, fresh: NDArray[np.bool_], velocity: Complex, turn: Array) -> Array:
-        """Return the weights (A, K) of constants at tick `n`, where positions are (A, 1), velocities and turn rates (A, K)."""
-        slot = n % self._ticks
-        self._pending[:, fresh] = np.nan
-        self._squares[fresh] = self._errors[fresh] = 0.0
-        error = position - self._pending[slot]
-        square = error.real**2 + error.imag**2
-        known = np.isfinite(square)
-        self._squares += np.where(known, self._weight * square, 0.0)
-        self._errors += self._weight * known[:, :1]
-        self._pending[slot] = position + displacement(velocity, turn, self._lead_s)
-        usual = USUAL_ERRORS * USUAL_ERROR_M**2
-        likelihood = -(USUAL_ERRORS + self._errors) * np.log(usual + self._squares)
-        likelihood += self._before
-        weight = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
-        return np.asarray(weight / weight.sum(axis=1, keepdims=True))

@@ -1,18 +1,18 @@
-"""Short predictions of every agent at every tick, by several methods, with their spread."""
+"""Short predictions of every agent at every tick, by several methods, with their spread, and how far they are off."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Scenario
+from log2sim.datatypes import CATEGORIES, EGO, GROUP_OF, STANDSTILL_MPS, Scenario
 from log2sim.errors import ConfigError
-from log2sim.files.documents import short_repr
+from log2sim.files.documents import rounded, short_repr
 from log2sim.geometry import Array
 from log2sim.simulation.prediction.motion_table import (
     MIN_COURSE_MPS,
@@ -25,7 +25,126 @@ from log2sim.simulation.prediction.motion_table import (
     table_of,
     turn_rates,
 )
-from log2sim.simulation.prediction.paths import Paths, Seekers, follow, kind_of, locate
+
+Index = NDArray[np.intp]
+
+SPACING_M = 0.5  # of the points of a path: the middle of a chord on a circle of 6 m is 5 mm off
+MAX_ASIDE_M = 1.5  # an agent farther from a path follows another: lanes are 3 m wide or more
+# An agent is on a path when their directions differ by less than 26 degrees; beyond, it leaves or crosses it.
+MIN_COS = 0.9
+TURN_M = 6.0  # directions that differ by a radian count as much as so many meters
+NEIGHBORS = 24  # points that are looked at for each agent: 3 m of its own path, and those of several others
+MAX_BEYOND_M = 2.0  # how far a path is continued straight on
+# Kinds of paths: agents follow their own kind, and riders vehicles too; where riders or people turn off, no vehicle
+# may.
+VEHICLES, RIDERS, WALKERS = range(3)
+
+
+def kind_of(category: str) -> int:
+    """Return whether a category goes as `VEHICLES`, `RIDERS` or `WALKERS` do."""
+    return {"two_wheeler": RIDERS, "pedestrian": WALKERS}.get(GROUP_OF[category], VEHICLES)
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """N points of paths, one path after the other."""
+
+    point_m: Complex  # (N,) m, map frame
+    direction: Complex  # (N,) unit vectors of travel
+    distance_m: Array  # (N,) along the path; of the next path it goes on from the end of the one before: it rises
+    path: NDArray[np.intp]  # (N,)
+    known_s: Array  # (N,) s, when an agent was there; minus infinity on lanes, which are known beforehand
+    agent: NDArray[np.intp]  # (N,) row of the agent that was there; -1 on lanes
+    kind: NDArray[np.intp]  # (N,) who was there, see `kind_of`; `VEHICLES` on lanes
+
+    @classmethod
+    def driven(cls, table: MotionTable, lanes: Sequence[Array] = ()) -> Self:
+        """Collect where agents went, and lanes (K, 2), m, map frame, in their direction of travel."""
+        parts = [
+            (*_resampled(line[:, 0] + 1j * line[:, 1], np.full(len(line), -np.inf)), -1, VEHICLES) for line in lanes
+        ]
+        for k, agent in enumerate(table.agents):
+            there = np.flatnonzero(table.present[k] & (np.abs(table.velocity_mps[k]) > MIN_COURSE_MPS))
+            for run in np.split(there, np.flatnonzero(np.diff(table.piece[k, there])) + 1):
+                if len(run) > 1:
+                    part = _resampled(table.position_m[k, run], table.t_s[run])
+                    parts.append((*part, k, kind_of(agent.category)))
+        parts = [part for part in parts if len(part[0]) > 1]
+        counts = [len(part[0]) for part in parts]
+        # The direction of a point is that of the step to it; of the first, of the step from it.
+        steps = [np.diff(part[0])[np.maximum(np.arange(-1, len(part[0]) - 1), 0)] for part in parts]
+        starts = np.cumsum([0.0, *(part[1][-1] + SPACING_M for part in parts)])
+        return cls(
+            np.concatenate([np.zeros(0, dtype=complex), *(part[0] for part in parts)]),
+            np.concatenate([np.zeros(0, dtype=complex), *(step / np.abs(step) for step in steps)]),
+            np.concatenate([np.zeros(0), *(start + part[1] for start, part in zip(starts, parts))]),
+            np.repeat(np.arange(len(parts)), counts),
+            np.concatenate([np.zeros(0), *(part[2] for part in parts)]),
+            np.repeat(np.array([part[3] for part in parts], dtype=np.intp), counts),
+            np.repeat(np.array([part[4] for part in parts], dtype=np.intp), counts),
+        )
+
+
+def follow(
+    paths: Paths, table: MotionTable, at: tuple[Index, ...], course: Complex, speed_mps: Array, lead_s: Array
+) -> tuple[Complex, Complex]:
+    """Compute positions, m, and courses, (N, H) complex128, of agents along the paths that they are on, after leads (H,), s.
+
+    Each agent, at a row and tick of the table `at` (N,), (N,), follows a path that others of its kind had made by then, or a
+    lane. `course` (N,): unit vectors, NaN where it is unknown. NaN without a path, and beyond where it was known.
+    """
+    from scipy.spatial import cKDTree
+
+    point = np.full((len(course), len(lead_s)), np.nan, dtype=complex)
+    heading, count, asked = point.copy(), min(NEIGHBORS, len(paths.point_m)), np.flatnonzero(np.isfinite(course))
+    if not count or not len(asked):
+        return point, heading
+    agent, t_s = at[0][asked, None], table.t_s[at[1]][asked, None]
+    position, direction = table.position_m[at][asked, None], course[asked, None]
+    tree = cKDTree(_features(paths.point_m, paths.direction))
+    _, near = tree.query(_features(position[:, 0], direction[:, 0]), count, distance_upper_bound=TURN_M)
+    near = near.reshape(-1, count)
+    row = np.minimum(near, len(paths.point_m) - 1)
+    offset = (position - paths.point_m[row]) * paths.direction[row].conj()
+    usable = (near < len(paths.point_m)) & (paths.known_s[row] <= t_s) & (paths.agent[row] != agent)
+    kind = np.array([kind_of(a.category) for a in table.agents], dtype=np.intp)[agent]
+    usable &= (paths.kind[row] == kind) | (paths.kind[row] == VEHICLES) & (kind == RIDERS)
+    usable &= (np.abs(offset.imag) < MAX_ASIDE_M) & (np.abs(offset.real) <= SPACING_M)
+    usable &= (direction * paths.direction[row].conj()).real > MIN_COS
+    pick = np.flatnonzero(usable.any(axis=1)), usable.argmax(axis=1)[usable.any(axis=1)]
+    on, row, offset, t_s = asked[pick[0]], row[pick], offset[pick], t_s[pick[0], 0]
+    # Up to where each path was known at these times.
+    late_s = np.nan_to_num(paths.known_s, neginf=0.0)
+    span, first_s = float(np.ptp(late_s)) + 1.0, late_s.min()
+    key = paths.path * span + np.where(np.isfinite(paths.known_s), paths.known_s - first_s, 0.0)
+    wanted = paths.path[row] * span + np.clip(t_s - first_s, 0.0, span - 0.5)
+    end = paths.distance_m[np.searchsorted(key, wanted, side="right") - 1][:, None]
+    ahead = (paths.distance_m[row] + offset.real)[:, None] + speed_mps[on, None] * lead_s
+    inside = np.clip(ahead, paths.distance_m[row, None], end)
+    way = paths.direction[np.searchsorted(paths.distance_m, inside)]
+    place = np.interp(inside, paths.distance_m, paths.point_m)
+    place = place + way * (1j * offset.imag[:, None] + ahead - inside)
+    known = ahead <= end + MAX_BEYOND_M
+    point[on], heading[on] = np.where(known, place, np.nan), np.where(known, way, np.nan)
+    return point, heading
+
+
+def _features(position_m: Complex, direction: Complex) -> Array:
+    """Coordinates (N, 4), m, whose distances weigh places and directions."""
+    turned = TURN_M * direction
+    return np.column_stack([position_m.real, position_m.imag, turned.real, turned.imag])
+
+
+def _resampled(point_m: Complex, known_s: Array) -> tuple[Complex, Array, Array]:
+    """Points `SPACING_M` apart on a polyline, their distances along it, and when each was reached."""
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(point_m)))])
+    moved = np.concatenate([[True], np.diff(way) > 0])
+    way, point_m, known_s = way[moved], point_m[moved], known_s[moved]
+    at = np.arange(0.0, way[-1], SPACING_M)
+    known_s = known_s[np.minimum(np.searchsorted(way, at), len(way) - 1)]
+    if len(known_s) > 1:
+        known_s[0] = known_s[1]  # its direction is that of the step to the second point
+    return np.interp(at, way, point_m), at, known_s
 
 
 class Restlessness(NamedTuple):
@@ -35,9 +154,8 @@ class Restlessness(NamedTuple):
     across_mps2: float
 
 
+# For how long an acceleration lasts: drivers and pedestrians change what they do after one to three seconds.
 ACCELERATION_S = 2.0
-"""For how long an acceleration lasts: drivers and pedestrians change what they do after one to three seconds."""
-
 MOVING: Mapping[str, Restlessness] = {
     "vehicle": Restlessness(0.8, 0.6), "two_wheeler": Restlessness(0.7, 0.6), "pedestrian": Restlessness(0.35, 0.35),
     "other": Restlessness(0.8, 0.6),
@@ -48,14 +166,10 @@ WAITING: Mapping[str, Restlessness] = {
 }  # fmt: skip
 """Of agents that stand: most stay, some start."""
 
+# Who has stood for as long is half as likely to start at once: the longer agents stand, the longer they go on to stand.
 WAITING_S = 10.0
-"""Who has stood for as long is half as likely to start at once: the longer agents stand, the longer they go on to stand."""
-
-USUAL_SPREAD_ERRORS = 5.0
-"""How many errors of an agent's own past the values above count as."""
-
-MIN_SCALE = 0.1
-"""Of an agent's own variances to the usual ones: what was regular so far can still brake."""
+USUAL_SPREAD_ERRORS = 5.0  # how many errors of an agent's own past the values above count as
+MIN_SCALE = 0.1  # of an agent's own variances to the usual ones: what was regular so far can still brake
 
 
 def drift_variance(lead_s: Array) -> Array:
@@ -77,18 +191,13 @@ def usual_sigma(table: MotionTable, lead_s: Array) -> Array:
     moving, waiting = (
         np.array([kind[g] for g in groups], dtype=np.float64).reshape(-1, 1, 2) for kind in (MOVING, WAITING)
     )
-    stands = speed < STANDSTILL_MPS
-    patience = np.sqrt(WAITING_S / (WAITING_S + _lasting(stands, table) * table.tick_s))
+    stands, ticks = speed < STANDSTILL_MPS, np.arange(speed.shape[1])
+    since = np.maximum.accumulate(np.where(~stands | table.begins, ticks, 0), axis=1)
+    stood_s = np.where(stands, ticks - since, 0) * table.tick_s
+    patience = np.sqrt(WAITING_S / (WAITING_S + stood_s))
     acceleration = np.where(stands[..., None], waiting * patience[..., None], moving)
     variance = drift_variance(lead_s)[:, None] * acceleration[:, :, None] ** 2
     return np.asarray(np.sqrt(table.sigma_m[..., None, None] ** 2 + variance))
-
-
-def _lasting(state: NDArray[np.bool_], table: MotionTable) -> NDArray[np.intp]:
-    """For how many ticks (A, T) a state has lasted; 0 where it is not so."""
-    ticks = np.arange(state.shape[1])
-    since = np.maximum.accumulate(np.where(~state | table.begins, ticks, 0), axis=1)
-    return np.where(state, ticks - since, 0)
 
 
 def own_scale(table: MotionTable, error_m: Complex, course: Complex, sigma_m: Array, ticks: int) -> Array:
@@ -103,18 +212,17 @@ def own_scale(table: MotionTable, error_m: Complex, course: Complex, sigma_m: Ar
     squared = (off.real / sigma_m[..., 0]) ** 2 + (off.imag / sigma_m[..., 1]) ** 2
     moves = np.abs(np.where(table.present, table.velocity_mps, 0.0)) >= STANDSTILL_MPS
     known = np.isfinite(squared) & moves
-    sums = [_known_sums(np.where(known, v, 0.0), table, ticks) / ticks for v in (squared, 2.0)]
+    # Sums within each piece, up to the tick after which each error is known.
+    ticks_on = np.arange(squared.shape[1])
+    start = np.maximum.accumulate(np.where(table.begins, ticks_on, 0), axis=1)
+    sums = []
+    for value in (squared, 2.0):
+        total = np.zeros_like(squared)
+        total[:, ticks:] = np.cumsum(np.where(known, value, 0.0), axis=1)[:, : max(len(ticks_on) - ticks, 0)]
+        sums.append((total - np.take_along_axis(total, start, axis=1)) / ticks)
     usual = 2.0 * USUAL_SPREAD_ERRORS
     scale = np.sqrt(np.maximum((usual + sums[0]) / (usual + sums[1]), MIN_SCALE))
     return np.where(moves, scale, 1.0)
-
-
-def _known_sums(value: Array, table: MotionTable, ticks: int) -> Array:
-    """Sum values (A, T) within each piece, up to the tick after which each is known."""
-    total = np.zeros_like(value)
-    total[:, ticks:] = np.cumsum(value, axis=1)[:, : value.shape[1] - ticks] if ticks < value.shape[1] else 0.0
-    start = np.maximum.accumulate(np.where(table.begins, np.arange(value.shape[1]), 0), axis=1)
-    return np.asarray(total - np.take_along_axis(total, start, axis=1))
 
 
 METHODS: Mapping[str, str] = {
@@ -125,19 +233,14 @@ METHODS: Mapping[str, str] = {
 }
 """Methods of prediction by name, and what each expects an agent to keep."""
 
-DEFAULT_METHOD = "path"
-"""Where no path is known it is `smoothed`, and elsewhere it errs less."""
-
-LEAD_STEP_S = 0.5
-"""Interval of predicted positions: half a second as in nuScenes' prediction task."""
-
-HORIZON_LIMITS_S = (0.1, 10.0)
-"""Within a tick there is nothing to predict; beyond 10 s no agent keeps to what it did."""
+DEFAULT_METHOD = "path"  # where no path is known it is `smoothed`, and elsewhere it errs less
+LEAD_STEP_S = 0.5  # interval of predicted positions: half a second as in nuScenes' prediction task
+HORIZON_LIMITS_S = (0.1, 10.0)  # within a tick there is nothing to predict; beyond 10 s no agent keeps to what it did
 
 
+# Standard deviation of the lateral distance of two agents on one path: drivers keep to a lane within some 0.3 m each.
+# At short leads an agent's own motion tells its place more exactly.
 PATH_SIGMA_M = 0.5
-"""Standard deviation of the lateral distance of two agents on one path: drivers keep to a lane within some 0.3 m each. At short
-leads an agent's own motion tells its place more exactly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,87 +323,163 @@ def predict_table(
     for name in methods:
         if name not in METHODS:
             raise ConfigError(f"method: '{name}' is not known; known: {', '.join(METHODS)}")
-    present = _Present(table, *np.nonzero(table.present))
+    at = row, tick = np.nonzero(table.present)
     smooth = smooth_motion(table)
-    latest, velocity = present.of(table.velocity_mps), present.of(smooth.velocity_mps)
-    motions = {
-        "velocity": (latest, np.zeros(len(latest))),
-        "turn": (latest, present.of(turn_rates(table))),
-        "smoothed": (velocity, present.of(smooth.turn_radps)),
-    }
+    latest, smoothed = table.velocity_mps[at], (smooth.velocity_mps[at], smooth.turn_radps[at])
+    motions = {"velocity": (latest, np.zeros(len(latest))), "turn": (latest, turn_rates(table)[at])}
     # The last lead is that by which the past is judged.
-    leads = np.append(lead_s, PROOF_S)
+    leads, ticks = np.append(lead_s, PROOF_S), round(PROOF_S / table.tick_s)
+    usual, (later, observed) = usual_sigma(table, leads), table.later(ticks)
     known = np.zeros(len(latest), dtype=bool)
     forecasts = {}
     for name in methods:
-        way = _turn_on(present, *motions[name if name in motions else "smoothed"], leads)
-        if name == "path":
-            paths = Paths.driven(table, lanes)
-            way, known = _drawn_to_paths(present, way, np.abs(velocity), paths, leads)
-        forecasts[name] = _with_sigma(present, way, lead_s)
-    return Predictions(table, lead_s, present.row, present.tick, forecasts, present.of(smooth.constants_s), known)
+        velocity, turn = motions.get(name, smoothed)
+        speed, heading = np.abs(velocity), np.exp(1j * table.yaw_rad[at])
+        fast = speed > MIN_COURSE_MPS
+        heading[fast] = velocity[fast] / speed[fast]
+        position = table.position_m[at][:, None] + displacement(velocity[:, None], turn[:, None], leads)
+        course = heading[:, None] * np.exp(1j * turn[:, None] * leads)
+        if name == "path":  # averaged with the way along a path by their variances across
+            seen = np.where(fast, course[:, 0], np.nan)
+            point, direction = follow(Paths.driven(table, lanes), table, at, seen, speed, leads)
+            there, free = np.isfinite(point), usual[at][..., 1] ** 2
+            share = np.where(there, free / (free + PATH_SIGMA_M**2), 0.0)
+            position = position + share * np.where(there, point - position, 0.0)
+            course = course + share * np.where(there, direction - course, 0.0)
+            course, known = course / np.abs(course), np.asarray(there.any(axis=1))
+        error, judged = np.full(later.shape, np.nan, dtype=complex), np.ones(later.shape, dtype=complex)
+        error[at], judged[at] = position[:, -1] - later[at], course[:, -1]
+        scale = own_scale(table, np.where(observed, error, np.nan), judged, usual[:, :, -1], ticks)
+        sigma = usual[at][:, :-1] * scale[at][:, None, None]
+        forecasts[name] = Forecast(position[:, :-1], course[:, :-1], sigma)
+    return Predictions(table, lead_s, row, tick, forecasts, smooth.constants_s[at], known)
 
 
-class _Present(NamedTuple):
-    """Where agents are present in a table: row (N,) and tick (N,)."""
-
-    table: MotionTable
-    row: NDArray[np.intp]
-    tick: NDArray[np.intp]
-
-    def of(self, column: NDArray[Any]) -> NDArray[Any]:
-        """Take the values (N, ...) of a column (A, T, ...)."""
-        return column[self.row, self.tick]
+MOTIONS = ("moving", "standing")  # whether an agent is faster than `STANDSTILL_MPS` when it is predicted
+CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 
 
-class _Way(NamedTuple):
-    """Predicted positions and courses (N, H)."""
+def measure_predictions(predictions: Predictions) -> list[dict[str, Any]]:
+    """Return the `figures` of a document of `schemas/prediction-1.json`, by kind of agent and motion.
 
-    position_m: Complex
-    course: Complex
+    Compared with the trajectories of their agents are ticks at which an agent was observed, with positions at which it was
+    observed too. Agents that the scenario says never move are left out: it keeps one pose for each, so that nothing can be off.
+    ADE is the mean distance over all leads up to one, FDE the distance at it (Pellegrini et al., ICCV 2009). NEES is the mean
+    squared error over the squared sigma for each axis, 1 when sigmas are honest.
+    """
+    table, row, tick = predictions.table, predictions.row, predictions.tick
+    # Where agents were (N, H) at the predicted times, and whether they were observed then and at the prediction.
+    truth = np.full((len(row), len(predictions.lead_s)), np.nan, dtype=complex)
+    seen = np.zeros(truth.shape, dtype=bool)
+    for h, lead in enumerate(predictions.lead_s):
+        position, observed = table.later(round(lead / table.tick_s))
+        truth[:, h], seen[:, h] = position[row, tick], observed[row, tick]
+    category = np.array([a.category for a in table.agents], dtype=object)[row]
+    is_ego = np.array([a.id == EGO for a in table.agents], dtype=bool)[row]
+    mobile = ~np.array([a.static for a in table.agents], dtype=bool)[row]
+    moving = np.abs(table.velocity_mps[row, tick]) >= STANDSTILL_MPS
+    kinds: list[tuple[str, Any]] = [("all", ~is_ego), *((c, ~is_ego & (category == c)) for c in CATEGORIES)]
+    out = []
+    for name, chosen in [*kinds, ("ego", is_ego), ("on a path", predictions.on_path)]:
+        for motion, there in zip(MOTIONS, (moving, ~moving)):
+            rows, methods = np.flatnonzero(chosen & mobile & there), {}
+            for method, forecast in predictions.forecasts.items():
+                error = (truth[rows] - forecast.position_m[rows]) * forecast.course[rows].conj()
+                figures = _figures(predictions, error, forecast, rows, seen[rows])
+                if figures:
+                    methods[method] = figures
+            if methods:
+                out.append({"agents": name, "motion": motion, "methods": methods})
+    return out
 
 
-def _turn_on(present: _Present, velocity: Complex, turn: Array, lead_s: Array) -> _Way:
-    """Move on with velocities (N,) that turn at rates (N,)."""
-    speed = np.abs(velocity)
-    course = np.exp(1j * present.of(present.table.yaw_rad))
-    fast = speed > MIN_COURSE_MPS
-    course[fast] = velocity[fast] / speed[fast]
-    position = present.of(present.table.position_m)[:, None] + displacement(velocity[:, None], turn[:, None], lead_s)
-    return _Way(position, course[:, None] * np.exp(1j * turn[:, None] * lead_s))
+def _figures(
+    predictions: Predictions,
+    error: NDArray[np.complex128],
+    forecast: Forecast,
+    rows: NDArray[np.intp],
+    seen: NDArray[np.bool_],
+) -> list[dict[str, Any]]:
+    """Compute the figures of errors (K, H) in the frames of the predicted courses; one entry for each lead with any."""
+    out = []
+    distance, lead_s = np.abs(error), predictions.lead_s
+    whole = np.isclose(lead_s, np.rint(lead_s)) | (np.arange(len(lead_s)) == len(lead_s) - 1)
+    for h in np.flatnonzero(whole).tolist():  # whole seconds and the horizon
+        there = seen[:, h]
+        if not there.any():
+            continue
+        sigma = forecast.sigma_m[rows[there], h]
+        off = np.stack([error[there, h].real, error[there, h].imag], axis=-1)
+        known = (sigma > 0).all(axis=1)
+        squared = ((off[known] / sigma[known]) ** 2).sum(axis=1)
+        upto = seen[there, : h + 1]
+        ade_m, fde_m = distance[there, : h + 1][upto].mean(), distance[there, h].mean()
+        nees, within = (squared.mean() / 2, (squared < CHI2_95).mean()) if known.any() else (None, None)
+        agents = len(np.unique(predictions.row[rows[there]]))
+        figures = {"ade_m": ade_m, "fde_m": fde_m, "nees": nees, "within_95": within}
+        out.append({
+            "lead_s": round(float(lead_s[h]), 3), "ticks": int(there.sum()), "agents": agents,
+            **{key: None if value is None else rounded(float(value), 4) for key, value in figures.items()},
+        })  # fmt: skip
+    return out
 
 
-def _drawn_to_paths(
-    present: _Present, way: _Way, speed_mps: Array, paths: Paths, lead_s: Array
-) -> tuple[_Way, NDArray[np.bool_]]:
-    """Average a way with that along a path by their variances across; and tell where a path is known (N,)."""
-    table = present.table
-    kinds = np.array([kind_of(a.category) for a in table.agents], dtype=np.intp)
-    seekers = Seekers(
-        present.of(table.position_m),
-        np.where(speed_mps > MIN_COURSE_MPS, way.course[:, 0], np.nan),
-        table.t_s[present.tick],
-        present.row,
-        kinds[present.row],
+VERSION = 1
+
+_DIGITS = 3
+
+
+def prediction_document(
+    scenario: Scenario, predictions: Predictions, *, with_positions: bool = False
+) -> dict[str, Any]:
+    """Return the document of `schemas/prediction-1.json`; the predicted positions only where asked for."""
+    table, agents, positions = predictions.table, [], []
+    for agent in table.agents:
+        rows = predictions.rows_of(agent.id)
+        # The time constants that its whole past chose; null without predictions, or for infinity.
+        chosen = predictions.constants_s[rows[-1]] if len(rows) else np.full(2, np.inf)
+        velocity_s, turn_s = (float(c) if np.isfinite(c) else None for c in chosen)
+        agents.append({
+            "id": agent.id, "category": agent.category, "ticks": len(rows), "velocity_constant_s": velocity_s,
+            "turn_constant_s": turn_s,
+        })  # fmt: skip
+        methods = {}
+        for name, forecast in predictions.forecasts.items() if with_positions else ():  # a row a tick, a column a lead
+            position, sigma = forecast.position_m[rows], forecast.sigma_m[rows]
+            columns = {
+                "x_m": position.real, "y_m": position.imag, "course_rad": np.angle(forecast.course[rows]),
+                "sigma_along_m": sigma[:, :, 0], "sigma_across_m": sigma[:, :, 1],
+            }  # fmt: skip
+            methods[name] = {key: np.round(values, _DIGITS).tolist() for key, values in columns.items()}
+        t_s = np.round(table.t_s[predictions.tick[rows]], _DIGITS).tolist()
+        positions.append({"id": agent.id, "t_s": t_s, "methods": methods})
+    document = {
+        "prediction_version": VERSION, "scenario": scenario.name, "scenario_sha256": scenario.digest,
+        "tick_s": table.tick_s, "lead_s": [round(float(lead), _DIGITS) for lead in predictions.lead_s],
+        "methods": {name: METHODS[name] for name in predictions.forecasts}, "agents": agents,
+        "figures": measure_predictions(predictions),
+    }  # fmt: skip
+    return {**document, "predictions": positions} if with_positions else document
+
+
+def format_figures(document: dict[str, Any]) -> str:
+    """Format the figures of a document: a line for each kind of agent, motion and method."""
+    lead_s = sorted({f["lead_s"] for entry in document["figures"] for m in entry["methods"].values() for f in m})
+    if not lead_s:
+        return "nothing to compare with: no agent is observed for a second or longer"
+    heads = [f"{name} {lead:g} s" for name in ("ADE", "FDE") for lead in lead_s]
+    cells = [["errors in m", "method", *heads, "NEES", "in 95 %", "ticks"]]
+    for entry in document["figures"]:
+        name = f"{entry['agents']}, {entry['motion']}"
+        for method, figures in entry["methods"].items():
+            at = {f["lead_s"]: f for f in figures}
+            errors = [f"{at[s][key]:.2f}" if s in at else "-" for key in ("ade_m", "fde_m") for s in lead_s]
+            last = figures[-1]
+            honest = ["-" if last[key] is None else f"{last[key]:.2f}" for key in ("nees", "within_95")]
+            cells.append([name, method, *errors, *honest, str(last["ticks"])])
+            name = ""
+    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
+    return "\n".join(
+        "  ".join([*(c.ljust(w) for c, w in zip(row[:2], widths)), *(c.rjust(w) for c, w in zip(row[2:], widths[2:]))])
+        for row in cells
     )
-    point, heading = follow(paths, locate(paths, seekers), speed_mps, lead_s)
-    known = np.isfinite(point)
-    free_variance = present.of(usual_sigma(table, lead_s))[..., 1] ** 2
-    share = np.where(known, free_variance / (free_variance + PATH_SIGMA_M**2), 0.0)
-    position = way.position_m + share * np.where(known, point - way.position_m, 0.0)
-    course = way.course + share * np.where(known, heading - way.course, 0.0)
-    return _Way(position, course / np.abs(course)), np.asarray(known.any(axis=1))
-
-
-def _with_sigma(present: _Present, way: _Way, lead_s: Array) -> Forecast:
-    """Add standard deviations to a way whose last lead is `PROOF_S`."""
-    table, shape = present.table, present.table.position_m.shape
-    ticks = round(PROOF_S / table.tick_s)
-    usual = usual_sigma(table, np.append(lead_s, PROOF_S))
-    later, observed = table.later(ticks)
-    error, course = np.full(shape, np.nan, dtype=complex), np.ones(shape, dtype=complex)
-    error[present.row, present.tick] = way.position_m[:, -1] - present.of(later)
-    course[present.row, present.tick] = way.course[:, -1]
-    scale = own_scale(table, np.where(observed, error, np.nan), course, usual[:, :, -1], ticks)
-    sigma = present.of(usual)[:, :-1] * present.of(scale)[:, None, None]
-    return Forecast(way.position_m[:, :-1], way.course[:, :-1], sigma)
