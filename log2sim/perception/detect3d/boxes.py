@@ -171,12 +171,7 @@ def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: 
     offset = np.clip(box[:2].T, -MAX_OFFSET_M, MAX_OFFSET_M)
     height = np.clip(box[2:3].T, MIN_CENTER_HEIGHT_M, MAX_CENTER_HEIGHT_M)
     size = np.exp(np.clip(box[3:6].T, np.log(MIN_SIDE_M), np.log(MAX_SIDE_M)))
-    # Sine and cosine of twice the yaw do not tell front from back. The direction is averaged over what the yaw may be: 2 p - 1
-    # times the unit vector where the front is there with probability p.
-    (axis_y, axis_x), (ahead_y, ahead_x) = values[channels.axis], values[channels.direction]
-    yaw = np.arctan2(axis_y, axis_x) / 2
-    along = ahead_y * np.sin(yaw) + ahead_x * np.cos(yaw)
-    yaw = np.asarray(wrap_angle(np.where(along < 0, yaw + np.pi, yaw)), dtype=np.float64)
+    yaw, heading_score = headings(values[channels.axis], values[channels.direction])
     # The most probable category within the group.
     category, places = np.empty(len(group), dtype="<U16"), channels.category
     for k, name in enumerate(info.groups):
@@ -186,7 +181,7 @@ def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: 
         np.concatenate([cells.middle_m + offset, height], axis=1),
         size,
         yaw,
-        (1 + np.minimum(np.abs(along), 1.0)) / 2,
+        heading_score,
         group,
         category,
         np.clip(heat, -MAX_LOGIT, MAX_LOGIT),
@@ -194,6 +189,21 @@ def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: 
     )
     columns = [found.center_m.T, found.size_m.T, found.yaw_rad, found.heading_score, found.heat, found.quality]
     return found.take(np.flatnonzero(np.isfinite(np.vstack(columns)).all(axis=0)))
+
+
+def headings(axis: Array, direction: Array) -> tuple[Array, Array]:
+    """Compute yaw over the full circle from its axis and its direction.
+
+    `axis`: (2, K): sine and cosine of twice the yaw, which do not tell front from back. `direction`: (2, K): sine and
+    cosine of the yaw, averaged over what the yaw may be: 2 p - 1 times the unit vector where the front is there with
+    probability p.
+
+    Returns `yaw_rad`: (K,); `heading_score`: (K,): probability in [0.5, 1] that front and back are not swapped.
+    """
+    yaw = np.arctan2(axis[0], axis[1]) / 2
+    along = direction[0] * np.sin(yaw) + direction[1] * np.cos(yaw)
+    turned = np.asarray(wrap_angle(np.where(along < 0, yaw + np.pi, yaw)), dtype=np.float64)
+    return turned, (1 + np.minimum(np.abs(along), 1.0)) / 2
 
 
 def sigmoid(logit: Array) -> Array:
