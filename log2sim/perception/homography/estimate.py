@@ -79,7 +79,7 @@ def estimate_homography(
     "time-aware" draws one half of its samples from single frames, where correspondences share the camera's momentary
     pose, and one half from all frames. It scores each hypothesis over all frames and obstacles with a bounded loss of
     the whitened error, and refines the best over all of its inliers. "calibrated" does the same over the six parameters
-    of the pose of a camera with known intrinsics. The others are baselines, see `baselines`.
+    of the pose of a camera with known intrinsics. The others are baselines, see `correspondences`.
     """
     options = options or EstimationOptions()
     method, of_stream = options.method, options.method in STREAM_METHODS

@@ -114,12 +114,12 @@ def measure(
         edges = np.cumsum([len(part.xyz) for part in sweep.views])[:-1]
         owned = {id(part): of_part for part, of_part in zip(sweep.views, np.split(mask, edges))}
     free = {}
-    for cloud in {id(cloud): cloud for _, _, cloud in frames if cloud is not None}.values():
-        free[id(cloud)] = cloud.obstacles, cloud.obstacle_columns
-        if any(id(part) in owned for part in cloud.views):
-            masks = [owned.get(id(part), np.zeros(len(part.xyz), dtype=bool)) for part in cloud.views]
-            left = ~np.concatenate(masks)[cloud.obstacles]
-            free[id(cloud)] = cloud.obstacles[left], cloud.obstacle_columns.compress(left, axis=1)
+    for one in {id(cloud): cloud for _, _, cloud in frames if cloud is not None}.values():
+        free[id(one)] = one.obstacles, one.obstacle_columns
+        if any(id(part) in owned for part in one.views):
+            masks = [owned.get(id(part), np.zeros(len(part.xyz), dtype=bool)) for part in one.views]
+            left = ~np.concatenate(masks)[one.obstacles]
+            free[id(one)] = one.obstacles[left], one.obstacle_columns.compress(left, axis=1)
     shown = list[tuple[Shown, Index, Array]]()
     for k, (view, detections, cloud) in enumerate(frames):
         of_frame = np.flatnonzero(frame == k)
