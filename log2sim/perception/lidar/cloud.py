@@ -214,9 +214,9 @@ class AzimuthIndex:
         some = np.flatnonzero((np.arange(len(row)) - start[group]) % -(-count // MAX_FACE_POINTS)[group] == 0)
         unit, sides = _directions(), end.size
         corner, xy = (self.range_m[of][..., None] * unit[self.azimuth[of]] for of in (row[end], row[some]))
-        near = [np.flatnonzero(((xy - corner[group[some], side]) ** 2).sum(axis=1) < FACE_M**2) for side in range(2)]
-        of = np.concatenate([2 * group[some[point]] + side for side, point in enumerate(near)])
-        x, y = xy[np.concatenate(near)].T
+        at_end = [np.flatnonzero(((xy - corner[group[some], side]) ** 2).sum(axis=1) < FACE_M**2) for side in range(2)]
+        of = np.concatenate([2 * group[some[point]] + side for side, point in enumerate(at_end)])
+        x, y = xy[np.concatenate(at_end)].T
         shown = np.maximum(np.bincount(of, minlength=sides), 1)
         center_x, center_y = np.bincount(of, x, sides) / shown, np.bincount(of, y, sides) / shown
         x, y = x - center_x[of], y - center_y[of]
