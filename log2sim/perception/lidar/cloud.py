@@ -220,7 +220,7 @@ class AzimuthIndex:
         shown = np.maximum(np.bincount(of, minlength=sides), 1)
         center_x, center_y = np.bincount(of, x, sides) / shown, np.bincount(of, y, sides) / shown
         x, y = x - center_x[of], y - center_y[of]
-        xx, cross, yy = (np.bincount(of, product, sides) for product in (x * x, x * y, y * y))
+        xx, cross, yy = (np.bincount(of, a * b, sides) for a, b in ((x, x), (x, y), (y, y)))
         # Eigenvalues and first eigenvector of a symmetric matrix of two rows: the face that ends there, unless it is a corner.
         mean, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, cross)
         is_face = (shown > 2) & (mean - radius <= MAX_FLATNESS * (mean + radius))
