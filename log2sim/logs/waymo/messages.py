@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from log2sim.geometry import Array
-from log2sim.logs.waymo.segment import MAX_BEAMS, CameraCalibration, ImageTimes, LaserCalibration, are_usable, rigid
+from log2sim.logs.waymo.segment import MAX_BEAMS, CameraCalibration, ImageTimes, LaserCalibration, rigid
 from log2sim.logs.waymo.tfrecord import RecordWindow
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
@@ -57,25 +57,22 @@ def fields(peek: Callable[[int, int], bytes], begin: int, end: int) -> Iterator[
     while begin < end:
         head = peek(begin, min(2 * MAX_VARINT_BYTES, end - begin))
         key, used = _varint(head, 0)
-        number, kind = key >> 3, key & 7
-        value = 0
+        number, kind, value, size = key >> 3, key & 7, 0, 0
         if kind == VARINT:
             value, used = _varint(head, used)
-            stop = begin + used
         elif kind == BYTES:
             size, used = _varint(head, used)
-            stop = begin + used + size
         elif kind in (FIXED64, FIXED32):
-            width = 8 if kind == FIXED64 else 4
-            value = int.from_bytes(head[used : used + width], "little")
-            stop = begin + used + width
+            size = 8 if kind == FIXED64 else 4
+            value = int.from_bytes(head[used : used + size], "little")
         else:
             raise WireError(f"field {number} is of wire type {kind}")
+        stop = begin + used + size
+        if stop > end:
+            raise WireError(f"field {number} ends {stop - end} bytes beyond its message")
         count += 1
-        if stop > end or count > MAX_FIELDS:
-            raise WireError(
-                f"field {number} ends {stop - end} bytes beyond its message" if stop > end else "too many fields"
-            )
+        if count > MAX_FIELDS:
+            raise WireError("too many fields")
         yield Field(number, kind, value, begin + used, stop)
         begin = stop
 
@@ -152,9 +149,8 @@ class FrameIndex:
 
     context: Span = (0, 0)
     stamp_us: int | None = None
-    pose: Array | None = None  # (4, 4) float64 or None
-    # Dict of camera number to (ImageTimes, Span of the JPEG)
-    images: dict[int, tuple[ImageTimes, Span]] = field(default_factory=dict)
+    pose: Array | None = None  # (4, 4)
+    images: dict[int, tuple[ImageTimes, Span]] = field(default_factory=dict)  # by camera, with the span of the JPEG
     lasers: dict[int, Span] = field(default_factory=dict)  # only those with a range image
     labels: list[Span] = field(default_factory=list)
     camera_labels: list[Span] = field(default_factory=list)
@@ -177,40 +173,27 @@ def read_index(window: RecordWindow) -> FrameIndex:
         elif f.number == 3:
             index.pose = _transform(take_index(window, span))
         elif f.number == 4:
-            _add_image(window, span, index)
+            number, jpeg, pose, times = 0, (0, 0), None, {5: 0.0, 6: 0.0, 7: 0.0, 8: 0.0}
+            for g in fields(window.peek, *span):
+                if g.number == 1:
+                    number = g.value
+                elif g.number == 2:
+                    jpeg = g.begin, g.end
+                elif g.number == 3 and g.kind == BYTES:
+                    pose = _transform(take_index(window, (g.begin, g.end)))
+                elif g.number in times:
+                    times[g.number] = g.real()
+            if jpeg[1] > jpeg[0]:
+                index.images[number] = ImageTimes(pose, *times.values()), jpeg
         elif f.number == 5:
-            _add_laser(window, span, index)
+            parts = list(fields(window.peek, *span))
+            if any(g.number in (2, 3) and g.end > g.begin for g in parts):
+                index.lasers[next((g.value for g in reversed(parts) if g.number == 1), 0)] = span
         elif f.number in spans:
             spans[f.number].append(span)
         elif f.number == 7:
             index.no_label_zones += 1
     return index
-
-
-def _add_image(window: RecordWindow, span: Span, index: FrameIndex) -> None:
-    number, jpeg, pose, times = 0, (0, 0), None, {5: 0.0, 6: 0.0, 7: 0.0, 8: 0.0}
-    for f in fields(window.peek, *span):
-        if f.number == 1:
-            number = f.value
-        elif f.number == 2:
-            jpeg = f.begin, f.end
-        elif f.number == 3 and f.kind == BYTES:
-            pose = _transform(take_index(window, (f.begin, f.end)))
-        elif f.number in times:
-            times[f.number] = f.real()
-    if jpeg[1] > jpeg[0]:
-        index.images[number] = ImageTimes(pose, *times.values()), jpeg
-
-
-def _add_laser(window: RecordWindow, span: Span, index: FrameIndex) -> None:
-    number, filled = 0, False
-    for f in fields(window.peek, *span):
-        if f.number == 1:
-            number = f.value
-        elif f.number in (2, 3):
-            filled |= f.end > f.begin
-    if filled:
-        index.lasers[number] = span
 
 
 def segment_name(window: RecordWindow, span: Span) -> str:
@@ -231,40 +214,28 @@ def read_calibration(
         if f.kind != BYTES:
             continue
         data = context[f.begin : f.end]
-        if f.number == 2:
-            number, cameras[number] = _camera(data)
-        elif f.number == 3:
-            number, lasers[number] = _laser(data)
-        elif f.number == 4:
+        if f.number == 4:
             names = {2: "time_of_day", 3: "location", 4: "weather"}
             stats = {names[s.number]: text(data, s) for s in fields_of(data) if s.number in names}
+        if f.number not in (2, 3):
+            continue
+        found = _by_number(data)
+        number, numbers = _whole(found, 1), doubles(data, found.get(2, []))
+        extrinsic = _submessage(data, found, 3 if f.number == 2 else 5)
+        pose = None if extrinsic is None else _transform(extrinsic)
+        if f.number == 2:
+            sizes = (_whole(found, key) for key in (4, 5, 6))
+            camera = None if pose is None else CameraCalibration(numbers, pose, *sizes)
+            if camera is None or not camera.is_usable:
+                expected = "expected 9 finite intrinsics, a rigid extrinsic, width and height"
+                raise WireError(f"calibration of camera {number}: {expected}")
+            cameras[number] = camera
+        else:
+            low, high = (found[k][-1].real() if k in found else 0.0 for k in (3, 4))
+            if pose is None or len(numbers) > MAX_BEAMS or not np.isfinite([*numbers, low, high]).all():
+                raise WireError(f"calibration of LiDAR {number}: expected a rigid extrinsic and finite inclinations")
+            lasers[number] = LaserCalibration(pose, numbers, (low, high))
     return cameras, lasers, stats
-
-
-def _camera(data: bytes) -> tuple[int, CameraCalibration]:
-    found = _by_number(data)
-    number = _whole(found, 1)
-    intrinsic = doubles(data, found.get(2, []))
-    extrinsic = _submessage(data, found, 3)
-    pose = None if extrinsic is None else _transform(extrinsic)
-    width, height = _whole(found, 4), _whole(found, 5)
-    if pose is None or not are_usable(intrinsic, width, height):
-        raise WireError(
-            f"calibration of camera {number}: expected 9 finite intrinsics, a rigid extrinsic, width and height"
-        )
-    return number, CameraCalibration(intrinsic, pose, width, height, _whole(found, 6))
-
-
-def _laser(data: bytes) -> tuple[int, LaserCalibration]:
-    found = _by_number(data)
-    number = _whole(found, 1)
-    beams = doubles(data, found.get(2, []))
-    limits = tuple(found[k][-1].real() if k in found else 0.0 for k in (3, 4))
-    extrinsic = _submessage(data, found, 5)
-    pose = None if extrinsic is None else _transform(extrinsic)
-    if pose is None or len(beams) > MAX_BEAMS or not np.isfinite([*beams, *limits]).all():
-        raise WireError(f"calibration of LiDAR {number}: expected a rigid extrinsic and finite inclinations")
-    return number, LaserCalibration(pose, beams, (limits[0], limits[1]))
 
 
 def read_box(data: bytes, dimensions: int) -> tuple[str, int, list[float]] | None:

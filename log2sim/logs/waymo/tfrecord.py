@@ -105,14 +105,18 @@ def starts_like_tfrecord(path: Path) -> bool:
 class RecordFile:
     """The records of a TFRecord file.
 
-    `spans` list of (int, int): offset and size of the data of each record. `notes`: what was left out.
+    `spans`: offset and size of the data of each record. `notes`: what was left out.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.notes = path, list[str]()
-        self.spans = list(self._walk())
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._lock = Lock()
+        try:
+            with open_regular(path, buffering=0) as file:
+                self.spans = self._find_spans(file, file.seek(0, SEEK_END))
+        except OSError as error:
+            raise LogError(f"{path}: cannot be read: {error.strerror}") from None
 
     def read(self, k: int, what: str) -> bytes:
         """Return the data of record `k`, checked; `what` names it in `RecordError`, if its CRC is wrong or the file became shorter."""
@@ -131,10 +135,8 @@ class RecordFile:
                 raise RecordError(f"{self.path} ({what}): truncated, expected {size} bytes at offset {begin}")
             stored, computed = struct.unpack("<I", footer)[0], masked_crc32c(data)
             if stored != computed:
-                raise RecordError(
-                    f"{self.path} ({what}): damaged: the CRC of its {size} bytes at offset {begin} is {computed:#010x}, the file says "
-                    f"{stored:#010x}"
-                )
+                crc = f"the CRC of its {size} bytes at offset {begin} is {computed:#010x}, the file says {stored:#010x}"
+                raise RecordError(f"{self.path} ({what}): damaged: {crc}")
             self._kept[k] = data
             if len(self._kept) > MAX_KEPT_RECORDS:
                 self._kept.popitem(last=False)
@@ -144,36 +146,29 @@ class RecordFile:
         """Open record `k` to read parts of it, without its CRC; to be closed."""
         return RecordWindow(self.path, *self.spans[k])
 
-    def _walk(self) -> list[tuple[int, int]]:
+    def _find_spans(self, file: BinaryIO, total: int) -> list[tuple[int, int]]:
         """Find offset and size of the data of all whole records by their lengths."""
-        try:
-            with open_regular(self.path, buffering=0) as file:
-                return self._spans(file, file.seek(0, SEEK_END))
-        except OSError as error:
-            raise LogError(f"{self.path}: cannot be read: {error.strerror}") from None
-
-    def _spans(self, file: BinaryIO, total: int) -> list[tuple[int, int]]:
         spans: list[tuple[int, int]] = []
         offset = number = 0
         while offset < total:
             header = read_at(file, offset, HEADER_BYTES)
             size, where = _length_of(header), f"{self.path}: record {number} at offset {offset}"
+            end = offset + HEADER_BYTES + int.from_bytes(header[:8], "little") + FOOTER_BYTES
             if len(header) == HEADER_BYTES and size is None:
-                end = offset + HEADER_BYTES + int.from_bytes(header[:8], "little") + FOOTER_BYTES
                 # A length with a wrong CRC that leads to the next record or to the end of the file is right all the same.
-                if end != total and (end > total or _length_of(read_at(file, end, HEADER_BYTES)) is None):
-                    if not spans:
-                        raise LogError(f"{where}: the CRC of its length is wrong; expected a TFRecord file")
-                    self.notes.append(f"{where}: the CRC of its length is wrong: it and what follows are left out")
+                leads_on = end == total or (end < total and _length_of(read_at(file, end, HEADER_BYTES)) is not None)
+                if not leads_on and not spans:
+                    raise LogError(f"{where}: the CRC of its length is wrong; expected a TFRecord file")
+                others = "" if leads_on else ": it and what follows are"
+                self.notes.append(f"{where}: the CRC of its length is wrong{others or ';'} left out")
+                if not leads_on:
                     break
-                self.notes.append(f"{where}: the CRC of its length is wrong; left out")
-            elif size is None or offset + HEADER_BYTES + size + FOOTER_BYTES > total:
+            elif size is None or end > total:
                 self.notes.append(f"{where} is truncated: the file ends {total - offset} bytes behind it; left out")
                 break
             elif size > MAX_RECORD_BYTES:
                 raise LogError(f"{where}: {size} bytes, more than the {MAX_RECORD_BYTES} that it may have")
             else:
-                end = offset + HEADER_BYTES + size + FOOTER_BYTES
                 spans.append((offset + HEADER_BYTES, size))
             offset, number = end, number + 1
             if number > MAX_RECORDS:
