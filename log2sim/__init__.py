@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from log2sim.export.openscenario.read import load as import_scenario
     from log2sim.logs.excerpt import summarize as summarize_log
     from log2sim.logs.native.writer import write_log
-    from log2sim.logs.opening import open_log
-    from log2sim.logs.validation import validate_log
+    from log2sim.logs.opening import open_log, validate_log
     from log2sim.pipeline import reconstruct
     from log2sim.resim.simulate import resimulate
     from log2sim.road.builder import map_ground
@@ -64,7 +63,7 @@ _PLACES = {
     "show_progress": "log2sim.visualization.progress:show_progress",
     "summarize_log": "log2sim.logs.excerpt:summarize",
     "tag_scenario": "log2sim.scenarios.tagging:tag",
-    "validate_log": "log2sim.logs.validation:validate_log",
+    "validate_log": "log2sim.logs.opening:validate_log",
     "view": "log2sim.visualization.page.writer:write_page",
     "write_log": "log2sim.logs.native.writer:write_log",
     "write_synthetic": "log2sim.synth.synthesis:write_synthetic",

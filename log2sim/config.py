@@ -307,10 +307,7 @@ class Config(Section):
     def from_dict(cls, document: Mapping[str, Any]) -> Config:
         """Build settings from a document such as `to_dict` returns and the provenance of a scenario holds; what it lacks has its default.
 
-        Raises
-        ------
-        ConfigError
-            When it is no table, for an unknown key or a value out of its range.
+        Raises `ConfigError` when it is no table, for an unknown key or a value out of its range.
         """
         if not isinstance(document, Mapping):
             raise ConfigError(f"settings: {type(document).__name__}, expected a table of settings")
@@ -320,23 +317,16 @@ class Config(Section):
     def load(cls, path: Path | str | None = None, settings: Iterable[str] = (), **overrides: Any) -> Config:
         """Read settings: defaults, then a TOML file, then `section.key=value`, then overrides that are not None.
 
-        Parameters
-        ----------
-        path : path, optional
-            TOML file.
-        settings : iterable of str
-            Entries such as "track.max_gap_s=2".
-        **overrides
-            Settings by name; a section as a document or as its model.
-
-        Raises
-        ------
-        ConfigError
-            For an unreadable file, an unknown key (naming the nearest known one) or a value out of its range.
+        `settings`: entries such as "track.max_gap_s=2". `overrides`: settings by name; a section as a document or as its model.
+        Raises `ConfigError` for an unreadable file, an unknown key (naming the nearest known one) or a value out of its range.
         """
         config = cls()
         if path is not None:
-            config = _merged(config, _read_toml(Path(path)), str(path))
+            text = read_text(path, CONFIG_LIMIT_BYTES, ConfigError, missing="no such config file")
+            try:
+                config = _merged(config, tomllib.loads(text), str(path))
+            except (tomllib.TOMLDecodeError, RecursionError) as problem:
+                raise ConfigError(f"{path}: not valid TOML: {problem}") from None
         for entry in settings:
             key, equals, text = entry.partition("=")
             if not equals:
@@ -348,13 +338,7 @@ class Config(Section):
         return _merged(config, {k: v for k, v in overrides.items() if v is not None}, "options")
 
     def changed(self, **changes: Any) -> Config:
-        """Return a checked copy with some settings changed; a section takes a document of its changes.
-
-        Raises
-        ------
-        ConfigError
-            For an unknown key or a value out of its range.
-        """
+        """Return a copy with some settings changed, `ConfigError` as for `load`; a section takes a document of its changes."""
         return _merged(self, changes, "changes")
 
     def to_dict(self) -> dict[str, Any]:
@@ -394,42 +378,24 @@ def _deep_merged(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dic
     return merged
 
 
-def _schema_of(section: type[Section], key: str) -> dict[str, Any]:
-    """Return the JSON Schema of one setting, of its value where it may be absent."""
-    schema: dict[str, Any] = section.model_json_schema()["properties"][key]
-    return {**schema, **schema.get("anyOf", [{}])[0]}
-
-
 def _toml_lines(section: Section, keys: Iterable[str], *, comments: bool) -> list[str]:
-    lines = []
+    """Write settings, with comments each after its meaning and, in brackets, its type or choices, unit, limits and default."""
+    lines, schemas = [], type(section).model_json_schema()["properties"]
     for key in keys:
         value = getattr(section, key)
         if comments:
-            lines.append(_comment(_schema_of(type(section), key)))
+            schema = {**schemas[key], **schemas[key].get("anyOf", [{}])[0]}
+            facts = [" | ".join(schema["enum"]) if "enum" in schema else KINDS[schema["type"]]]
+            facts += [f"unit {schema['unit']}"] if "unit" in schema else []
+            facts += [f"from {schema['minimum']:.10g} to {schema['maximum']:.10g}"] if "minimum" in schema else []
+            default = schema["default"]
+            facts.append("not set by default" if default is None else f"default {_toml_value(default)}")
+            lines.append(f"# {schema['description']} [{', '.join(facts)}]")
         if value is not None:
             lines.append(f"{key} = {_toml_value(value)}")
         elif comments:
             lines.append(f"# {key} = ")
     return lines
-
-
-def _comment(schema: Mapping[str, Any]) -> str:
-    """Return a setting's meaning and, in brackets, its type or choices, unit, limits and default, as a TOML comment."""
-    facts = [" | ".join(schema["enum"]) if "enum" in schema else KINDS[schema["type"]]]
-    if "unit" in schema:
-        facts.append(f"unit {schema['unit']}")
-    if "minimum" in schema:
-        facts.append(f"from {schema['minimum']:.10g} to {schema['maximum']:.10g}")
-    facts.append("not set by default" if schema["default"] is None else f"default {_toml_value(schema['default'])}")
-    return f"# {schema['description']} [{', '.join(facts)}]"
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    text = read_text(path, CONFIG_LIMIT_BYTES, ConfigError, missing="no such config file")
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as problem:
-        raise ConfigError(f"{path}: not valid TOML: {problem}") from None
 
 
 def _parse_value(text: str) -> Any:

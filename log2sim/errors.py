@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 
 class Log2SimError(Exception):
@@ -70,44 +69,27 @@ class LogsFailed(Log2SimError):
 
 
 def install_command(extra: str) -> str:
-    """Return the pip command that adds an extra to this installation.
+    """Return the pip command that adds an extra of log2sim, such as "coco", to this installation.
 
-    Parameters
-    ----------
-    extra : str
-        Name of an extra of log2sim, for instance ``"coco"``.
-
-    Returns
-    -------
-    str
-        A line for the shell. It names the checkout where log2sim runs from one or was installed from one, the repository
-        or archive where it was installed from that, and the package index otherwise.
-
-    Notes
-    -----
-    pip records the origin of an installation in ``direct_url.json`` (PEP 610); a package from an index has no such file.
+    It names the checkout where log2sim runs from one or was installed from one, the repository or archive where it was installed
+    from that, and the package index otherwise: pip records the origin of an installation in `direct_url.json` (PEP 610); a package
+    from an index has no such file.
     """
     checkout = Path(__file__).resolve().parents[1]
     if (checkout / "pyproject.toml").is_file():
         return f"pip install --editable '{checkout}[{extra}]'"
     # Imported here: every command loads this module, and these imports take longer than the rest of it.
+    from importlib.metadata import PackageNotFoundError, distribution
     from urllib.parse import urlsplit
     from urllib.request import url2pathname
 
-    origin = _origin()
+    try:
+        origin = dict(json.loads(distribution("log2sim").read_text("direct_url.json") or "{}"))
+    except (PackageNotFoundError, ValueError):
+        origin = {}
     url = origin.get("url", "")
     if "dir_info" in origin:
         return f"pip install '{url2pathname(urlsplit(url).path)}[{extra}]'"
     if "vcs_info" in origin:
         return f"pip install 'log2sim[{extra}] @ {origin['vcs_info']['vcs']}+{url}'"
     return f"pip install 'log2sim[{extra}]{f' @ {url}' if url else ''}'"
-
-
-def _origin() -> dict[str, Any]:
-    """Read `direct_url.json`; empty for a package from an index."""
-    from importlib.metadata import PackageNotFoundError, distribution
-
-    try:
-        return dict(json.loads(distribution("log2sim").read_text("direct_url.json") or "{}"))
-    except (PackageNotFoundError, ValueError):
-        return {}

@@ -8,17 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.agents import estimate
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.conflicts import extend_static
-from log2sim.agents.estimate import (
-    ego_agent,
-    ego_path,
-    ego_velocity,
-    estimate_agents,
-    simplify,
-    with_observers,
-    with_pose_errors,
-)
 from log2sim.agents.evidence import Recording
 from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import judge
@@ -42,8 +34,7 @@ from log2sim.report import Progress, Result, Run, conclude, draft_scenario
 from log2sim.road.describe import describe
 from log2sim.tracking.tracker import mark_unrecorded, track
 
-LATER = ("topdown", "track", "smooth", "map", "appearance")
-"""Settings of stages after the first pass."""
+LATER = ("topdown", "track", "smooth", "map", "appearance")  # settings of stages after the first pass
 
 
 def reconstruct(
@@ -57,41 +48,23 @@ def reconstruct(
 ) -> Result:
     """Reconstruct the scenario of a log.
 
-    Parameters
-    ----------
-    log : Log
-        From `open_log`.
-    config : Config, optional
-        Settings; the defaults without.
-    detector : callable, Detector, LidarDetector, str or a list of two of them, optional
-        In place of `detect.name` of the settings. A function gets a picture, (H, W, 3) uint8 BGR, and returns rows of x0, y0, x1,
-        y1 in px, score in [0, 1], category of `log2sim.datatypes.CATEGORIES`; or `Detections`. An object is a `Detector` of
-        `perception.detect.detectors` or, for sweeps, a `LidarDetector` of `perception.detect3d.detectors`; a name one that
-        `--detector` takes. A list joins one for pictures and one for sweeps, such as `[find_cars, "lidar:vehicle"]`.
-    progress : callable, optional
-        Called as `progress(stage, done, total)`; with a total of 0 when a stage of unknown length begins.
-    cache : bool
-        Whether what is detected and measured is taken from the user's cache, and kept there.
-    jobs : int, optional
-        Processes that share the work; the result is the same for any number. None for all usable cores, or one with a detector
-        from elsewhere, which need not work in a forked process.
-
-    Raises `LogError`, `ConfigError` and `MissingExtra` for logs and settings that cannot work, `PluginError` when the detector fails
-    or returns something else, `NothingToReconstruct` when neither an ego nor any agent was found.
+    `detector`: in place of `detect.name` of `config`. A function gets a picture, (H, W, 3) uint8 BGR, and returns rows of x0, y0, x1,
+    y1 in px, score in [0, 1], category of `log2sim.datatypes.CATEGORIES`; or `Detections`. An object is a `Detector` of
+    `perception.detect.detectors` or, for sweeps, a `LidarDetector` of `perception.detect3d.detectors`; a name one that `--detector`
+    takes. A list joins one for pictures and one for sweeps, such as `[find_cars, "lidar:vehicle"]`. `progress`: called as
+    `progress(stage, done, total)`, with a total of 0 when a stage of unknown length begins. `cache`: whether what is detected and
+    measured is taken from the user's cache, and kept there. `jobs`: processes that share the work, with the same result; None for
+    all usable cores, or one with a detector from elsewhere, which need not work in a forked process. Raises `LogError`, `ConfigError`
+    and `MissingExtra` for logs and settings that cannot work, `PluginError` when the detector fails or returns something else,
+    `NothingToReconstruct` when neither an ego nor any agent was found.
     """
     run = start(log, config or Config(), detector=detector, progress=progress, cache=cache, jobs=jobs)
     return infer_scenario(run, observe_log(run))
 
 
 def start(
-    log: Log,
-    config: Config,
-    *,
-    detector: Any = None,
-    progress: Progress | None = None,
-    cache: bool = True,
-    jobs: int | None = None,
-) -> Run:
+    log: Log, config: Config, *, detector: Any = None, progress: Progress | None = None, cache: bool = True, jobs: int | None = None
+) -> Run:  # fmt: skip
     """Put the sensors in one map and on one clock, synchronize them, and plan the run."""
     given = sort_detectors(detector, config)
     clock, progress = StageClock(), progress or (lambda *_: None)
@@ -102,19 +75,13 @@ def start(
     config = choose_detector(log, given.config)
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
-        asked = config.calibration
+        check, asked = partial(check_calibration, log, config, sensors, progress=progress), config.calibration
         # What mends the log gives more than findings, which alone are kept.
-        if not asked.check or asked.fix_time or asked.fix_mounts:
-            log, faults = check_calibration(log, config, sensors, progress=progress)
-        else:
+        if asked.check and not (asked.fix_time or asked.fix_mounts):
             of = [{name: value for name, value in config.to_dict().items() if name not in LATER}, sensors]
-            faults = earlier.known(
-                "calibration",
-                log,
-                of,
-                (Finding,),
-                lambda: check_calibration(log, config, sensors, progress=progress)[1],
-            )
+            faults = earlier.known("calibration", log, of, (Finding,), lambda: check()[1])
+        else:
+            log, faults = check()
         sensors = sensors.without([fault.subject for fault in faults if fault.treatment == "left_out"])
     with clock.stage("poses"):
         of = [poses.source, poses.checked, poses.during_ns, faults]
@@ -146,7 +113,7 @@ def observe_log(run: Run) -> Observations:
 def infer_scenario(run: Run, observations: Observations) -> Result:
     """Go on from observations, which stay as they are, to the scenario and the report."""
     log, config, plan, schedule, clock = run.log, run.config, run.plan, run.schedule, run.clock
-    timeline = Timeline(schedule.t_ns, int(schedule.t_ns[0]))
+    timeline, obstacles = Timeline(schedule.t_ns, int(schedule.t_ns[0])), observations.obstacles
     with clock.stage("topdown"):
         homographies = fit_homographies(log, observations, plan, config.topdown, rng=np.random.default_rng(config.seed))
         placed = place_by_homography(log, observations, homographies)
@@ -155,30 +122,26 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
     with clock.stage("track", run.progress):
         limits = config.track
         tracks = track(
-            fused,
-            schedule.t_ns,
-            birth_score=limits.birth_score,
-            max_gap_s=limits.max_gap_s,
-            min_life_s=limits.min_life_s,
-            flow_mps=ego_velocity(log, schedule),
-        )
+            fused, schedule.t_ns, birth_score=limits.birth_score, max_gap_s=limits.max_gap_s, min_life_s=limits.min_life_s,
+            flow_mps=estimate.ego_velocity(log, schedule),
+        )  # fmt: skip
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
-        obstacles = observations.obstacles
-        candidates = estimate_agents(tracks, obstacles, timeline, smooth=config.smooth.enabled, jobs=run.jobs)
-        candidates = decide_headings(candidates, ego_path(log, schedule), timeline)
-        ego = ego_agent(log, timeline, run.poses.origin)
+        candidates = estimate.estimate_agents(tracks, obstacles, timeline, smooth=config.smooth.enabled, jobs=run.jobs)
+        candidates = decide_headings(candidates, estimate.ego_path(log, schedule), timeline)
+        ego = estimate.ego_agent(log, timeline, run.poses.origin)
     with clock.stage("judge", run.progress):
         searched = schedule.drop_frames(observations.unseen)
         judged = judge(candidates, ego, Recording(log, searched, obstacles, timeline), jobs=run.jobs)
-        agents = [with_observers(c, with_pose_errors(c.agent, log, timeline), timeline) for c in judged]
-        if config.track.static_for_all:
+        agents = [
+            estimate.with_observers(c, estimate.with_pose_errors(c.agent, log, timeline), timeline) for c in judged
+        ]
+        if limits.static_for_all:
             agents = extend_static(agents, ego, obstacles, timeline)
-        least = config.track.quarantine_confidence / (1 if log.lidars else 2)
+        least = limits.quarantine_confidence / (1 if log.lidars else 2)
         agents = [replace(a, quarantined=a.confidence < least) for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
-        agents = simplify(agents) if ego is not None else agents
-
+        agents = estimate.simplify(agents) if ego is not None else agents
     scenario = draft_scenario(run, observations, homographies, agents if ego is None else [ego, *agents])
     described = describe(
         scenario, log, plan, observations, settings=config.map, for_map=run.poses.for_map, earlier=run.earlier,

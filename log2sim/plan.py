@@ -63,11 +63,9 @@ def choose_detector(log: Log, config: Config) -> Config:
     far = _lidars_out_of_range(log, config.measure.max_range_m)
     near = [lidar for name, lidar in log.lidars.items() if name not in far and is_used(lidar, config)]
     cameras = [camera for camera in log.cameras.values() if is_used(camera, config)]
-    names = []
-    if not near or (cameras and (config.cameras or image_detector_installed())):
-        names.append(IMAGE_DETECTOR)
-    if near:
-        names.append(network_for(near))
+    installed = all(importlib.util.find_spec(name) is not None for name in IMAGE_DETECTOR_PACKAGES)
+    names = [IMAGE_DETECTOR] if not near or (cameras and (config.cameras or installed)) else []
+    names += [network_for(near)] if near else []
     return config.changed(detect={"name": "+".join(names)})
 
 
@@ -86,11 +84,6 @@ def is_used(sensor: Camera | Lidar, config: Config) -> bool:
     return config.cooperation.ends in ("both", end_of(sensor))
 
 
-def image_detector_installed() -> bool:
-    """Return whether the packages of the default detector in images are installed."""
-    return all(importlib.util.find_spec(name) is not None for name in IMAGE_DETECTOR_PACKAGES)
-
-
 def select_sensors(log: Log, config: Config) -> Sensors:
     """Choose the sensors of a run and check their calibration.
 
@@ -104,7 +97,15 @@ def select_sensors(log: Log, config: Config) -> Sensors:
         raise ConfigError(f"--ends {config.cooperation.ends}: {log.name}: no sensor is {place}; choose both")
     cameras = _cameras(log, config)
     _check_calibration(log, cameras)
-    _check_pose_times(log, cameras)
+    # The ego's poses must not all be at other times than the records of the sensors on it.
+    mounts = {n: log.cameras[n].mount for n in cameras} or {n: lidar.mount for n, lidar in log.lidars.items()}
+    stamps = [log.streams[name].t_ns for name in mounts if name in log.streams and len(log.streams[name].t_ns)]
+    if log.ego is not None and stamps and "map" not in mounts.values():
+        records = Span.of("frames" if cameras else "sweeps", np.concatenate(stamps))
+        poses = Span.of("ego poses", log.ego.t_ns)
+        if poses.is_apart(records, round(log.ego.extrapolate_s * NS_PER_S)):
+            gap = describe_gap(poses, records)
+            raise LogError(f"{log.name}: {gap}; correct the stamps, or choose --poses lidar")
     used = tuple(name for name, lidar in log.lidars.items() if is_used(lidar, config))
     far = _lidars_out_of_range(log, config.measure.max_range_m) & set(used)
     lidars = tuple(name for name in used if name not in far)
@@ -157,21 +158,9 @@ def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
                 "0, 0, 1 in the last row"
             )
     for name in (*cameras, *log.lidars):
-        for problem in problems_of(log, name):
-            if problem.is_impossible:
-                raise LogError(problem.message)
-
-
-def _check_pose_times(log: Log, cameras: tuple[str, ...]) -> None:
-    """Raise `LogError` when the ego has poses, but at other times than all records of the sensors on it."""
-    mounts = {n: log.cameras[n].mount for n in cameras} or {n: lidar.mount for n, lidar in log.lidars.items()}
-    stamps = [log.streams[name].t_ns for name in mounts if name in log.streams and len(log.streams[name].t_ns)]
-    if log.ego is None or not stamps or "map" in mounts.values():
-        return
-    records = Span.of("frames" if cameras else "sweeps", np.concatenate(stamps))
-    poses = Span.of("ego poses", log.ego.t_ns)
-    if poses.is_apart(records, round(log.ego.extrapolate_s * NS_PER_S)):
-        raise LogError(f"{log.name}: {describe_gap(poses, records)}; correct the stamps, or choose --poses lidar")
+        for message, is_impossible in problems_of(log, name):
+            if is_impossible:
+                raise LogError(message)
 
 
 def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:
@@ -195,13 +184,12 @@ def fusion_level(log: Log, config: Config) -> tuple[FusionLevel | None, str]:
 
     No level where not both ends have LiDARs that are searched or measured; no reason for a log with one end.
     """
-    ends = {end_of(lidar) for lidar in log.lidars.values()} | {end_of(camera) for camera in log.cameras.values()}
-    if ends < set(ENDS):
-        return None, ""
     with_lidar, asked = {end_of(lidar) for lidar in log.lidars.values()}, FusionLevel(config.cooperation.fusion)
+    if with_lidar | {end_of(camera) for camera in log.cameras.values()} < set(ENDS):
+        return None, ""
     if with_lidar < set(ENDS):
-        missing = [end for end in ENDS if end not in with_lidar]
-        return None, f"no LiDAR of {' and '.join(missing)}: what their cameras measure is joined as of any"
+        missing = " and ".join(end for end in ENDS if end not in with_lidar)
+        return None, f"no LiDAR of {missing}: what their cameras measure is joined as of any"
     if not config.detect.in_sweeps and asked is not FusionLevel.POINTS:
         reason = f"points: images alone are searched, so that there are no {asked} of LiDARs to join"
         return FusionLevel.POINTS, reason
@@ -263,10 +251,6 @@ class Decision:
         """Return what is the same for the same log and settings, as scenario.json holds it."""
         return {"stage": str(self.stage), "kept": self.kept, "reason": self.reason}
 
-    def to_report(self) -> dict[str, Any]:
-        """Return the decision with its seconds, as report.json holds it."""
-        return {**self.to_dict(), "saved_s": self.saved_s, "saved_how": self.saved_how}
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -307,7 +291,6 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     """Decide what to run at the ticks (T,) of a log."""
     images, sweeps = config.detect.in_images, config.detect.in_sweeps
     cameras, lidars, far = sensors.cameras, sensors.lidars, sensors.lidars_out_of_range
-    no_camera = (not images, NO_CAMERA)
     decodes = bool(images) and images != LABELS
     # Where sweeps are searched at every tick, the frames of a camera are searched at one of `every` ticks.
     every = max(round(config.detect.period_s / period_of(t_ns)), 1) if decodes and sweeps and len(t_ns) > 1 else 1
@@ -315,24 +298,27 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     # frames that many ticks apart in which the detector found nothing, the others need not be decoded.
     stride = max(min_hits(t_ns, config.track.min_life_s), 1) if decodes and every == 1 else 1
     moved_m, turned_rad = (0.0, 0.0) if log.ego is None else _ego_motion(log.ego, t_ns)
+    stands = moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD
     level, why_level = fusion_level(sensors.only(log), config)
     ground = [what for what, used in (("pictures", cameras), ("sweeps", lidars)) if used]
+    no_camera, no_lidar = (not images, NO_CAMERA), (not log.lidars, "the log has no LiDAR")
+    skips_nothing = "the log has too few ticks for its tracks to skip any"
     decisions = [
         _decide(
             Stage.ALL_LIDARS,
             f"{len(lidars)} within range",
-            (not log.lidars, "the log has no LiDAR"),
+            no_lidar,
             (bool(far), f"never within {MAX_LIDAR_RANGE_M:.0f} m of the measured area: {', '.join(far)}"),
         ),
         _decide(
             Stage.MOTION_COMPENSATION,
             f"the ego moves {moved_m:.1f} m while sweeps are taken",
-            (not log.lidars, "the log has no LiDAR"),
+            no_lidar,
             (not lidars, "no LiDAR is within range"),
             (all(log.lidars[n].mount == "map" for n in lidars), "the LiDARs are fixed in the map"),
             (log.ego is None, "no ego poses: sensors are assumed to stand still"),
             (
-                moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD,
+                stands,
                 f"the ego stands still (moves {moved_m * 100:.1f} cm, turns {np.rad2deg(turned_rad):.2f} degrees)",
             ),
         ),
@@ -344,9 +330,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         ),
         _decide(
             Stage.DETECTION_IN_EVERY_FRAME,
-            "the log has too few ticks for its tracks to skip any"
-            if decodes
-            else "without decoding a frame costs nothing",
+            skips_nothing if decodes else "without decoding a frame costs nothing",
             no_camera,
             (every > 1, f"sweeps show the same objects: each camera is searched at one of {every} ticks"),
             (stride > 1, f"frames between two empty ones {stride} ticks apart are skipped"),
@@ -370,27 +354,28 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         decisions.append(_decide(Stage.FUSION_WITH_LIDAR, reason, no_camera))
     if why_level:
         decisions.append(Decision(Stage.FUSION_OF_ENDS, level is not None, why_level))
+    smooth, lanes, look = config.smooth.enabled, config.map.lanes, config.appearance
     decisions += [
         Decision(Stage.TRACKING, True, "identities over time are the result"),
-        _decide(Stage.SMOOTHING, "measured positions are noisy", (not config.smooth.enabled, "smooth.enabled=false")),
+        _decide(Stage.SMOOTHING, "measured positions are noisy", (not smooth, "smooth.enabled=false")),
         Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, False, "a static agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
         _decide(
             Stage.LANES,
             f"{' and '.join(ground)} show the ground",
-            (not config.map.lanes, "map.lanes=false"),
+            (not lanes, "map.lanes=false"),
             (not ground, "no sensor is used that shows the ground"),
         ),
         _decide(
             Stage.COLORS,
             "pictures show the vehicles",
-            (not config.appearance.colors, "appearance.colors=false"),
+            (not look.colors, "appearance.colors=false"),
             (not cameras, NO_CAMERA),
         ),
         _decide(
             Stage.SIGNALS,
             "detectors with the classes of COCO know them",
-            (not config.appearance.signals, "appearance.signals=false"),
+            (not look.signals, "appearance.signals=false"),
             (not cameras or not images, NO_CAMERA),
             (images == LABELS, "labels of road users take the place of a detector"),
         ),

@@ -11,12 +11,12 @@ import numpy as np
 
 from log2sim.agents.estimate import TOLERANCE_M
 from log2sim.config import Config
-from log2sim.datatypes import Agent, Finding, Log, Measurements, Scenario
+from log2sim.datatypes import Agent, Finding, Lidar, Log, Measurements, Scenario
 from log2sim.errors import NothingToReconstruct
 from log2sim.files.documents import rounded
 from log2sim.files.stages import StageClock
 from log2sim.files.version import __version__
-from log2sim.geometry import NS_PER_S, Array, apply, inverse, undistort
+from log2sim.geometry import NS_PER_S, Array, Camera, apply, inverse, undistort
 from log2sim.localization.choice import GIVEN, PoseChoice
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
@@ -111,41 +111,33 @@ def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
 
     A camera looks where the rays of its middle row and column go, a LiDAR where it measured points.
     """
-    mounts = [(name, "camera", c.mount_T_cam) for name, c in log.cameras.items() if c.mount == "map"]
-    mounts += [(name, "lidar", lidar.mount_T_lidar) for name, lidar in log.lidars.items() if lidar.mount == "map"]
-    entries = []
-    for name, kind, map_T_sensor in mounts:
-        rays_map = (_camera_rays(log, name) if kind == "camera" else _lidar_rays(log, name)) @ map_T_sensor[:3, :3].T
+    records, entries = RecordSource(log), []
+    sensors: list[Camera | Lidar] = [*log.cameras.values(), *log.lidars.values()]
+    for sensor in (sensor for sensor in sensors if sensor.mount == "map"):
+        rays = [np.zeros((0, 3))]
+        if isinstance(sensor, Camera):
+            # Pixels in the middle row and column that the lens model explains.
+            map_T_sensor, width, height = sensor.mount_T_cam, sensor.width_px, sensor.height_px
+            u, v = np.linspace([0.0, 0.0], [width, height], 65).T
+            row = np.column_stack([u, np.full_like(u, height / 2)])
+            column = np.column_stack([np.full_like(v, width / 2), v])
+            xy = undistort(sensor, np.concatenate([row, column]))
+            xy = xy[np.isfinite(xy).all(axis=1)]
+            rays.append(np.column_stack([xy, np.ones(len(xy))]))
+        else:
+            map_T_sensor, count = sensor.mount_T_lidar, len(log.streams[sensor.name].t_ns)
+            for i in np.unique(np.linspace(0, count, VIEW_SWEEPS, endpoint=False).astype(int))[:count]:
+                sweep = records.get(sensor.name, int(i))
+                if sweep is not None:  # the stages before have reported it
+                    xyz = np.asarray(sweep.xyz_m, dtype=np.float64)
+                    rays.append(apply(inverse(map_T_sensor), xyz) if sweep.frame == "map" else xyz)
+        rays_map = np.concatenate(rays) @ map_T_sensor[:3, :3].T
         yaw_rad, fov_rad = _view_of(np.arctan2(rays_map[:, 1], rays_map[:, 0]))
+        kind = "camera" if isinstance(sensor, Camera) else "lidar"
         place = dict(zip(("x_m", "y_m", "z_m"), map_T_sensor[:3, 3].tolist()))
         look = {"yaw_rad": yaw_rad, "fov_rad": fov_rad, "range_m": range_m}
-        entries.append({"name": name, "kind": kind, **place, **look})
+        entries.append({"name": sensor.name, "kind": kind, **place, **look})
     return tuple(entries)
-
-
-def _camera_rays(log: Log, name: str) -> Array:
-    """Return rays (N, 3), cam frame, of pixels in the middle row and column that the lens model explains."""
-    camera = log.cameras[name]
-    u, v = np.linspace([0.0, 0.0], [camera.width_px, camera.height_px], 65).T
-    row = np.column_stack([u, np.full_like(u, camera.height_px / 2)])
-    column = np.column_stack([np.full_like(v, camera.width_px / 2), v])
-    xy = undistort(camera, np.concatenate([row, column]))
-    xy = xy[np.isfinite(xy).all(axis=1)]
-    return np.column_stack([xy, np.ones(len(xy))])
-
-
-def _lidar_rays(log: Log, name: str) -> Array:
-    """Return rays (N, 3), lidar frame, to the points of some sweeps of a LiDAR that is fixed in the map."""
-    records, count = RecordSource(log), len(log.streams[name].t_ns)
-    lidar_T_map = inverse(log.lidars[name].mount_T_lidar)
-    rays = [np.zeros((0, 3))]
-    for i in np.unique(np.linspace(0, count, VIEW_SWEEPS, endpoint=False).astype(int))[:count]:
-        sweep = records.get(name, int(i))
-        if sweep is None:
-            continue  # the stages before have reported it
-        xyz = np.asarray(sweep.xyz_m, dtype=np.float64)
-        rays.append(apply(lidar_T_map, xyz) if sweep.frame == "map" else xyz)
-    return np.concatenate(rays)
 
 
 def _view_of(azimuth_rad: Array) -> tuple[float, float]:
@@ -193,31 +185,32 @@ def conclude(
 
     `measurements`: by tick. `described`: what `describe` returns.
     """
-    log, config, schedule, clock = run.log, run.config, run.schedule, run.clock
+    log, schedule, clock, ticks = run.log, run.schedule, run.clock, len(run.schedule)
     scenario, decisions, figures = described
-    found: Mapping[Stage, Callable[[Decision], Decision]] = {
-        Stage.MOTION_COMPENSATION: lambda d: _compensation(d, observations),
-        Stage.DETECTION_IN_EVERY_FRAME: lambda d: _detection(d, run.plan.picture_stride, observations, clock),
-        Stage.HOMOGRAPHY: lambda d: _homography(d, run.plan.homography, homographies),
-        Stage.SMOOTHING_OF_STATIC_AGENTS: lambda d: _static(scenario.others),
-        Stage.WAYPOINT_AT_EVERY_TICK: lambda d: _waypoints(scenario.others),
-    }
     planned = (d for d in run.plan.decisions if d.stage not in DESCRIBING)
-    stages = (*(found[d.stage](d) if d.stage in found else d for d in planned), *decisions)
+    stages = (*(_turned_out(d, run, observations, homographies, scenario.others) for d in planned), *decisions)
     scenario = replace(scenario, stages=tuple(stage.to_dict() for stage in stages))
     from_lidar = [rows.source == "lidar" for rows in measurements]
+    total_s, detecting_s = clock.total(), clock.seconds.get("detect", 0.0)
+    without_pose: dict[str, int] = {}
+    for name, index in schedule.frames.items():
+        known = log.map_T_sensor(name, log.streams[name].t_ns[index[index >= 0]])[1]
+        without_pose |= {} if known.all() else {name: int(np.sum(~known))}
     report = {
         "report_version": 1,
         "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
         "log2sim_version": __version__,
-        "ticks": len(schedule),
+        "ticks": ticks,
         "duration_s": (int(schedule.t_ns[-1]) - int(schedule.t_ns[0])) / NS_PER_S,
-        **_times(clock, len(schedule)),
-        "plan": [stage.to_report() for stage in stages],
+        "seconds": round(total_s, 4),
+        "ticks_per_second": round(ticks / total_s, 3),
+        "ticks_per_second_without_detector": round(ticks / max(total_s - detecting_s, 1e-9), 3),
+        "stages": clock.table(ticks),
+        "plan": [{**stage.to_dict(), "saved_s": stage.saved_s, "saved_how": stage.saved_how} for stage in stages],
         "sync": {"reference": schedule.reference, "streams": schedule.summary()},
-        "without_pose": _frames_without_pose(log, schedule),
+        "without_pose": without_pose,
         "detections": observations.detections,
-        "homography": {name: _homography_entry(g, config.topdown.method) for name, g in homographies.items()},
+        "homography": {name: _homography_entry(g, run.config.topdown.method) for name, g in homographies.items()},
         "measurements": {"total": sum(map(len, from_lidar)), "with_lidar": int(sum(map(np.sum, from_lidar)))},
         "agents": _agent_counts(scenario),
         **figures,
@@ -230,92 +223,57 @@ def conclude(
     return Result(scenario, report, log, (*run.poses.findings, *run.faults, *observations.faults))
 
 
-def _compensation(planned: Decision, observations: Observations) -> Decision:
-    counts, total = observations.sweeps, sum(observations.sweeps.values())
-    if not planned.kept or not total:
-        return planned
-    if counts["in the log"] == total:
-        return Decision(planned.stage, False, "the sweeps of the log are compensated already")
-    if counts["in the log"] + counts["no times"] == total:
-        return Decision(planned.stage, False, "the points have no times of their own")
-    if counts["at rest"]:
-        reason = f"{planned.reason}; it stands still during {counts['at rest']} of {total} sweeps"
-        return Decision(planned.stage, counts["moving"] > 0, reason)
+def _turned_out(
+    planned: Decision, run: Run, observations: Observations, homographies: Mapping[str, CameraHomography], agents: Sequence[Agent]
+) -> Decision:  # fmt: skip
+    """Return a decision as the data turned out."""
+    stage = planned.stage
+    if stage is Stage.MOTION_COMPENSATION and planned.kept:
+        counts, total = observations.sweeps, sum(observations.sweeps.values())
+        if total and counts["in the log"] == total:
+            return Decision(stage, False, "the sweeps of the log are compensated already")
+        if total and counts["in the log"] + counts["no times"] == total:
+            return Decision(stage, False, "the points have no times of their own")
+        if total and counts["at rest"]:
+            reason = f"{planned.reason}; it stands still during {counts['at rest']} of {total} sweeps"
+            return Decision(stage, counts["moving"] > 0, reason)
+    if stage is Stage.DETECTION_IN_EVERY_FRAME and not planned.kept and observations.frames_detected:
+        skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
+        if not skipped:
+            return Decision(stage, True, "no camera was empty long enough to skip a frame")
+        count = f"{skipped} of {skipped + detected} frames"
+        names = ", ".join(f"{name} {n}" for name, n in sorted(observations.frames_skipped.items()))
+        reason = f"{count} are between two in which nothing was found: {names}"
+        if run.plan.picture_stride > 1:
+            reason = f"{planned.reason}; {count} were not"
+        each_s = sum(run.clock.seconds.get(step, 0.0) for step in ("decode", "detect")) / detected
+        how = f"estimated: {1e3 * each_s:.3g} ms a frame (measured on {detected}), times {skipped}"
+        return Decision(stage, False, reason, round(skipped * each_s, 4), how)
+    if stage is Stage.HOMOGRAPHY and run.plan.homography is not HomographyScope.NONE:
+        if not homographies:
+            return Decision(stage, False, "every detection has LiDAR points or no foot in the image")
+        return Decision(stage, True, f"{planned.reason}: {', '.join(homographies)}")
+    if stage is Stage.SMOOTHING_OF_STATIC_AGENTS:
+        static = sum(a.static for a in agents)
+        reason = f"{static} of {len(agents)} agents are static: one pose for each" if static else "no agent is static"
+        return Decision(stage, not static, reason)
+    if stage is Stage.WAYPOINT_AT_EVERY_TICK:
+        left_out = sum(a.quality.get("waypoints_left_out", 0) for a in agents)
+        if not left_out:
+            return Decision(stage, True, "no agent moves straight at constant speed")
+        total = left_out + sum(len(a.waypoints) for a in agents)
+        reason = f"{left_out} of {total} lie within {TOLERANCE_M * 100:.0f} cm of the line between their neighbors"
+        return Decision(stage, False, reason)
     return planned
-
-
-def _detection(planned: Decision, picture_stride: int, observations: Observations, clock: StageClock) -> Decision:
-    seconds = clock.seconds
-    skipped, detected = sum(observations.frames_skipped.values()), observations.frames_detected
-    if planned.kept or not detected:
-        return planned
-    if not skipped:
-        return Decision(planned.stage, True, "no camera was empty long enough to skip a frame")
-    names = ", ".join(f"{name} {n}" for name, n in sorted(observations.frames_skipped.items()))
-    reason = f"{skipped} of {skipped + detected} frames are between two in which nothing was found: {names}"
-    if picture_stride > 1:
-        reason = f"{planned.reason}; {skipped} of {skipped + detected} frames were not"
-    each_s = (seconds.get("decode", 0.0) + seconds.get("detect", 0.0)) / max(detected, 1)
-    how = f"estimated: {1e3 * each_s:.3g} ms a frame (measured on {detected}), times {skipped}"
-    return Decision(planned.stage, False, reason, round(skipped * each_s, 4), how)
-
-
-def _homography(planned: Decision, scope: HomographyScope, homographies: Mapping[str, CameraHomography]) -> Decision:
-    if scope is HomographyScope.NONE:
-        return planned
-    if not homographies:
-        return Decision(planned.stage, False, "every detection has LiDAR points or no foot in the image")
-    return Decision(planned.stage, True, f"{planned.reason}: {', '.join(homographies)}")
-
-
-def _static(agents: Sequence[Agent]) -> Decision:
-    static = sum(a.static for a in agents)
-    reason = f"{static} of {len(agents)} agents are static: one pose for each" if static else "no agent is static"
-    return Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, not static, reason)
-
-
-def _waypoints(agents: Sequence[Agent]) -> Decision:
-    stage, left_out = Stage.WAYPOINT_AT_EVERY_TICK, sum(a.quality.get("waypoints_left_out", 0) for a in agents)
-    if not left_out:
-        return Decision(stage, True, "no agent moves straight at constant speed")
-    total = left_out + sum(len(a.waypoints) for a in agents)
-    reason = f"{left_out} of {total} lie within {TOLERANCE_M * 100:.0f} cm of the line between their neighbors"
-    return Decision(stage, False, reason)
-
-
-DETECTOR_STAGES = ("detect",)
-
-
-def _times(clock: StageClock, ticks: int) -> dict[str, Any]:
-    """Return the seconds of a run so far, its rates, and the table of its stages."""
-    total, detecting = clock.total(), sum(clock.seconds.get(stage, 0.0) for stage in DETECTOR_STAGES)
-    return {
-        "seconds": round(total, 4),
-        "ticks_per_second": round(ticks / total, 3),
-        "ticks_per_second_without_detector": round(ticks / max(total - detecting, 1e-9), 3),
-        "stages": clock.table(ticks),
-    }
-
-
-def _frames_without_pose(log: Log, schedule: Schedule) -> dict[str, int]:
-    """Frames by camera that were left out because the ego's pose is not known at their stamp."""
-    counts = {}
-    for name, index in schedule.frames.items():
-        known = log.map_T_sensor(name, log.streams[name].t_ns[index[index >= 0]])[1]
-        if not known.all():
-            counts[name] = int(np.sum(~known))
-    return counts
 
 
 def unused_records(report: Mapping[str, Any]) -> list[Finding]:
     """List what a run could not use of its log or keep for later runs, as its report says."""
-    found = unreadable_records(report["unreadable"])
-    found += [
-        Finding("frames_without_pose", name, "left_out", values={"count": float(count)})
-        for name, count in report["without_pose"].items()
-    ]
+    lost = report["without_pose"].items()
+    found = [Finding("frames_without_pose", name, "left_out", values={"count": float(n)}) for name, n in lost]
     problem = (report["detection_cache"] or {}).get("problem")
-    return [*found, *([Finding("not_cached", "cache", other=problem)] if problem else [])]
+    not_cached = [Finding("not_cached", "cache", other=problem)] if problem else []
+    return [*unreadable_records(report["unreadable"]), *found, *not_cached]
 
 
 def unreadable_records(counted: Mapping[str, Any]) -> list[Finding]:
@@ -346,15 +304,12 @@ def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
 def _agent_counts(scenario: Scenario) -> dict[str, Any]:
     agents = scenario.others
     categories = sorted({a.category for a in agents})
-    doubtful = {a.id: [doubt.to_dict() for doubt in a.doubts] for a in scenario.agents if a.is_doubtful}
-    residuals = [
-        a.quality["smoothing_residual_rms_m"] for a in agents if a.quality.get("smoothing_residual_rms_m") is not None
-    ]
+    known_m = [m for a in agents if (m := a.quality.get("smoothing_residual_rms_m")) is not None]
     return {
         "total": len(agents),
         "static": sum(a.static for a in agents),
         "by_category": {c: sum(a.category == c for a in agents) for c in categories},
-        "smoothing_residual_median_m": rounded(float(np.median(residuals)), 4) if residuals else None,
-        "doubtful": doubtful,
+        "smoothing_residual_median_m": rounded(float(np.median(known_m)), 4) if known_m else None,
+        "doubtful": {a.id: [doubt.to_dict() for doubt in a.doubts] for a in scenario.agents if a.is_doubtful},
         "quarantined": [a.id for a in agents if a.quarantined],
     }

@@ -16,8 +16,7 @@ from plain_settings import AGENTS_ALONE
 from log2sim.config import Config
 from log2sim.datatypes import Log, Scenario
 from log2sim.logs.excerpt import RECORD_MARGIN_NS, cut_log
-from log2sim.logs.opening import open_log
-from log2sim.logs.validation import validate_log
+from log2sim.logs.opening import open_log, validate_log
 from log2sim.pipeline import reconstruct
 
 TWO_CAMERAS = [

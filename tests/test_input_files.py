@@ -24,7 +24,7 @@ from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.records import image_stream, read_sweep
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.containers import ChunkedFile
-from log2sim.logs.waymo.tfrecord import RecordFile
+from log2sim.logs.waymo.messages import RecordFile
 from log2sim.synth.returns import lidar_model
 from log2sim.synth.scene import load_scene
 

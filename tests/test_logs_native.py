@@ -16,9 +16,8 @@ from log2sim.errors import LogError, RecordError
 from log2sim.files.images import decode_image
 from log2sim.geometry import Camera, PoseTrack, rotation_from_rpy, transform
 from log2sim.logs.native.writer import write_log
-from log2sim.logs.opening import open_log
+from log2sim.logs.opening import open_log, validate_log
 from log2sim.logs.stamps import transverse_mercator
-from log2sim.logs.validation import validate_log
 
 T0_NS = 1_700_000_000_123_456_789
 FRAMES = 5

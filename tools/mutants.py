@@ -56,7 +56,7 @@ MUTANTS = (
     ("normals face the sensor", "localization/roadside_fit.py", "np.where(facing < 0, -1.0, 1.0)", "np.where(facing < 0, 1.0, 1.0)", "cooperation"),
     ("sigmas of predictions do not grow", "simulation/prediction/prediction.py", "** 2 + variance)", "** 2 + 0 * variance)", "prediction"),
     ("centers of exported boxes", "export/openscenario/write.py", "x=number(agent.rear_axle_offset_m), y", "x=number(-agent.rear_axle_offset_m), y", "export_openscenario import"),
-    ("shifts to the side", "edit/motion.py", "y_m=w.y_m + offset * np.cos(yaw)", "y_m=w.y_m - offset * np.cos(yaw)", "edit"),
+    ("shifts to the side", "edit/edits.py", "y_m=w.y_m + offset * np.cos(yaw)", "y_m=w.y_m - offset * np.cos(yaw)", "edit"),
     ("hypotheses are not counted", "agents/hypotheses.py", "- np.log(count))", ")", "hypotheses"),
     ("lit lamps", "road/signals.py", "log[k] += 0.0 if", "log[k] += 0.0 if True or", "traffic_lights"),
     ("points beyond a gap of time", "evaluation/metrics/comparison.py", "<= MAX_TRUTH_GAP_S) & table", "<= 2 * MAX_TRUTH_GAP_S) & table", "metrics_evaluate"),

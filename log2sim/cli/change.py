@@ -198,13 +198,10 @@ def _with_points(scenario: Scenario, changed: set[str], log: Path, sequence: str
     """Return the scenario with the LiDAR points of the changed agents, and a line for each of them that has none."""
     import numpy as np
 
+    from log2sim.cli.show import open_recorded
     from log2sim.evaluation.metrics.truth import count_points
-    from log2sim.localization.choice import localize_like
-    from log2sim.logs.opening import open_log
-    from log2sim.visualization.recording import require_overlap
 
-    opened = localize_like(open_log(log, sequence=sequence), scenario.provenance)
-    require_overlap(opened, scenario)
+    opened = open_recorded(log, scenario, sequence).log
     part = replace(scenario, agents=tuple(a for a in scenario.others if a.id in changed))
     points = {a.id: a.waypoints.lidar_points for a in count_points(part, opened).agents}
     seen = {name: float(np.median(found)) for name, found in points.items() if found is not None}
@@ -249,9 +246,8 @@ def studio(
     layers: dict[str, Any] = {}
     with progress(quiet=quiet) as report_progress:
         if log is not None:
-            recorded = open_recorded(
-                log, loaded, sequence, round(max_mb * 1e6), opt.camera_names(cameras), report_progress
-            )
+            wanted = opt.camera_names(cameras)
+            recorded = open_recorded(log, loaded, sequence, round(max_mb * 1e6), wanted, report_progress)
             layers["recorded"] = recorded
             if shows_ground(recorded.log):
                 layers["background"] = map_of(recorded.log, loaded, report_progress)

@@ -26,10 +26,8 @@ from log2sim.files.version import __version__
 
 MIN_PYTHON = (3, 11)
 BROKEN_CODE = 5  # as where an extra is missing: something has to be installed
-
 # Modules of packages whose names differ by more than a hyphen.
 MODULES = {"opencv-contrib-python-headless": "cv2", "scikit-image": "skimage"}
-
 # Extras for users, and what for; others are for development.
 PURPOSES = {
     "coco": "the default detector in images",
@@ -48,7 +46,6 @@ PURPOSES = {
     "rerun": "export --to rerun",
     "carla": "replay --simulator carla",
 }
-
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

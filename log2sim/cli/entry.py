@@ -26,7 +26,6 @@ from log2sim.files.outputs import holding_claims
 from log2sim.files.version import __version__
 
 INTERRUPTED = 130
-
 EXIT_CODES = """\b
 Exit codes:
     0  done
@@ -38,7 +37,6 @@ Exit codes:
     6  a check of --strict failed
     7  some logs of a batch failed
   130  interrupted"""
-
 UNSET = {"help": False, "install_completion": False, "show_completion": False}
 """Flags that typer adds without a default: it would load pydantic to check them, which takes as long as all of --help."""
 
@@ -99,9 +97,8 @@ def _run(ended: Ended) -> NoReturn:
     except Exception as error:
         format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
         if format_message is None:
-            cause: BaseException | None = (
-                error  # Ctrl-C while libraries are being imported gives an ImportError from it
-            )
+            # Ctrl-C while libraries are being imported gives an ImportError from it.
+            cause: BaseException | None = error
             while cause is not None and not isinstance(cause, KeyboardInterrupt):
                 cause = cause.__cause__ or cause.__context__
             if cause is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.files.outputs import together
 
 if TYPE_CHECKING:
-    from log2sim.datatypes import Log, Scenario
+    from log2sim.datatypes import Scenario
 
 
 PROTOCOL = "center"
@@ -69,13 +68,42 @@ def evaluate(
         only_files = {**only_boxes, "--sequence": sequence, "--poses": poses, "--plot": plot, "--labels": labels}
         for name in (name for name, value in only_files.items() if value is not None):
             raise ConfigError(f"{name}: is for single files; {path} is a folder, so leave it out")
-        result, table = _batch_figures(path, truth, range, wanted, quiet=quiet, verbose=verbose)
+        from log2sim.batch.evaluation import evaluate_batch, format_batch_table, format_batch_verdict
+        from log2sim.batch.folder import BatchFolder, is_batch
+
+        if not is_batch(path):
+            raise LogError(
+                f"{path}: is a folder, but of no batch; give a file, or the folder that `log2sim batch` wrote"
+            )
+        with progress(quiet=quiet) as report_progress:
+            result = evaluate_batch(
+                BatchFolder.load(path), truth,
+                lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
+                max_range_m=range, categories=wanted, progress=partial(report_progress, "logs"),
+            )  # fmt: skip
+        table = format_batch_verdict(result)
+        table += f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
     elif is_boxes_document(document := read_json(path, ScenarioError)):
-        options = {"protocol": protocol or PROTOCOL, "max_range_m": range, "classes": wanted}
-        options |= {} if score is None else {"min_score": score}
-        provenance = _stated(document.get("poses"), poses)
-        opened = partial(_open_truth, truth, sequence, labels, provenance)
-        result, table = _boxes_figures(path, document, options, opened, quiet=quiet, verbose=verbose)
+        from log2sim.evaluation.detection.boxes import DetectedBoxes
+        from log2sim.evaluation.detection.evaluation import DEFAULT_SCORE, DetectionOptions, evaluate_boxes
+        from log2sim.evaluation.detection.evaluation import format_table as boxes_table
+        from log2sim.evaluation.detection.evaluation import format_verdict as boxes_verdict
+        from log2sim.localization.choice import localize_like
+        from log2sim.logs.opening import is_log_file, open_log
+
+        options = DetectionOptions(protocol or PROTOCOL, DEFAULT_SCORE if score is None else score, range, wanted)
+        options.chosen()  # what is wrong with them is said before anything is read
+        try:
+            detected = DetectedBoxes.from_dict(document)
+        except LogError as error:
+            raise LogError(f"{path}: {error}") from None
+        with progress(quiet=quiet) as report_progress:
+            if truth.is_file() and not is_log_file(truth):
+                raise LogError(f"{truth}: is a file and no log; the truth of boxes is a log with labels")
+            labeled = open_log(truth, sequence=sequence, labels=labels)
+            labeled = localize_like(labeled, _stated(document.get("poses"), poses))
+            result = evaluate_boxes(detected, labeled, options, progress=partial(report_progress, "count points"))
+        table = boxes_verdict(result) + (f"\n\n{boxes_table(result)}" if verbose else "")
     else:
         for name in (name for name, value in only_boxes.items() if value is not None):
             raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
@@ -122,58 +150,6 @@ def _other_map(scenario: Scenario, truth: Path) -> str | None:
     if source not in ("lidar", "camera") or not (truth.suffix == ".json" or (truth / "truth.json").is_file()):
         return None
     return f"the scenario's poses are estimated ({source}), {truth} has its own: what the two maps differ by counts as error"
-
-
-def _batch_figures(
-    path: Path, truth: Path, max_range_m: float | None, categories: list[str] | None, *, quiet: bool, verbose: bool
-) -> tuple[dict[str, Any], str]:
-    """Compare all scenarios of a batch with the labels of their logs."""
-    from log2sim.batch.evaluation import evaluate_batch, format_batch_table, format_batch_verdict
-    from log2sim.batch.folder import BatchFolder, is_batch
-    from log2sim.evaluation.metrics.truth import load_truth
-
-    if not is_batch(path):
-        raise LogError(
-            f"{path}: is a folder, but not of a batch; give a file, or the folder that `log2sim batch` wrote"
-        )
-    with progress(quiet=quiet) as report_progress:
-        result = evaluate_batch(
-            BatchFolder.load(path),
-            truth,
-            lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
-            max_range_m=max_range_m,
-            categories=categories,
-            progress=partial(report_progress, "logs"),
-        )
-    table = f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
-    return result, format_batch_verdict(result) + table
-
-
-def _open_truth(path: Path, sequence: str | None, labels: Path | None, provenance: dict[str, Any]) -> Log:
-    """Open the log with the true boxes."""
-    from log2sim.localization.choice import localize_like
-    from log2sim.logs.opening import is_log_file, open_log
-
-    if path.is_file() and not is_log_file(path):
-        raise LogError(f"{path}: is a file and no log; the truth of boxes is a log with labels")
-    return localize_like(open_log(path, sequence=sequence, labels=labels), provenance)
-
-
-def _boxes_figures(
-    path: Path, document: Any, options: dict[str, Any], truth: Callable[[], Log], *, quiet: bool, verbose: bool
-) -> tuple[dict[str, Any], str]:
-    from log2sim.evaluation.detection.boxes import DetectedBoxes
-    from log2sim.evaluation.detection.evaluation import DetectionOptions, evaluate_boxes, format_table, format_verdict
-
-    chosen = DetectionOptions(**options)
-    chosen.chosen()
-    try:
-        detected = DetectedBoxes.from_dict(document)
-    except LogError as error:
-        raise LogError(f"{path}: {error}") from None
-    with progress(quiet=quiet) as report_progress:
-        result = evaluate_boxes(detected, truth(), chosen, progress=partial(report_progress, "count points"))
-    return result, format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
 
 
 def bench(
@@ -223,9 +199,8 @@ def bench(
     known = truth_at(truth or log, used, sequence, provenance=made) if truth is not None or labeled else None
     scope = ScoreScope(range, opt.split_names(categories) or None)
     with progress(quiet=quiet) as report_progress:
-        result = run(
-            opened, chosen, truth=known, scope=scope, detectors=tuple(detector or ()), progress=report_progress
-        )
+        others = tuple(detector or ())
+        result = run(opened, chosen, truth=known, scope=scope, detectors=others, progress=report_progress)
     with together():
         write_json(out / "bench.json", bench_document(result))
         write_picture(result, out / "bench.png")

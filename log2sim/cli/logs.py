@@ -190,7 +190,7 @@ def validate(
 
     if path.is_dir() or is_log_file(path):
         from log2sim.logs.native.reader import READER
-        from log2sim.logs.validation import list_gaps, validate_log
+        from log2sim.logs.opening import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)
         with progress(quiet=quiet) as report_progress:
@@ -249,20 +249,13 @@ def convert(
     check_folder(out, overwrite=overwrite)
     if out.resolve() in (log.resolve(), *log.resolve().parents):
         raise ConfigError(f"{out}: holds the log that is converted; choose another folder")
-    part = cut_log(
-        open_log(log, format=format, sequence=sequence, labels=labels), cameras=names, start_s=start, stop_s=stop
-    )
+    opened = open_log(log, format=format, sequence=sequence, labels=labels)
+    part = cut_log(opened, cameras=names, start_s=start, stop_s=stop)
     opt.say_all("note", part.notes, quiet=quiet)
     problems: list[str] = []
     with progress(quiet=quiet) as report_progress:
-        write_log(
-            part,
-            out,
-            overwrite=overwrite,
-            jpeg_quality=95,
-            progress=partial(report_progress, "convert"),
-            problems=problems,
-        )
+        done = partial(report_progress, "convert")
+        write_log(part, out, overwrite=overwrite, jpeg_quality=95, progress=done, problems=problems)
     opt.say_all("note: left out", problems, quiet=quiet)
     records = sum(len(stream.t_ns) for stream in part.streams.values()) - len(problems)
     size_mb = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6

@@ -96,8 +96,6 @@ Poses = Annotated[str | None, choose(
     "--poses", "given|lidar|camera|auto",
     "Ego poses: the log's own, from LiDAR odometry (extra odometry), from the motion of a camera, or what fits to the sensors best.",
     default="the log's own; what fits best for a log without any")]  # fmt: skip
-
-
 NoCache = Annotated[bool, option(
     "Search every picture again, and keep nothing of it; see log2sim cache.", None, "--no-cache")]  # fmt: skip
 

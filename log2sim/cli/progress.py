@@ -14,10 +14,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 LINE_EVERY_S = 5.0
-
 # Shown on a terminal alone: elsewhere what is wrong with the log is to be the only line.
 ON_TERMINALS = (OPENING, VALIDATING)
-
 # Called as `report(stage, done, total)`; a total of 0 says that the length of the stage is not known.
 Report = Callable[[str, int, int], None]
 

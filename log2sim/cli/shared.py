@@ -154,10 +154,8 @@ KINDS = {
     "--ego": {"policy": ""},
     "--model": {"vehicle_model": ""},
 }
-
 # Commands of which alone an option means that; `export --ego` takes the id of an agent.
 ONLY_OF = {"--ego": "replay", "--model": "replay"}
-
 SWEEPS_ALONE = "detect"  # command whose `--detector` takes none in pictures
 
 

@@ -59,9 +59,8 @@ def plot(
     from log2sim.visualization.plot.selection import PlotOptions, parse_extent, parse_ids, parse_size
     from log2sim.visualization.plot.tracks import plot_tracks, resolve_picture
 
-    options = PlotOptions(
-        parse_size(size), fps, speed, start, stop, parse_extent(extent), parse_ids(agents), label_static
-    )
+    shown = parse_extent(extent), parse_ids(agents), label_static
+    options = PlotOptions(parse_size(size), fps, speed, start, stop, *shown)
     picture = resolve_picture(out)
     options.require_fits(picture.path.suffix.lower(), picture.path.name)
     check_targets(picture.path, overwrite=overwrite)
@@ -141,9 +140,8 @@ def view(
             from log2sim.visualization.recording import DEFAULT_MAX_BYTES
 
             max_bytes = DEFAULT_MAX_BYTES if max_mb is None else round(max_mb * 1e6)
-            layers["recorded"] = open_recorded(
-                log, loaded, sequence, max_bytes, opt.camera_names(cameras), report_progress
-            )
+            wanted = opt.camera_names(cameras)
+            layers["recorded"] = open_recorded(log, loaded, sequence, max_bytes, wanted, report_progress)
         if background is not None:
             layers["background"] = load_background(background, loaded, sequence, report_progress)
         elif log is not None and shows_ground(opened := layers["recorded"].log):
@@ -187,22 +185,15 @@ def map_of(log: Log, scenario: Scenario, progress: Callable[[str, int, int], Non
     return map_ground(log, scenario, MapConfig(cell_m=CELL_M), progress=progress).as_picture()
 
 
-def open_recorded(
-    path: Path,
-    scenario: Scenario,
-    sequence: str | None,
-    max_bytes: int,
-    cameras: tuple[str, ...],
-    progress: Callable[[str, int, int], None],
-) -> Recorded:
-    """Open the log whose pictures and points are shown, with the poses that the scenario was made with."""
+def open_recorded(path: Path, scenario: Scenario, sequence: str | None, *options: Any) -> Recorded:
+    """Open the log whose pictures and points are shown, with the poses that the scenario was made with; `options` of `Recorded`."""
     from log2sim.localization.choice import localize_like
     from log2sim.logs.opening import open_log
     from log2sim.visualization.recording import Recorded, require_overlap
 
     log = localize_like(open_log(path, sequence=sequence), scenario.provenance)
     require_overlap(log, scenario)
-    return Recorded(log, max_bytes, cameras, progress)
+    return Recorded(log, *options)
 
 
 def shows_ground(log: Log) -> bool:

@@ -11,7 +11,7 @@ from log2sim.cli.progress import progress
 from log2sim.errors import ConfigError, ScenarioError
 
 if TYPE_CHECKING:
-    from log2sim.datatypes import Scenario
+    pass
 
 
 def replay(
@@ -74,7 +74,7 @@ def replay(
     from dataclasses import replace as changed
 
     from log2sim.cli.change import ids_of
-    from log2sim.datatypes import Scenario
+    from log2sim.datatypes import Scenario, explain_doubt, format_confidence
     from log2sim.export.checks import doubtful_note, export_notes
     from log2sim.files.documents import check_targets
     from log2sim.simulation.expected_motion import WarningSettings
@@ -102,7 +102,13 @@ def replay(
     warning = None if warn is None else WarningSettings(warn, horizon, reaction_s=reaction, brake_mps2=deceleration)
     loaded = Scenario.load(scenario)
     chosen = agents if react is None else list(ids_of(loaded, [react]))
-    kept, left_out = _trusted(loaded, confidence, drop_doubtful=drop_doubtful)
+    # The scenario without the agents that are not wanted, and these with why.
+    kept = loaded.active if confidence is None else loaded.trusted(confidence)
+    there = {a.id for a in kept.agents}
+    left_out = {a.id: format_confidence(a) for a in loaded.agents if a.id not in there}
+    if drop_doubtful:
+        left_out |= {a.id: explain_doubt(a) for a in kept.doubtful if a is not kept.ego}
+        kept = kept.drop_doubtful()
     if warning is not None:
         warnable(kept if confidence is not None else kept.active)
     policy = load_policy(ego) if ego is not None else BrakeWhenWarned(warning) if brake else None
@@ -132,19 +138,6 @@ def replay(
     if strict:
         require_strict(result, limits)
     opt.say_all("limit exceeded", check_limits(result, limits), quiet=quiet)
-
-
-def _trusted(scenario: Scenario, confidence: float | None, *, drop_doubtful: bool) -> tuple[Scenario, dict[str, str]]:
-    """Return the scenario without the agents that are not wanted, and these with why."""
-    from log2sim.datatypes import explain_doubt, format_confidence
-
-    kept = scenario.active if confidence is None else scenario.trusted(confidence)
-    there = {a.id for a in kept.agents}
-    left_out = {a.id: format_confidence(a) for a in scenario.agents if a.id not in there}
-    if drop_doubtful:
-        left_out |= {a.id: explain_doubt(a) for a in kept.doubtful if a is not kept.ego}
-        kept = kept.drop_doubtful()
-    return kept, left_out
 
 
 def predict(

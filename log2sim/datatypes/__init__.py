@@ -9,13 +9,13 @@ from log2sim.datatypes.agent import (
     STANDSTILL_DRIFT_M,
     STANDSTILL_MPS,
     Agent,
+    AgentTable,
     Trajectory,
     Waypoints,
     explain_doubt,
     format_confidence,
     list_doubtful,
 )
-from log2sim.datatypes.agent_table import AgentTable
 from log2sim.datatypes.categories import (
     CATEGORIES,
     CATEGORY,
@@ -73,8 +73,17 @@ from log2sim.datatypes.map_features import (
     Marking,
     RoadBorder,
 )
-from log2sim.datatypes.scenario import EGO, SIGNAL_STATES, VERSION, Scenario, Signal, count_agents, count_categories
-from log2sim.datatypes.tag import TAGS, Tag
+from log2sim.datatypes.scenario import (
+    EGO,
+    SIGNAL_STATES,
+    TAGS,
+    VERSION,
+    Scenario,
+    Signal,
+    Tag,
+    count_agents,
+    count_categories,
+)
 
 __all__ = [
     "BORDER_KINDS", "CATEGORIES", "CATEGORY", "COLOR_NAMES", "EGO", "ENDS", "FIRST_SPEED_MPS", "GROUPS",

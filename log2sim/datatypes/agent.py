@@ -1,4 +1,4 @@
-"""Road users: a box of one size on a trajectory, with what speaks against it."""
+"""Road users: a box of one size on a trajectory, with what speaks against it; boxes of many at common times, as columns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.datatypes.categories import CATEGORIES
+from log2sim.datatypes.categories import CATEGORIES, GROUP_OF
 from log2sim.datatypes.findings import Finding
 from log2sim.datatypes.log import Span
 from log2sim.errors import ScenarioError
@@ -248,9 +248,7 @@ class Agent:
     # that it is right
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0  # in [0, 1]
-    quality: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # figures of the reconstruction, such as the number of detections
+    quality: Mapping[str, Any] = field(default_factory=dict)  # figures such as the number of detections
     doubts: tuple[Finding, ...] = ()  # what speaks against it
     # Times of the scenario, s, between which each of the `ENDS` measured it; empty for truth and the ego
     observed_by: Mapping[str, tuple[Span, ...]] = field(default_factory=dict)
@@ -296,6 +294,75 @@ class Agent:
         return AgentStates(valid=valid, **{k: np.where(valid, v, np.nan) for k, v in states._asdict().items()})
 
 
+@dataclass(frozen=True, eq=False)
+class AgentTable:
+    """Boxes of A agents at T times, map frame; NaN where an agent is absent."""
+
+    __repr__ = short_repr
+
+    agents: tuple[Agent, ...]
+    t_s: Array  # (T,), s
+    center_m: Array  # (A, T, 3), m
+    yaw_rad: Array  # (A, T), in [-pi, pi)
+    speed_mps: Array  # (A, T), m/s: along the heading, negative when reversing
+
+    @classmethod
+    def of(cls, agents: Sequence[Agent], t_s: Array, *, margin_s: float = MARGIN_S, permanent: bool = False) -> Self:
+        """Evaluate agents at times (T,); those with `is_permanent` are there at all of them where `permanent` says so.
+
+        Up to `margin_s` before and after its life an agent moves on as it starts and ends.
+        """
+        columns = np.full((5, len(agents), len(t_s)), np.nan)
+        for k, agent in enumerate(agents):
+            states = agent.at(t_s, margin_s=np.inf if permanent and agent.is_permanent else margin_s)
+            outside_s = t_s - np.clip(t_s, *agent.waypoints.t_s[[0, -1]])
+            dx, dy = (states.speed_mps * turn(states.yaw_rad) * outside_s for turn in (np.cos, np.sin))
+            columns[:, k] = states.x_m + dx, states.y_m + dy, states.z_m, states.yaw_rad, states.speed_mps
+        return cls(tuple(agents), t_s, np.moveaxis(columns[:3], 0, -1).copy(), *columns[3:])
+
+    def take(self, rows: NDArray[np.generic]) -> AgentTable:
+        """Return some of the agents."""
+        return AgentTable(
+            tuple(self.agents[k] for k in np.arange(len(self.agents))[rows].tolist()), self.t_s,
+            self.center_m[rows], self.yaw_rad[rows], self.speed_mps[rows],
+        )  # fmt: skip
+
+    @cached_property
+    def present(self) -> NDArray[np.bool_]:
+        """Whether an agent is there (A, T)."""
+        return np.isfinite(self.yaw_rad)
+
+    @cached_property
+    def size_m(self) -> Array:
+        """Length, width, height (A, 3)."""
+        return np.array([agent.size_m for agent in self.agents], dtype=np.float64).reshape(-1, 3)
+
+    @cached_property
+    def category(self) -> NDArray[np.str_]:
+        """Category (A,) of each agent."""
+        return np.array([agent.category for agent in self.agents], dtype="<U16")
+
+    @cached_property
+    def group(self) -> NDArray[np.str_]:
+        """Group (A,) of these categories."""
+        return np.array([GROUP_OF.get(agent.category, "other") for agent in self.agents], dtype="<U16")
+
+    @property
+    def xy_m(self) -> Array:
+        """Place (A, T, 2) of the center on the ground."""
+        return self.center_m[..., :2]
+
+    @cached_property
+    def heading_velocity_mps(self) -> Array:
+        """Velocity (A, T, 2) along the heading."""
+        return np.stack([self.speed_mps * np.cos(self.yaw_rad), self.speed_mps * np.sin(self.yaw_rad)], axis=-1)
+
+    def rectangles(self, row: NDArray[np.intp] | int, time: NDArray[np.intp] | slice) -> Array:
+        """Return footprints (n, 5) at rows and times (n,): x, y, length, width, yaw, as `rectangle_overlap` takes them."""
+        xy, yaw = self.xy_m[row, time], self.yaw_rad[row, time]
+        return np.column_stack([xy, np.broadcast_to(self.size_m[row, :2], xy.shape), yaw])
+
+
 def agent_to_dict(agent: Agent) -> dict[str, Any]:
     """Return the entry of an agent in a document of `schemas/scenario-1.json`."""
     columns = {k: v.astype(_type(k)).tolist() for k, v in agent.waypoints.columns().items()}
@@ -334,6 +401,13 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
     problem = waypoints.problem()
     if problem is not None:
         raise ScenarioError(f"{where}: {problem}")
+    # Before there were doubts, `quality` named the limits that its motion breaks.
+    flags = entry["quality"].get("flags")
+    listed = flags if isinstance(flags, list) else ()
+    doubts = [Finding(str(flag), text=f"breaks the limit of {flag}") for flag in listed]
+    if "doubts" in entry:
+        doubts = [Finding.from_dict(doubt) for doubt in entry["doubts"]]
+    spans = entry.get("observed_by", {}).items()
     size = entry["size_m"]
     return Agent(
         id=entry["id"],
@@ -345,26 +419,14 @@ def agent_from_dict(entry: Mapping[str, Any]) -> Agent:
         color=entry["color"],
         confidence=float(entry["confidence"]),
         quarantined=bool(entry.get("quarantined", False)),
-        doubts=_doubts_of(entry),
+        doubts=tuple(doubts),
         quality=entry["quality"],
-        observed_by={
-            end: tuple((float(first), float(last)) for first, last in spans)
-            for end, spans in entry.get("observed_by", {}).items()
-        },
+        observed_by={end: tuple((float(first), float(last)) for first, last in of_end) for end, of_end in spans},
     )
 
 
 def _type(column: str) -> Any:
     return bool if column in ("observed", "visible") else np.float64
-
-
-def _doubts_of(entry: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Read the doubts of an agent; before there were any, `quality` named the limits that its motion breaks."""
-    if "doubts" in entry:
-        return tuple(Finding.from_dict(doubt) for doubt in entry["doubts"])
-    flags = entry["quality"].get("flags")
-    listed = flags if isinstance(flags, list) else ()
-    return tuple(Finding(str(flag), text=f"breaks the limit of {flag}") for flag in listed)
 
 
 MAX_LISTED = 5

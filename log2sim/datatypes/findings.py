@@ -316,9 +316,8 @@ class Finding:
     def __post_init__(self) -> None:
         """Refuse numbers that its kind does not name, and an unknown kind without a sentence; `ValueError`."""
         if self.text is None and (self.kind not in KINDS or set(self.values) - set(KINDS[self.kind].numbers)):
-            raise ValueError(
-                f"finding '{self.kind}' with {sorted(self.values)}: no such kind, or it has no such numbers"
-            )
+            wrong = "no such kind, or it has no such numbers"
+            raise ValueError(f"finding '{self.kind}' with {sorted(self.values)}: {wrong}")
 
     def __str__(self) -> str:
         """Return subject and sentence."""
@@ -329,7 +328,7 @@ class Finding:
         """One line for people: what was found, when, and what was done about it."""
         if self.text is not None:
             return self.text
-        kind, values = KINDS[self.kind], self.values
+        kind, values, digits = KINDS[self.kind], self.values, 2 if self.subject else 1
         words = kind.words if isinstance(kind.words, str) else kind.words.get(self.case) or kind.words[self.treatment]
         done = {
             "corrected": "corrected",
@@ -338,13 +337,10 @@ class Finding:
         }
         as_read = {f"{name[:-1]}ms": 1e3 * value for name, value in values.items() if name.endswith("_s")}
         as_read |= {f"{name[:-3]}deg": float(np.degrees(v)) for name, v in values.items() if name.endswith("_rad")}
-        at = f" at {values['at_s']:.1f} s" if "at_s" in values else ""
-        return words.format(**as_read, **values, other=self.other, when=self._when(), done=done[self.treatment]) + at
-
-    def _when(self) -> str:
-        digits = 2 if self.subject else 1
         first, last = (f"{max(t_s or 0.0, 0.0):.{digits}f}" for t_s in (self.start_s, self.end_s))
-        return f"at {first} s" if first == last else f"from {first} to {last} s"
+        when = f"at {first} s" if first == last else f"from {first} to {last} s"
+        at = f" at {values['at_s']:.1f} s" if "at_s" in values else ""
+        return words.format(**as_read, **values, other=self.other, when=when, done=done[self.treatment]) + at
 
     def holds(self, t_s: Array) -> NDArray[np.bool_]:
         """Return whether it holds at times (T,)."""

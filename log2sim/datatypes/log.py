@@ -88,7 +88,13 @@ class IgnoreRegions:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the part `unlabeled` of a document of `schemas/scenario-1.json`."""
-        document = {"outside_views": self.outside_views, "views": [_view_to_dict(v) for v in self.views]}
+        columns = ("t_s", "translation_m", "rotation_wxyz", "region_frame", "region_px")
+        views = [
+            {"camera": v.camera.name, "intrinsics": intrinsics_to_dict(v.camera)}
+            | {name: getattr(v, name).tolist() for name in columns}
+            for v in self.views
+        ]
+        document: dict[str, Any] = {"outside_views": self.outside_views, "views": views}
         return {**document, "categories": list(self.categories)} if self.categories else document
 
     @classmethod
@@ -116,12 +122,6 @@ def camera_of(name: str, intrinsics: Mapping[str, Any], mount: Mount, mount_T_ca
     return Camera(name, i["width_px"], i["height_px"], K, mount, mount_T_cam, model, lens)
 
 
-def _view_to_dict(view: LabelView) -> dict[str, Any]:
-    columns = ("t_s", "translation_m", "rotation_wxyz", "region_frame", "region_px")
-    about = {"camera": view.camera.name, "intrinsics": intrinsics_to_dict(view.camera)}
-    return about | {name: getattr(view, name).tolist() for name in columns}
-
-
 def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
     camera = camera_of(entry["camera"], entry["intrinsics"], "map", np.eye(4))
     t_s = np.array(entry["t_s"], dtype=np.float64)
@@ -130,9 +130,8 @@ def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
     frame = np.array(entry["region_frame"], dtype=np.int64)
     box = np.array(entry["region_px"], dtype=np.float64).reshape(-1, 4)
     if not len(t_s) == len(position) == len(q):
-        raise ScenarioError(
-            f"{where}: {len(t_s)} stamps, {len(position)} translations, {len(q)} rotations; expected equal"
-        )
+        counts = f"{len(t_s)} stamps, {len(position)} translations, {len(q)} rotations"
+        raise ScenarioError(f"{where}: {counts}; expected equal")
     if len(frame) != len(box) or np.any(frame >= len(t_s)):
         raise ScenarioError(f"{where}: region_frame must hold one index of a stamp for each of the {len(box)} regions")
     if np.any(np.diff(t_s) <= 0):
@@ -257,9 +256,7 @@ class Stream:
     __repr__ = short_repr
 
     name: str  # of the sensor
-    t_ns: Deferred[NDArray[np.int64]] = (
-        Deferred()
-    )  # (F,): absolute stamps, increasing; may be a function that reads them
+    t_ns: Deferred[NDArray[np.int64]] = Deferred()  # (F,): absolute, increasing; may be a function that reads them
     # Returns record `i`: (H, W, 3) uint8 BGR of a camera, a `Sweep` of a LiDAR. Raises `RecordError` for a record that cannot be read.
     # Several threads may call it at once.
     read: Callable[[int], Any]  # type: ignore[misc]  # `t_ns` is a descriptor, it has no default
@@ -306,9 +303,7 @@ class Log:
     ignored_regions: Mapping[str, ImageRegions] = field(
         default_factory=dict
     )  # by camera: where `labels` are incomplete
-    ground_z_ego_m: Deferred[float] = Deferred(
-        0.0
-    )  # height of the road in the ego frame; 0 when its origin is on the ground
+    ground_z_ego_m: Deferred[float] = Deferred(0.0)  # of the road in the ego frame; 0 when its origin is on the ground
     reference_camera: str | None = None  # the camera whose stamps make the ticks
     digest: str = ""  # SHA-256 over the log's index
     notes: Deferred[tuple[str, ...]] = Deferred(())  # remarks of the reader for the report
@@ -431,7 +426,4 @@ def retime_spans(
 ) -> dict[str, tuple[Span, ...]]:
     """Put the spans of each end elsewhere in time by `change`, s to s; what ends before `begin_s` is left out."""
     moved = {end: [(change(first), change(last)) for first, last in spans] for end, spans in observed_by.items()}
-    return {
-        end: tuple((max(first, begin_s), last) for first, last in spans if last >= begin_s)
-        for end, spans in moved.items()
-    }
+    return {end: tuple((max(a, begin_s), b) for a, b in spans if b >= begin_s) for end, spans in moved.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.log import IgnoreRegions, MapFrame
 from log2sim.datatypes.map_features import MapFeatures, unique_ids
-from log2sim.datatypes.tag import Tag
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.files import plugins
 from log2sim.files.documents import check, from_entry, read_json, replaced, short_repr, to_entry, write_json
@@ -47,6 +47,49 @@ class Signal:
         return np.asarray(np.where(k >= 0, self.state[np.maximum(k, 0)], "unknown"))
 
 
+TAGS: Mapping[str, str] = {
+    "in_lane": "is in a lane of the map",
+    "lane_change": "changes to a lane beside it",
+    "turning": "turns by at least 60 degrees, to the left where angle_rad is positive",
+    "u_turn": "turns back",
+    "starting": "starts from standstill",
+    "stopping": "brakes to standstill",
+    "standing": "stands; it moves at another time",
+    "standing_at_light": "stands before a traffic light that is red or yellow",
+    "standing_at_crosswalk": "stands before a crosswalk",
+    "hard_braking": "brakes harder than is comfortable",
+    "following": "drives behind the other in its lane, about as fast",
+    "approaching": "comes nearer to the other, which is ahead in its lane",
+    "cut_in": "changes into the lane of the other, ahead of it",
+    "cut_out": "leaves the lane of the other, which it was ahead of",
+    "merging": "turns into the lane of the other, ahead of it, from another road",
+    "overtaking": "passes the other, which moves in the same direction",
+    "crossing_path": "crosses the path of the other",
+    "turning_across": "turns across the path of the other, which is oncoming",
+    "oncoming_in_lane": "comes toward the other in its lane",
+    "stepping_out": "walks into the path of the other from where something hid it",
+    "near_miss": "comes so near to the other that little is missing to a collision",
+}
+"""What a tag says of its agent, and of the other where there is one."""
+
+
+@dataclass(frozen=True)
+class Tag:
+    """What an agent does during a time."""
+
+    tag: str  # one of `TAGS`
+    agent: str  # id of who does it
+    start_s: float
+    t_s: float  # the moment that `quantities` are of
+    end_s: float
+    probability: float  # that it is so, by the standard deviations and the confidence of the agents, in [0, 1]
+    other: str | None = None  # id of the agent that it is done to
+    lane: str | None = None  # the lane that the agent is in then, or changes to
+    quantities: Mapping[str, float] = field(
+        default_factory=dict
+    )  # what defines it, in SI units, which the names end with
+
+
 COLUMNS: dict[str, tuple[str, str]] = {
     "agent": ("", "id of the agent"),
     "category": ("", "category of the agent"),
@@ -75,78 +118,18 @@ PER_AGENT = ("category", "length_m", "width_m", "height_m", "static", "confidenc
 
 def columns_of(agents: Sequence[Agent]) -> dict[str, NDArray[Any]]:
     """Return the columns (R,) with one row for each agent and waypoint, in the order of the agents."""
-    parts = [_columns_of(agent) for agent in agents]
+    parts = []
+    for agent in agents:
+        known, (length, width, height) = agent.waypoints.columns(), agent.size_m
+        doubts = ",".join(dict.fromkeys(doubt.kind for doubt in agent.doubts))
+        same: dict[str, Any] = {
+            "agent": agent.id, "category": agent.category, "length_m": length, "width_m": width, "height_m": height,
+            "static": agent.static, "confidence": agent.confidence, "doubts": doubts, "sigma_yaw_rad": np.nan,
+            "sigma_speed_mps": np.nan,
+        }  # fmt: skip
+        rows = len(agent.waypoints)
+        parts.append({k: known[k] if k in known else np.full(rows, same[k], dtype=_kind(k)) for k in COLUMNS})
     return {key: np.concatenate([np.zeros(0, _kind(key)), *(part[key] for part in parts)]) for key in COLUMNS}
-
-
-def dataframe_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
-    """Return the columns as a pandas DataFrame with `about` as its `attrs`; `MissingExtra` when pandas is not installed."""
-    try:
-        import pandas as pd
-    except ImportError:
-        raise MissingExtra("to_dataframe", "dataframe") from None
-    frame = pd.DataFrame(columns_of(agents))
-    frame.attrs = dict(about)
-    return frame
-
-
-def dataset_of(agents: Sequence[Agent], about: Mapping[str, Any]) -> Any:
-    """Return the columns as an xarray Dataset along agents (A,) and the times of all waypoints (T,); `about` becomes its `attrs`."""
-    try:
-        import xarray
-    except ImportError:
-        raise MissingExtra("to_xarray", "xarray") from None
-    columns = columns_of(agents)
-    t_s, tick = np.unique(columns["t_s"], return_inverse=True)
-    counts = [len(agent.waypoints) for agent in agents]
-    row = np.repeat(np.arange(len(agents)), counts)
-    first = np.cumsum([0, *counts[:-1]]) if agents else np.zeros(0, dtype=np.intp)
-    along: dict[str, Any] = {}
-    for key, (unit, meaning) in COLUMNS.items():
-        values, about_key = columns[key], {"units": unit, "description": meaning}
-        if key in PER_AGENT:
-            along[key] = ("agent", values[first], about_key)
-        elif key not in ("agent", "t_s"):
-            table = np.full((len(agents), len(t_s)), False if key in FLAGS else np.nan)
-            table[row, tick] = values
-            along[key] = (("agent", "t_s"), table, about_key)
-    coordinates = {
-        "agent": [agent.id for agent in agents],
-        "t_s": ("t_s", t_s, {"units": "s", "description": COLUMNS["t_s"][1]}),
-    }
-    return xarray.Dataset(along, coords=coordinates, attrs=dict(about))
-
-
-def write_states(agents: Sequence[Agent], about: Mapping[str, Any], path: Path) -> None:
-    """Write the columns as a Parquet file whose schema states unit and meaning of each; `about` are its metadata."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError:
-        raise MissingExtra("to_parquet", "parquet") from None
-    columns = columns_of(agents)
-    kinds = {key: pa.string() if key in TEXTS else pa.bool_() if key in FLAGS else pa.float64() for key in COLUMNS}
-    fields = [
-        pa.field(key, kinds[key], nullable=False, metadata={"unit": unit, "description": meaning})
-        for key, (unit, meaning) in COLUMNS.items()
-    ]
-    schema = pa.schema(fields, metadata={key: str(value) for key, value in about.items()})
-    table = pa.table([pa.array(columns[key].tolist(), kinds[key]) for key in COLUMNS], schema=schema)
-    with replaced(path) as temporary:
-        pq.write_table(table, temporary)
-
-
-def _columns_of(agent: Agent) -> dict[str, NDArray[Any]]:
-    w, rows = agent.waypoints, len(agent.waypoints)
-    length, width, height = agent.size_m
-    doubts = ",".join(dict.fromkeys(doubt.kind for doubt in agent.doubts))
-    same: dict[str, Any] = {
-        "agent": agent.id, "category": agent.category, "length_m": length, "width_m": width, "height_m": height,
-        "static": agent.static, "confidence": agent.confidence, "doubts": doubts, "sigma_yaw_rad": np.nan,
-        "sigma_speed_mps": np.nan,
-    }  # fmt: skip
-    known = w.columns()
-    return {key: known[key] if key in known else np.full(rows, same[key], dtype=_kind(key)) for key in COLUMNS}
 
 
 def _kind(key: str) -> Any:
@@ -309,7 +292,13 @@ class Scenario:
 
         Raises `MissingExtra` when pandas is not installed.
         """
-        return dataframe_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
+        try:
+            import pandas as pd
+        except ImportError:
+            raise MissingExtra("to_dataframe", "dataframe") from None
+        frame = pd.DataFrame(columns_of(self.agents))
+        frame.attrs = {"name": self.name, "t0_ns": int(self.t0_ns)}
+        return frame
 
     def to_xarray(self) -> Any:
         """Return an xarray Dataset: the columns of `to_dataframe` along `agent` and, where they change with it, `t_s`.
@@ -319,14 +308,48 @@ class Scenario:
 
         Raises `MissingExtra` when xarray is not installed.
         """
-        return dataset_of(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)})
+        try:
+            import xarray
+        except ImportError:
+            raise MissingExtra("to_xarray", "xarray") from None
+        agents, columns = self.agents, columns_of(self.agents)
+        t_s, tick = np.unique(columns["t_s"], return_inverse=True)
+        counts = [len(agent.waypoints) for agent in agents]
+        row = np.repeat(np.arange(len(agents)), counts)
+        first = np.cumsum([0, *counts[:-1]]) if agents else np.zeros(0, dtype=np.intp)
+        along: dict[str, Any] = {}
+        for key, (unit, meaning) in COLUMNS.items():
+            values, about = columns[key], {"units": unit, "description": meaning}
+            if key in PER_AGENT:
+                along[key] = ("agent", values[first], about)
+            elif key not in ("agent", "t_s"):
+                table = np.full((len(agents), len(t_s)), False if key in FLAGS else np.nan)
+                table[row, tick] = values
+                along[key] = (("agent", "t_s"), table, about)
+        times = ("t_s", t_s, {"units": "s", "description": COLUMNS["t_s"][1]})
+        coordinates = {"agent": [agent.id for agent in agents], "t_s": times}
+        return xarray.Dataset(along, coords=coordinates, attrs={"name": self.name, "t0_ns": int(self.t0_ns)})
 
     def to_parquet(self, path: Path | str) -> None:
         """Write the rows of `to_dataframe` as a Parquet file, atomically; its schema states unit and meaning of each column.
 
         Raises `MissingExtra` when pyarrow is not installed; `ConfigError` when the file cannot be written.
         """
-        write_states(self.agents, {"name": self.name, "t0_ns": int(self.t0_ns)}, Path(path))
+        try:
+            import pyarrow as pa
+            import pyarrow.parquet as pq
+        except ImportError:
+            raise MissingExtra("to_parquet", "parquet") from None
+        columns = columns_of(self.agents)
+        kinds = {key: pa.string() if key in TEXTS else pa.bool_() if key in FLAGS else pa.float64() for key in COLUMNS}
+        fields = [
+            pa.field(key, kinds[key], nullable=False, metadata={"unit": unit, "description": meaning})
+            for key, (unit, meaning) in COLUMNS.items()
+        ]
+        schema = pa.schema(fields, metadata={"name": self.name, "t0_ns": str(int(self.t0_ns))})
+        table = pa.table([pa.array(columns[key].tolist(), kinds[key]) for key in COLUMNS], schema=schema)
+        with replaced(path) as temporary:
+            pq.write_table(table, temporary)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `schemas/scenario-1.json`."""
@@ -392,9 +415,7 @@ class Scenario:
         )
         for signal in scenario.signals:
             if len(signal.t_s) != len(signal.state):
-                raise ScenarioError(
-                    f"signal '{signal.id}': {len(signal.t_s)} times, {len(signal.state)} states; expected equal"
-                )
+                raise ScenarioError(f"signal '{signal.id}': {len(signal.t_s)} times for {len(signal.state)} states")
             if np.any(np.diff(signal.t_s) <= 0):
                 raise ScenarioError(f"signal '{signal.id}': t_s does not increase")
         unique_ids("agent", scenario.agents)
@@ -416,15 +437,9 @@ def count_agents(ids: Iterable[str]) -> str:
 
 def count_categories(agents: Sequence[Agent]) -> str:
     """Count agents by category, most frequent first, with how many of each are static: "8 cars (3 static), 1 bus"."""
-    counts: dict[str, list[int]] = {}
-    for agent in agents:
-        count = counts.setdefault(agent.category, [0, 0])
-        count[0] += 1
-        count[1] += agent.static
-    ordered = sorted(counts.items(), key=lambda entry: (-entry[1][0], entry[0]))
-    return ", ".join(_count_category(category, total, static) for category, (total, static) in ordered)
-
-
-def _count_category(category: str, total: int, static: int) -> str:
-    noun = category if total == 1 else PLURALS.get(category, f"{category}s")
-    return f"{total} {noun}" + (f" ({static} static)" if static else "")
+    total, static = Counter(a.category for a in agents), Counter(a.category for a in agents if a.static)
+    parts = []
+    for category, count in sorted(total.items(), key=lambda entry: (-entry[1], entry[0])):
+        noun = category if count == 1 else PLURALS.get(category, f"{category}s")
+        parts.append(f"{count} {noun}" + (f" ({static[category]} static)" if static[category] else ""))
+    return ", ".join(parts)

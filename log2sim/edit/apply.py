@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
-from log2sim.edit.edits import Add, Agents, Edit, Only, Remove
-from log2sim.edit.motion import MIN_PATH_MPS, chords
+from log2sim.edit.edits import MIN_PATH_MPS, Add, Agents, Edit, Only, Remove, chords
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.files.plugins import nearest
 from log2sim.simulation.metrics.all_metrics import OFF_PATH_M
@@ -48,36 +47,6 @@ def _overlaps(scenario: Scenario, changed: Set[str]) -> Sequence[dict[str, Any]]
     replayed = replay(replace(scenario, agents=tuple(agents)), mode="exact", dt_s=STEP_S)
     collisions: Sequence[dict[str, Any]] = replayed.metrics["collisions"]
     return collisions
-
-
-def _undrivable(before: Scenario, after: Scenario, changed: Sequence[Agent]) -> Iterator[str]:
-    """Yield the agents that their vehicle model cannot keep on the edited path, though it could on that of the source."""
-    moving = tuple(a for a in changed if not a.static and GROUP_OF[a.category] != "pedestrian")
-    if not moving:
-        return
-
-    def off_path_of(scenario: Scenario) -> dict[str, float]:  # with the largest distance across it, m
-        figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]
-        across = {name: entry.get("cross_track_max_m") for name, entry in figures.items()}
-        return {name: float(value) for name, value in across.items() if value is not None and value > OFF_PATH_M}
-
-    off_path = off_path_of(replace(after, agents=moving))
-    same = tuple(a for a in before.agents if a.id in off_path and not a.static)
-    known = off_path_of(replace(before, agents=same)) if same else {}
-    for agent in moving:
-        across_m = off_path.get(agent.id, 0.0)
-        if across_m > known.get(agent.id, 0.0):
-            yield f"agent '{agent.id}': its vehicle model leaves the path by {across_m:.2f} m, limit {OFF_PATH_M:g} m"
-
-
-def _infeasible(before: Agent | None, after: Agent) -> Iterator[str]:
-    """Yield acceleration and curvature beyond their limits and beyond those of the source."""
-    curvature_limit = CURVATURE_LIMITS_1PM.get(GROUP_OF[after.category], np.inf)
-    known = {} if before is None else _peaks(before)
-    for what, (peak, t_s) in _peaks(after).items():
-        limit, unit = (MAX_ACCEL_MPS2, "m/s2") if what == "acceleration" else (curvature_limit, "1/m")
-        if peak > max(limit, known.get(what, (0.0, 0.0))[0]) * RELATIVE_TOLERANCE:
-            yield f"agent '{after.id}': {what} {peak:.3g} {unit} at {t_s:.2f} s, limit {limit:g} {unit}"
 
 
 def _peaks(agent: Agent) -> dict[str, tuple[float, float]]:
@@ -137,9 +106,8 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     for step in edits:
         for name in step.names:
             if name not in known:
-                some = ", ".join(known[:MAX_LISTED]) + f" and {len(known) - MAX_LISTED} more" * (
-                    len(known) > MAX_LISTED
-                )
+                more = len(known) - MAX_LISTED
+                some = ", ".join(known[:MAX_LISTED]) + f" and {more} more" * (more > 0)
                 raise ConfigError(f"{step.kind}: no agent '{name}'{nearest(name, known)}; known: {some}")
             if (step.kind, name) in seen and not isinstance(step, Only | Remove | Add):
                 raise ConfigError(f"{step.kind}: agent '{name}' is named twice; give one value")
@@ -170,7 +138,31 @@ def find_problems(source: Scenario, changed: Scenario, agents: Sequence[Agent]) 
     `agents`: those of the changed scenario that were changed. New collisions, accelerations and curvatures that no vehicle reaches, and
     agents whose vehicle model cannot keep on their paths.
     """
-    known = {a.id: a for a in source.agents}
-    infeasible = [line for a in agents for line in _infeasible(known.get(a.id), a)]
-    undrivable = () if infeasible else _undrivable(source, changed, agents)
-    return (*_collisions(source, changed, {a.id for a in agents}), *infeasible, *undrivable)
+    known, lines = {a.id: a for a in source.agents}, []
+    for agent in agents:  # acceleration and curvature beyond their limits and beyond those of the source
+        before = _peaks(known[agent.id]) if agent.id in known else {}
+        for what, (peak, t_s) in _peaks(agent).items():
+            limit, unit = (MAX_ACCEL_MPS2, "m/s2")
+            if what == "curvature":
+                limit, unit = CURVATURE_LIMITS_1PM.get(GROUP_OF[agent.category], np.inf), "1/m"
+            if peak > max(limit, before.get(what, (0.0, 0.0))[0]) * RELATIVE_TOLERANCE:
+                lines.append(f"agent '{agent.id}': {what} {peak:.3g} {unit} at {t_s:.2f} s, limit {limit:g} {unit}")
+    moving = tuple(a for a in agents if not a.static and GROUP_OF[a.category] != "pedestrian")
+    if (
+        not lines and moving
+    ):  # agents that their vehicle model cannot keep on the path, though it could on that of the source
+
+        def off_path(scenario: Scenario) -> dict[str, float]:  # with the largest distance across it, m
+            figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]
+            across = {name: entry.get("cross_track_max_m") for name, entry in figures.items()}
+            return {name: float(value) for name, value in across.items() if value is not None and value > OFF_PATH_M}
+
+        now = off_path(replace(changed, agents=moving))
+        same = tuple(a for a in source.agents if a.id in now and not a.static)
+        then = off_path(replace(source, agents=same)) if same else {}
+        lines += [
+            f"agent '{name}': its vehicle model leaves the path by {now[name]:.2f} m, limit {OFF_PATH_M:g} m"
+            for name in (a.id for a in moving)
+            if now.get(name, 0.0) > then.get(name, 0.0)
+        ]
+    return (*_collisions(source, changed, {a.id for a in agents}), *lines)

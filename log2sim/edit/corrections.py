@@ -16,8 +16,7 @@ import numpy as np
 from log2sim.datatypes import EGO, TYPICAL_SIZE_M, Agent, MapFeatures, Marking, RoadBorder, Scenario, Waypoints
 from log2sim.datatypes.agent import STANDSTILL_MPS, hermite, hermite_slope
 from log2sim.datatypes.map_features import BORDER_KINDS
-from log2sim.edit.edits import ground_at, new_id
-from log2sim.edit.motion import STEP_S, insert_steps, resampled
+from log2sim.edit.edits import STEP_S, ground_at, insert_steps, new_id, resampled
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check, read_json
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
@@ -403,9 +402,7 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
     Where both have states the mean by their variances stands. A gap is bridged by the cubic through the places and velocities
     at its ends, the mean of a motion of white acceleration, whose variance is a^2 s^3 (T - s)^3 / (3 T^3) at time s of T.
     """
-    longer = max(
-        (agent, other), key=lambda a: (int(a.waypoints.observed.sum()), a.waypoints.t_s[-1] - a.waypoints.t_s[0])
-    )
+    longer = max((agent, other), key=lambda a: (int(a.waypoints.observed.sum()), np.ptp(a.waypoints.t_s)))
     static = agent.static and other.static
     if static:
         waypoints = _mean_of_static(agent.waypoints, other.waypoints)

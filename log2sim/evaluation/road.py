@@ -107,7 +107,6 @@ MATCH_M = 0.3
 # Found points farther from every true line than this, about a third of a lane, belong to none and have no lateral
 # error.
 LATERAL_REACH_M = 1.0
-
 Line = Marking | RoadBorder
 Counts = Callable[[Array], NDArray[np.bool_]]  # which of places (N, 2) count
 
@@ -235,9 +234,7 @@ def shape_figures(found: Sequence[Marking], true: Sequence[Marking], area: Area)
 def _alike(kind: str, a: BaseGeometry, b: BaseGeometry) -> float:
     """How much two of a kind are the same, 0 where they are not."""
     if kind == "stop_line":
-        shared = min(
-            a.intersection(b.buffer(STOP_LINE_REACH_M)).length, b.intersection(a.buffer(STOP_LINE_REACH_M)).length
-        )
+        shared = min(p.intersection(q.buffer(STOP_LINE_REACH_M)).length for p, q in ((a, b), (b, a)))
         part = shared / max(a.length, b.length) if max(a.length, b.length) > 0 else 0.0
         return float(part) if part >= MIN_STOP_LINE_SHARE else 0.0
     union = a.union(b).area

@@ -19,8 +19,6 @@ from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents, controller_data
 
 MODES = ("exact", "pid")
-
-
 options: tuple[str, ...] = ("map", "mode")
 loses = (
     "sizes (CARLA's assets have their own; the data list by how much), states of traffic lights, map origin, cameras, quality,"

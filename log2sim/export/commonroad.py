@@ -33,7 +33,6 @@ GOAL_SIDE_M = 1.0
 GOAL_YAW_RAD = 0.35
 GOAL_SPEED_MPS = 3.0
 UNKNOWN_PLACE = ("-999", "999", "999")  # CommonRoad's values for no GeoNames id, latitude and longitude
-
 TYPE_OF_CATEGORY = {
     "car": "car", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle",
     "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
@@ -44,8 +43,6 @@ LIGHT = {
 LINE_MARKING = {"solid": "solid", "broken": "dashed", "curb": "curb", "none": "no_marking"}
 # Static obstacles have types of their own, without pedestrians: those are dynamic obstacles that do not move.
 STATIC_TYPE = dict.fromkeys(("car", "truck", "bus", "motorcycle", "bicycle"), "parkedVehicle") | {"other": "unknown"}
-
-
 options: tuple[str, ...] = ()
 loses = (
     "colors, uncertainty and observed flags, times between steps of 0.1 s and before the ego's first, the ego's way "

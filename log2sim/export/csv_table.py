@@ -19,7 +19,6 @@ COLUMNS = (
 )  # fmt: skip
 ABOUT = ("length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence", "doubts")
 HEADER = ("id", "category", *COLUMNS, *ABOUT)
-
 # Texts that spreadsheets execute as a formula: they begin so and are no number.
 FORMULA = re.compile(r"\s*[=+\-@](?!\d+(\.\d+)?$)")
 

@@ -20,7 +20,6 @@ from log2sim.files.outputs import expect_new, place_all, temporary_beside, unfin
 from log2sim.geometry import Array, whole_kilometers, wrap_angle
 
 __all__ = ["EXTERNAL", "Exporter", "Options", "export", "formats"]
-
 EXTERNAL = "external"  # as the ego of an export: another program drives it, from its place and speed in the scenario
 
 

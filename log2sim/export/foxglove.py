@@ -39,7 +39,6 @@ BOX_ALPHA, PATH_ALPHA = 0.6, 0.9
 LABEL_ABOVE_M = 0.5
 PATH_PX, OUTLINE_PX, TEXT_PX = 2.0, 2.0, 12.0
 PLUMB_BOB = 5  # number of coefficients of this model; with more it is called rational
-
 Message = tuple[int, str, Any]  # time in ns, topic and message
 
 
@@ -68,9 +67,8 @@ def scene_messages(steps: viewers.AgentSteps, origin: Array) -> Iterator[Message
 def record_messages(record: viewers.ViewerRecord, origin: Array) -> Iterable[Message]:
     """Return the messages of one record of the log."""
     if isinstance(record, viewers.UnreadableRecord):
-        text = LogMessage(
-            timestamp=_stamp(record.t_ns), level=LogMessage.WARNING, name=record.stream, message=record.reason
-        )
+        stamp, level = _stamp(record.t_ns), LogMessage.WARNING
+        text = LogMessage(timestamp=stamp, level=level, name=record.stream, message=record.reason)
         return [(record.t_ns, "/log", text)]
     if isinstance(record, viewers.ThinnedSweep):
         data, real = (record.points_map - origin).astype("<f4").tobytes(), PackedElementField.FLOAT32
@@ -127,7 +125,16 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
     stamp, topic = _stamp(t_ns), f"/camera/{name}"
     if record.map_T_cam is not None:
         yield t_ns, "/tf", _frame(t_ns, name, transform(record.map_T_cam[:3, :3], record.map_T_cam[:3, 3] - origin))
-    yield t_ns, f"{topic}/calibration", _calibration(record)
+    camera = record.camera
+    known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
+    few = len(camera.distortion) <= PLUMB_BOB
+    model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
+    coefficients = [*camera.distortion, *[0.0] * count][:count]
+    K, P = camera.K.ravel().tolist(), np.column_stack([camera.K, np.zeros(3)]).ravel().tolist()
+    yield t_ns, f"{topic}/calibration", CameraCalibration(
+        timestamp=stamp, frame_id=name, width=camera.width_px, height=camera.height_px, distortion_model=model,
+        D=coefficients, K=K, R=np.eye(3).ravel().tolist(), P=P,
+    )  # fmt: skip
     yield t_ns, f"{topic}/image", CompressedImage(timestamp=stamp, frame_id=name, data=record.jpeg, format="jpeg")
     lines, texts = [], []
     for agent, outline in record.outlines:
@@ -137,20 +144,6 @@ def _picture(record: viewers.CameraFrame, origin: Array) -> Iterator[Message]:
             timestamp=stamp, type=PointsAnnotation.LINE_LIST, points=points, outline_color=color, thickness=OUTLINE_PX,
         ))  # fmt: skip
         place = Point2(x=u, y=v)
-        texts.append(
-            TextAnnotation(timestamp=stamp, position=place, text=agent.id, font_size=TEXT_PX, text_color=color)
-        )
+        label, size = agent.id, TEXT_PX
+        texts.append(TextAnnotation(timestamp=stamp, position=place, text=label, font_size=size, text_color=color))
     yield t_ns, f"{topic}/boxes", ImageAnnotations(timestamp=stamp, points=lines, texts=texts)
-
-
-def _calibration(record: viewers.CameraFrame) -> CameraCalibration:
-    camera = record.camera
-    known = {"none": ("", 0), "fisheye": ("kannala_brandt", 4)}
-    few = len(camera.distortion) <= PLUMB_BOB
-    model, count = known.get(camera.distortion_model, ("plumb_bob", PLUMB_BOB) if few else ("rational_polynomial", 8))
-    coefficients = [*camera.distortion, *[0.0] * count][:count]
-    K, P = camera.K.ravel().tolist(), np.column_stack([camera.K, np.zeros(3)]).ravel().tolist()
-    return CameraCalibration(
-        timestamp=_stamp(record.t_ns), frame_id=camera.name, width=camera.width_px, height=camera.height_px,
-        distortion_model=model, D=coefficients, K=K, R=np.eye(3).ravel().tolist(), P=P,
-    )  # fmt: skip

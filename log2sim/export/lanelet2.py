@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import MapFeatures, MapFrame, MapLane, Marking, RoadBorder, Scenario, Signal
+from log2sim.datatypes import MapFeatures, MapFrame, MapLane, Marking, RoadBorder, Scenario
 from log2sim.export import xml_text
 from log2sim.export.exporters import Options, project_points
 from log2sim.export.roads.network import MarkFinder
@@ -29,8 +29,6 @@ TYPE_OF_MARK = {
     "solid": ("line_thin", "solid"), "broken": ("line_thin", "dashed"), "curb": ("curbstone", "high"), "none": ("virtual", None),
 }  # fmt: skip
 Way = tuple[str, str]  # of a lane, "left" or "right"
-
-
 options: tuple[str, ...] = ()
 loses = (
     "agents, states of traffic lights, widths of lines, confidences of lanes and markings, arrows; a stop line without a light "
@@ -51,7 +49,17 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     lit: set[int] = set()  # stop lines of lights
     for signal in scenario.signals:
         ahead = signal_lanes(signal, roads)
-        members = [("way", _add_light(draft, signal), "refers")]
+        # The lower edge of its housing, from the left to the right of who looks at it.
+        across = 0.0 if signal.heading_rad is None else signal.heading_rad + np.pi / 2
+        side = np.array([np.cos(across), np.sin(across), 0.0]) * LIGHT_WIDTH_M / 2
+        bottom = signal.position_m - [0.0, 0.0, LIGHT_HEIGHT_M / 2]
+        tags = {
+            "subtype": "red_yellow_green",
+            "height": f"{LIGHT_HEIGHT_M:g}",
+            "log2sim_id": xml_text.escaped(signal.id),
+        }
+        light = draft.way(np.stack([bottom - side, bottom + side]), type="traffic_light", **tags)
+        members = [("way", light, "refers")]
         if not ahead:
             continue
         lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
@@ -83,13 +91,11 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
             ring, z = np.array(outline.coords)[:4], np.full(2, marking.points_m[:, 2].mean())
             if np.hypot(*(ring[1] - ring[0])) < np.hypot(*(ring[2] - ring[1])):
                 ring = np.roll(ring, -1, axis=0)
-            edges = [
-                draft.way(np.column_stack([ring[side], z]), type="pedestrian_marking") for side in ([3, 2], [0, 1])
-            ]
+            sides = (np.column_stack([ring[side], z]) for side in ([3, 2], [0, 1]))
+            edges = [draft.way(points, type="pedestrian_marking") for points in sides]
             members = [("way", number, side) for number, side in zip(edges, ("left", "right"))]
-            draft.relation(
-                members, type="lanelet", subtype="crosswalk", one_way="no", **{"participant:pedestrian": "yes"}
-            )
+            tags = {"subtype": "crosswalk", "one_way": "no", "participant:pedestrian": "yes"}
+            draft.relation(members, type="lanelet", **tags)
     xml_text.write(draft.document(), folder / "lanelet2_map.osm")
     (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
 
@@ -211,15 +217,6 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
             tags |= {"color": mark.color} if mark.color in ("white", "yellow") else {}
         way_of[key] = draft.way([root(n) for n in numbers], **tags)
     return way_of | {key: way_of[other] for key, other in same.items()}
-
-
-def _add_light(draft: _Draft, signal: Signal) -> int:
-    """Add a traffic light as the lower edge of its housing, from the left to the right of who looks at it."""
-    across = 0.0 if signal.heading_rad is None else signal.heading_rad + np.pi / 2
-    side = np.array([np.cos(across), np.sin(across), 0.0]) * LIGHT_WIDTH_M / 2
-    bottom = signal.position_m - [0.0, 0.0, LIGHT_HEIGHT_M / 2]
-    tags = {"subtype": "red_yellow_green", "height": f"{LIGHT_HEIGHT_M:g}", "log2sim_id": xml_text.escaped(signal.id)}
-    return draft.way(np.stack([bottom - side, bottom + side]), type="traffic_light", **tags)
 
 
 def _add_sign(draft: _Draft, stop: Marking, lane: MapLane) -> int:

@@ -23,8 +23,6 @@ from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
 
 DECIMALS = 6  # of meters, and finer of radians; pixels have two
 PINHOLE_COEFFICIENTS = 5  # that the schema asks for at least
-
-
 options: tuple[str, ...] = ("log",)
 loses = (
     "uncertainty and observed flags, speeds, times between frames, markings, lanes, traffic lights, map origin, stages; the "

@@ -23,7 +23,6 @@ from log2sim.geometry import NS_PER_S, Array
 
 # Length, width and height of a signal head with three lamps of 200 mm (EN 12368); not measured.
 LIGHT_SIZE_M = (0.3, 0.3, 0.9)
-
 BOUNDARY_TYPE = {"solid": "SOLID_LINE", "broken": "DASHED_LINE", "curb": "CURB", "none": "NO_LINE"}
 BOUNDARY_COLOR = {"white": "WHITE", "yellow": "YELLOW", "standard": "UNKNOWN"}
 # Color and mode by state; OSI has one lamp a light, so that red with yellow is written as yellow.
@@ -110,13 +109,10 @@ def _traffic_lights(osi: Any, scenario: Scenario, first: int, t_s: float) -> lis
 
 SOURCE = "io.log2sim.scenario"
 AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs above ground as a share of the vehicle's height; not measured
-
 # Names in OSI's `MovingObject.VehicleClassification.Type`, whose types include the rider.
 VEHICLE_TYPE = {
     "car": "CAR", "truck": "HEAVY_TRUCK", "bus": "BUS", "motorcycle": "MOTORCYCLE", "cyclist": "BICYCLE", "bicycle": "BICYCLE",
 }  # fmt: skip
-
-
 options: tuple[str, ...] = ()
 loses = (
     "uncertainty and observed flags, whether vehicles are static, times between steps of 0.1 s, confidences of lanes and"

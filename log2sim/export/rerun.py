@@ -24,11 +24,8 @@ from log2sim.geometry import Array
 
 TIMELINE = "time"
 PATH_PX, OUTLINE_PX = 1.5, 1.0
-
 # An entity, absolute stamps (T,) in ns or None for what holds all the time, and columns of T rows.
 Part = tuple[tuple[str, ...], NDArray[np.int64] | None, Any]
-
-
 options: tuple[str, ...] = ("log",)
 loses = (
     "uncertainty and observed flags, times between steps of 0.1 s, colors (boxes are colored by category), stages; of a "

@@ -85,13 +85,9 @@ STEP_S = 0.1  # MetaDrive assumes this step
 DATASET = "log2sim"
 PROTOCOL = 5
 MOVED_M = 1.0  # MetaDrive's summaries count an object as moving beyond this
-
 # MetaDrive's types of participants. It keeps OTHER in the file and does not show it.
 TYPE_OF_GROUP = {"vehicle": "VEHICLE", "two_wheeler": "CYCLIST", "pedestrian": "PEDESTRIAN", "other": "OTHER"}
-
 Value = dict[str, Any]
-
-
 options: tuple[str, ...] = ()
 loses = (
     "times between steps of 0.1 s and outside the ego's life, uncertainty and observed flags, stop lines and other markings "
@@ -132,7 +128,15 @@ def scenario_description(scenario: Scenario) -> Value:
     left_out = {a.id: "not alive at any step of the ego" for a in scenario.agents if a.id not in tracks}
     features = map_features(scenario, origin)
     lights = dynamic_map_states(scenario, t_s, origin)
-    objects = {k: _object_summary(k, track) for k, track in tracks.items()}
+    objects = {}
+    for name, track in tracks.items():
+        valid = track["state"]["valid"]
+        path, after_first = track["state"]["position"][valid, :2], valid[int(valid.argmax()) :]
+        objects[name] = {
+            "type": track["type"], "object_id": name, "track_length": len(valid),
+            "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()), "valid_length": int(valid.sum()),
+            "continuous_valid_length": int(after_first.argmin()) if not after_first.all() else len(after_first),
+        }  # fmt: skip
     metadata = {
         "id": scenario.name, "scenario_id": scenario.name, "dataset": DATASET,
         "history_metadata": dict(scenario.provenance), "metadrive_processed": False, "coordinate": "metadrive",
@@ -173,17 +177,6 @@ def _track(agent: Agent, move: SampledMotion, origin: Array) -> Value:
             "color": dict(agent.color) if agent.color is not None else None, "confidence": agent.confidence,
             "doubts": [doubt.to_dict() for doubt in agent.doubts], "rear_axle_offset_m": agent.rear_axle_offset_m,
         },
-    }  # fmt: skip
-
-
-def _object_summary(name: str, track: Value) -> Value:
-    valid = track["state"]["valid"]
-    path = track["state"]["position"][valid, :2]
-    after_first = valid[int(valid.argmax()) :]
-    return {
-        "type": track["type"], "object_id": name, "track_length": len(valid),
-        "moving_distance": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()), "valid_length": int(valid.sum()),
-        "continuous_valid_length": int(after_first.argmin()) if not after_first.all() else len(after_first),
     }  # fmt: skip
 
 

@@ -19,15 +19,12 @@ STEP_S = 0.1  # the lowest rate that readers of OSI traces accept, and smooth to
 MAX_IMAGE_PX = 960  # wider images are downscaled, which keeps files of several cameras small
 JPEG_QUALITY = 80
 MAX_SWEEP_POINTS = 10_000
-
 # Colors as red, green and blue in [0, 255].
 EGO_RGB = (0, 158, 115)
 RGB_OF_CATEGORY = {
     "car": (86, 180, 233), "truck": (0, 114, 178), "bus": (0, 70, 140), "motorcycle": (230, 159, 0), "cyclist": (230, 159, 0),
     "bicycle": (240, 228, 66), "pedestrian": (213, 94, 0), "other": (160, 160, 160),
 }  # fmt: skip
-
-
 # All agents at equal steps: absolute time (T,), ns, and each with its motion.
 AgentSteps = tuple[NDArray[np.int64], tuple[tuple[Agent, SampledMotion], ...]]
 
@@ -101,41 +98,44 @@ def viewer_records(scenario: Scenario, log: Log) -> Iterator[ViewerRecord]:
             f"--log: log '{log.name}' has no picture and no sweep between {start} and {stop} ns, the time of scenario "
             f"'{scenario.name}'; give the log that it was made from"
         )
+    records = RecordSource(log)
     for t_ns, name, i in sorted(index):
-        yield _viewer_record(scenario, log, name, i, t_ns)
+        try:
+            record = records.require(name, i)
+        except RecordError as error:
+            yield UnreadableRecord(t_ns, name, str(error))
+            continue
+        if name in log.cameras:
+            yield _camera_frame(scenario, log, log.cameras[name], t_ns, record)
+        else:
+            mapped = sweep_to_map(log, name, record.thinned(MAX_SWEEP_POINTS), compensate=True)
+            yield ThinnedSweep(t_ns, name, np.zeros((0, 3)) if mapped is None else mapped[0])
 
 
-def _viewer_record(scenario: Scenario, log: Log, name: str, i: int, t_ns: int) -> ViewerRecord:
-    try:
-        record = RecordSource(log).require(name, i)
-    except RecordError as error:
-        return UnreadableRecord(t_ns, name, str(error))
-    if name in log.cameras:
-        camera = log.cameras[name]
-        image_bgr = record
-        import cv2
-        import simplejpeg
+def _camera_frame(
+    scenario: Scenario, log: Log, camera: geometry.Camera, t_ns: int, image_bgr: NDArray[np.uint8]
+) -> CameraFrame:
+    import cv2
+    import simplejpeg
 
-        scale, small = min(1.0, MAX_IMAGE_PX / camera.width_px), camera
-        if scale < 1.0:  # the center of the first pixel is (0, 0) in both sizes
-            size, K = (round(camera.width_px * scale), round(camera.height_px * scale)), camera.K.copy()
-            for axis, (new, old) in enumerate(zip(size, (camera.width_px, camera.height_px))):
-                K[axis] *= new / old
-                K[axis, 2] += (new / old - 1) / 2
-            small = replace(camera, width_px=size[0], height_px=size[1], K=K)
-            image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
-        poses, known = log.map_T_sensor(camera.name, t_ns)
-        if not known[0]:
-            return CameraFrame(t_ns, small, None, jpeg, ())
-        outlines, t_s = [], (t_ns - scenario.t0_ns) / geometry.NS_PER_S
-        for agent in scenario.others if small.mount == "ego" else scenario.agents:  # the ego is not in its own cameras
-            at = agent.at(t_s)
-            if at.valid[0]:
-                corners = geometry.box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
-                lines = geometry.box_lines(small, geometry.apply(geometry.inverse(poses[0]), corners))
-                if len(lines):
-                    outlines.append((agent, lines))
-        return CameraFrame(t_ns, small, poses[0], jpeg, tuple(outlines))
-    mapped = sweep_to_map(log, name, record.thinned(MAX_SWEEP_POINTS), compensate=True)
-    return ThinnedSweep(t_ns, name, np.zeros((0, 3)) if mapped is None else mapped[0])
+    scale, small = min(1.0, MAX_IMAGE_PX / camera.width_px), camera
+    if scale < 1.0:  # the center of the first pixel is (0, 0) in both sizes
+        size, K = (round(camera.width_px * scale), round(camera.height_px * scale)), camera.K.copy()
+        for axis, (new, old) in enumerate(zip(size, (camera.width_px, camera.height_px))):
+            K[axis] *= new / old
+            K[axis, 2] += (new / old - 1) / 2
+        small = replace(camera, width_px=size[0], height_px=size[1], K=K)
+        image_bgr = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(image_bgr), quality=JPEG_QUALITY, colorspace="BGR")
+    poses, known = log.map_T_sensor(camera.name, t_ns)
+    if not known[0]:
+        return CameraFrame(t_ns, small, None, jpeg, ())
+    outlines, t_s = [], (t_ns - scenario.t0_ns) / geometry.NS_PER_S
+    for agent in scenario.others if small.mount == "ego" else scenario.agents:  # the ego is not in its own cameras
+        at = agent.at(t_s)
+        if at.valid[0]:
+            corners = geometry.box_corners([at.x_m[0], at.y_m[0], at.z_m[0]], agent.size_m, at.yaw_rad)[0]
+            lines = geometry.box_lines(small, geometry.apply(geometry.inverse(poses[0]), corners))
+            if len(lines):
+                outlines.append((agent, lines))
+    return CameraFrame(t_ns, small, poses[0], jpeg, tuple(outlines))

@@ -19,7 +19,6 @@ from log2sim.files.inputs import read_file
 
 SIZE_LIMIT_BYTES = 256 * 1024 * 1024
 DEPTH_LIMIT = 100
-
 # "$" begins a parameter in OpenSCENARIO, "%" our own escape; all other printable ASCII is unchanged.
 _PLAIN = "".join(c for c in string.printable if c not in "%$" and (c == " " or not c.isspace()))
 

@@ -184,10 +184,9 @@ class DiskCache:
                 _remove(path)
         found = sorted(self._entries(digit), key=lambda entry: entry[1].st_mtime_ns)
         share, size = self.max_bytes / len(DIGITS), sum(state.st_size for _, state in found)
-        if size <= share:
-            return
+        least = SHARE_LEFT * share if size > share else size
         for path, state in found:
-            if size <= SHARE_LEFT * share:
+            if size <= least:
                 break
             _remove(path)
             size -= state.st_size

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, fields
@@ -99,34 +100,30 @@ def parse_unique(text: str, **hooks: Any) -> Any:
     Raises `RepeatedKeysError` for keys that do; all others are found first; `ValueError` for what is no JSON.
     """
     repeated: list[str] = []
-    value = json.loads(text, object_pairs_hook=partial(_unique, repeated), **hooks)
+    value = unique_decoder(repeated, **hooks).decode(text)
     require_unique(repeated)
     return value
 
 
-def unique_decoder(repeated: list[str]) -> json.JSONDecoder:
+def unique_decoder(repeated: list[str], **hooks: Any) -> json.JSONDecoder:
     """Return a decoder of JSON that adds the keys to `repeated` that occur twice in one object."""
-    return json.JSONDecoder(object_pairs_hook=partial(_unique, repeated))
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        value = dict(pairs)
+        if len(value) < len(pairs):
+            counts = Counter(key for key, _ in pairs)
+            repeated.extend(key for key, count in counts.items() for _ in range(count - 1))
+        return value
+
+    return json.JSONDecoder(object_pairs_hook=unique, **hooks)
 
 
 def require_unique(repeated: list[str]) -> None:
     """Raise `RepeatedKeysError` where there are keys that occur twice."""
     if repeated:
         count = f"{len(repeated)} keys occur" if len(repeated) > 1 else "a key occurs"
-        raise RepeatedKeysError(
-            f"{count} twice in one object, first {repeated[0][:40]!a}; remove the one of the two that is wrong"
-        )
-
-
-def _unique(repeated: list[str], pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    value = dict(pairs)
-    if len(value) < len(pairs):
-        seen = set[str]()
-        for key, _ in pairs:
-            if key in seen:
-                repeated.append(key)
-            seen.add(key)
-    return value
+        advice = "remove the one of the two that is wrong"
+        raise RepeatedKeysError(f"{count} twice in one object, first {repeated[0][:40]!a}; {advice}")
 
 
 SHOWN_CHARACTERS = 80
@@ -148,10 +145,10 @@ def first_problem(error: ValidationError, model: type[BaseModel]) -> str:
         near = difflib.get_close_matches(str(location[-1]), known, 1)
         hint = f"; did you mean '{_key([*location[:-1], near[0]])}'?" if near else f"; known: {', '.join(known)}"
         return f"unknown key '{_key(location)}'{hint}"
-    if problem["type"] == "missing" and isinstance(location[-1], str):
-        return f"'{_key(location)}' is missing"
-    if problem["type"] == "missing":  # a list that is too short
-        location = location[:-1]
+    if problem["type"] == "missing":
+        if isinstance(location[-1], str):
+            return f"'{_key(location)}' is missing"
+        location = location[:-1]  # a list that is too short
     expected = _schema_at(schema, location)
     if isinstance(found, list | tuple) and expected.get("type") == "array":
         low, high = expected.get("minItems", 0), expected.get("maxItems")
@@ -269,9 +266,8 @@ def check_targets(*paths: Path | str | None, overwrite: bool) -> None:
         refuse_existing(target, overwrite=overwrite)
         refuse_below_file(target)
         if target.resolve() in [t.resolve() for t in targets[:k]]:
-            raise ConfigError(
-                f"{target}: two files would be written under this one name; choose another for one of them"
-            )
+            advice = "choose another for one of them"
+            raise ConfigError(f"{target}: two files would be written under this one name; {advice}")
     for target in targets:
         claim(target, overwrite=overwrite)
     if not overwrite:
@@ -313,18 +309,15 @@ def read_json(path: Path | str, error: type[LogError] = LogError) -> Any:
             place = _path_of_not_finite(json.loads(text)) or "the document"
         except (ValueError, RecursionError):  # another error follows it, or too deep nesting
             place = "a number"
-        raise error(
-            f"{path}: {place} is {problem}, expected a finite number; write one, or null where the schema allows it"
-        ) from None
+        advice = "write one, or null where the schema allows it"
+        raise error(f"{path}: {place} is {problem}, expected a finite number; {advice}") from None
     except RepeatedKeysError as problem:
         raise error(f"{path}: {problem}") from None
     except json.JSONDecodeError as problem:
         raise error(f"{path}: not valid JSON at line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
     except UnicodeEncodeError as problem:
-        half = problem.object[problem.start : problem.end][:1]
-        raise error(
-            f"{path}: a text has {half!a}, an unpaired surrogate, which UTF-8 cannot encode; correct the text"
-        ) from None
+        half = f"{problem.object[problem.start : problem.end][:1]!a}, an unpaired surrogate"
+        raise error(f"{path}: a text has {half}, which UTF-8 cannot encode; correct the text") from None
     except (UnicodeDecodeError, RecursionError, ValueError) as problem:
         raise error(f"{path}: not valid JSON: {problem}") from None
 

@@ -36,18 +36,8 @@ def decode_image(
             raise RecordError(f"{where}: JPEG cannot be decoded: {error}") from None
     import cv2
 
-    png = np.frombuffer(_checked_png(data, where), np.uint8)
-    image = cv2.imdecode(png, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise RecordError(f"{where}: PNG cannot be decoded")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image, dtype=np.uint8)
-
-
-def _checked_png(data: bytes, where: str) -> bytes:
-    """Check lengths and check sums of a PNG, and return it without what is said beside the picture.
-
-    OpenCV returns the upper part of a truncated PNG as if it were whole, and libpng prints what it finds wrong.
-    """
+    # OpenCV returns the upper part of a truncated PNG as if it were whole, and libpng prints what it finds wrong: lengths and check
+    # sums are checked before, and what is said beside the picture is left out.
     at, kind, kept = 8, b"", [data[:8]]
     while kind != b"IEND":
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
@@ -56,10 +46,13 @@ def _checked_png(data: bytes, where: str) -> bytes:
             raise RecordError(f"{where}: PNG is truncated")
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise RecordError(f"{where}: the check sum of the PNG at byte {end} is wrong")
-        if kind[:1].isupper() or kind == b"tRNS":
-            kept.append(data[at : end + 4])
+        kept += [data[at : end + 4]] if kind[:1].isupper() or kind == b"tRNS" else []
         at = end + 4
-    return b"".join(kept)
+    png = np.frombuffer(b"".join(kept), np.uint8)
+    image = cv2.imdecode(png, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise RecordError(f"{where}: PNG cannot be decoded")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image, dtype=np.uint8)
 
 
 def image_size(data: bytes, where: str) -> tuple[int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -17,13 +17,9 @@ from log2sim.errors import LogError
 CHUNK_BYTES = 1024 * 1024
 # Of one name in ext4, XFS, Btrfs, NTFS and APFS; of a path in Linux, less what a folder above may have.
 MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 3072
-_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a named pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
+_KINDS = {
+    stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+}  # fmt: skip
 
 
 class TooLargeError(OSError):
@@ -57,19 +53,13 @@ def read_bytes(path: Path | str, limit_bytes: int) -> bytes:
                 return parts[0] if len(parts) == 1 else b"".join(parts)
             parts.append(part)
             count += len(part)
-    raise TooLargeError(
-        errno.EFBIG, f"{max(size, count)} bytes, more than the {limit_bytes} that it may have", str(path)
-    )
+    found = f"{max(size, count)} bytes, more than the {limit_bytes} that it may have"
+    raise TooLargeError(errno.EFBIG, found, str(path))
 
 
 def read_file(
-    path: Path | str,
-    limit_bytes: int,
-    error: type[Exception],
-    *,
-    where: str | None = None,
-    missing: str = "no such file",
-) -> bytes:
+    path: Path | str, limit_bytes: int, error: type[Exception], *, where: str | None = None, missing: str = "no such file"
+) -> bytes:  # fmt: skip
     """Read a whole regular file as `read_bytes` does; whatever is wrong with it is an `error` of one line.
 
     It begins with `where`, by default the path; `missing` is what it says of a file that is not there.
@@ -116,7 +106,7 @@ def is_present(path: Path) -> bool:
 
 def _require_regular(mode: int, path: Path | str) -> None:
     if not stat.S_ISREG(mode):
-        kind = next((name for is_kind, name in _KINDS if is_kind(mode)), "something else")
+        kind = _KINDS.get(stat.S_IFMT(mode), "something else")
         raise OSError(errno.EINVAL, f"is {kind}, expected a regular file", str(path))
 
 
@@ -149,14 +139,14 @@ def inside(root: Path, relative: str, what: str) -> Path:
     try:
         resolved = (root / relative).resolve()
     except (OSError, RuntimeError, ValueError) as problem:  # a loop of symbolic links, a zero byte
-        raise LogError(
-            f"{what}: path {relative[:100]!r} cannot be followed: {problem}; give the path of a file"
-        ) from None
-    if _leaves_by_itself(relative) or not (_followed.get() or resolved.is_relative_to(root.resolve())):
-        hint = "" if _leaves_by_itself(relative) else f"; where links may leave the log, pass {OPTION}"
-        raise LogError(
-            f"{what}: path '{relative}' leaves the log folder; use a path relative to it, without '..'{hint}"
-        )
+        why = f"path {relative[:100]!r} cannot be followed: {problem}"
+        raise LogError(f"{what}: {why}; give the path of a file") from None
+    # By its own words, whatever is in the folder.
+    by_itself = Path(relative).is_absolute() or os.path.normpath(relative).split(os.sep)[0] == os.pardir
+    if by_itself or not (_followed.get() or resolved.is_relative_to(root.resolve())):
+        hint = "" if by_itself else f"; where links may leave the log, pass {OPTION}"
+        advice = "use a path relative to it, without '..'"
+        raise LogError(f"{what}: path '{relative}' leaves the log folder; {advice}{hint}")
     return resolved
 
 
@@ -171,11 +161,10 @@ def require_links_inside(folder: Path, *roots: Path, files: Iterable[Path] = ())
     the one that was named. `files`: files of the log elsewhere; each must lie in one of the folders. Raises `LogError` naming the
     first link that leads out, and where to.
     """
-    if _followed.get():
-        return
-    allowed = [root.resolve() for root in (folder, *roots)]
-    for link in (*_links_in(folder), *files):
-        _require_inside(link, allowed)
+    if not _followed.get():
+        allowed = [root.resolve() for root in (folder, *roots)]
+        for link in (*_links_in(folder), *files):
+            _require_inside(link, allowed)
 
 
 def require_link_inside(file: Path, *roots: Path) -> None:
@@ -211,8 +200,3 @@ def _record_of(path: Path) -> tuple[int | str, str]:
     """Return the number, or the name, and the suffixes of a file of a data set."""
     stem, dot, suffix = path.name.partition(".")
     return int(stem) if stem.isdecimal() and len(stem) < MAX_DIGITS else stem, dot + suffix
-
-
-def _leaves_by_itself(relative: str) -> bool:
-    """Whether a path leaves a folder by its own words, whatever is in the folder."""
-    return Path(relative).is_absolute() or os.path.normpath(relative).split(os.sep)[0] == os.pardir

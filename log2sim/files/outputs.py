@@ -53,7 +53,7 @@ def claim(target: Path, *, overwrite: bool) -> None:
     except BlockingIOError:
         if not overwrite:
             raise ConfigError(
-                f"{target}: another run is about to write it; wait for that, choose another name or pass --overwrite"
+                f"{target}: another run is about to write it; wait, choose another name or pass --overwrite"
             ) from None
     except OSError as error:
         raise ConfigError(f"{target}: cannot be written: {error.strerror or error}; choose another place") from None
@@ -71,18 +71,27 @@ class _Lock:
 
     @classmethod
     def take(cls, target: Path) -> _Lock:
-        """Make and lock the file beside a target; `BlockingIOError` where another process has locked it."""
+        """Make and lock the file beside a target; `BlockingIOError` where another process has locked it.
+
+        Where the system or its file system has no such locks, nothing is locked.
+        """
         made = tuple(reversed([p for p in target.parents if not p.exists()]))
         target.parent.mkdir(parents=True, exist_ok=True)
         path = target.with_name(f".{target.name}.lock")
         try:
             while True:
                 handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-                lock = cls(path, handle, made)
                 try:
-                    _lock(handle)
+                    try:
+                        import fcntl
+
+                        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except BlockingIOError:
+                        raise
+                    except (ImportError, OSError):
+                        pass
                     if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
-                        return lock
+                        return cls(path, handle, made)
                 except BaseException:
                     os.close(handle)
                     raise
@@ -96,20 +105,6 @@ class _Lock:
         self.path.unlink(missing_ok=True)
         os.close(self.handle)
         _remove_empty(self.made)
-
-
-def _lock(handle: int) -> None:
-    """Lock an open file for this process; without effect where the system or its file system has no such locks."""
-    try:
-        import fcntl
-    except ImportError:
-        return
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
-    except OSError:
-        return
 
 
 def _remove_empty(folders: Sequence[Path]) -> None:
@@ -144,7 +139,15 @@ def is_temporary(path: Path) -> bool:
 def is_left_over(path: Path) -> bool:
     """Return whether a file or folder has such a name of a process of this machine that is not there any more."""
     found = _TEMPORARY.search(path.name)
-    return found is not None and found["machine"] == _machine() and not _is_alive(int(found["process"]))
+    if found is None or found["machine"] != _machine() or os.name == "nt":  # on Windows asking would end the process
+        return False
+    try:
+        os.kill(int(found["process"]), 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):
+        pass
+    return False
 
 
 def remove(path: Path) -> None:
@@ -160,21 +163,18 @@ def put(temporary: Path, target: Path) -> bool:
 
     Raises `ConfigError` when another run wrote the target meanwhile and this one may not replace it; `OSError` when it fails.
     """
-    waiting = _waiting.get()
+    waiting, expected_new = _waiting.get(), _expected_new.get()
     if waiting is not None:
         waiting.append((temporary, target))
         return True
-    expected_new = _expected_new.get()
     if expected_new is None or target.resolve() not in expected_new:
         os.replace(temporary, target)
         return False
     try:
         os.link(temporary, target)  # a renaming would replace what is there
         temporary.unlink()
-    except FileExistsError:
-        raise written_meanwhile(target) from None
-    except OSError:  # a file system without hard links
-        if target.exists():
+    except OSError as error:  # there is one, or the file system has no hard links
+        if isinstance(error, FileExistsError) or target.exists():
             raise written_meanwhile(target) from None
         os.replace(temporary, target)
     expected_new.discard(target.resolve())
@@ -236,19 +236,6 @@ def _machine() -> str:
     except OSError:
         parts.append("")  # of another system
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
-
-
-def _is_alive(process: int) -> bool:
-    """Whether there is a process of this number; True where asking would end it (Windows)."""
-    if os.name == "nt":
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
 
 
 # Of the system call: paths count from the working folder; both names stay, exchanged (linux/fcntl.h, linux/fs.h).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -108,22 +109,17 @@ class _Reader:
         dtype = np.dtype(kind)
         if dtype.kind not in KINDS or not 0 < dtype.itemsize <= MAX_ITEM_BYTES or any(n < 0 for n in shape):
             raise ValueError(f"no array of {kind} {shape}")
-        count = 1
-        for n in shape:
-            count *= n
+        count = math.prod(shape)
         if count * dtype.itemsize > len(self.left):
             raise ValueError("fewer bytes than arrays")
         here, self.left = self.left[: count * dtype.itemsize], self.left[count * dtype.itemsize :]
         array = np.frombuffer(here, dtype, count).reshape(shape).copy()
-        if dtype.kind == "U" and not _are_words(array):
-            raise ValueError("letters that Unicode does not have")
+        if dtype.kind == "U":
+            # Letters that Unicode has, none of them half of a pair.
+            code = np.ascontiguousarray(array).reshape(-1).view(np.uint32)
+            if not ((code <= 0x10FFFF) & ~((code >= 0xD800) & (code < 0xE000))).all():
+                raise ValueError("letters that Unicode does not have")
         return array
-
-
-def _are_words(texts: NDArray[np.str_]) -> bool:
-    """Return whether texts consist of letters that Unicode has, none of them half of a pair."""
-    code = np.ascontiguousarray(texts).reshape(-1).view(np.uint32)
-    return bool(((code <= 0x10FFFF) & ~((code >= 0xD800) & (code < 0xE000))).all())
 
 
 def _digest(content: bytes | memoryview) -> bytes:

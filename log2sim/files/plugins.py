@@ -58,10 +58,8 @@ def find_defect(kind: str, found: Any) -> str | None:
     """Return why an object is no plug-in of a kind; None where nothing is wrong."""
     if kind in FUNCTIONS:
         return find_call_defect(found, FUNCTIONS[kind])
-    members = OBJECTS.get(kind)
-    if members is None:
-        return None
-    if isinstance(found, type):
+    members = OBJECTS.get(kind, {})
+    if members and isinstance(found, type):
         return f"is the class {found.__name__}, expected an object of it: name an instance, such as {found.__name__}()"
     missing = [name for name in members if not hasattr(found, name)]
     if missing:
@@ -104,7 +102,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "log2sim": "log2sim.logs.native.reader:READER",
         "kitti": "log2sim.logs.kitti.drives:READER",
         "kitti-tracking": "log2sim.logs.kitti.drives:TRACKING_READER",
-        "kitti-object": "log2sim.logs.kitti.object:READER",
+        "kitti-object": "log2sim.logs.kitti.drives:OBJECT_READER",
         "pandaset": "log2sim.logs.pandaset.reader:READER",
         "waymo": "log2sim.logs.waymo.reader:READER",
         "waymo-parquet": "log2sim.logs.waymo.parquet_reader:READER",
@@ -143,11 +141,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
 
 
 KIND_LABELS = {
-    "log": "log format",
-    "lidar_detector": "LiDAR detector",
-    "export": "export format",
-    "vehicle_model": "vehicle model",
-}
+    "log": "log format", "lidar_detector": "LiDAR detector", "export": "export format", "vehicle_model": "vehicle model",
+}  # fmt: skip
 
 
 def names(kind: str) -> list[str]:
@@ -169,22 +164,26 @@ def load(kind: str, name: str) -> Any:
     package cannot be imported, or is not what the kind asks for.
     """
     if name in BUILT_IN[kind]:
-        module, _, attribute = BUILT_IN[kind][name].partition(":")
-        found = importlib.import_module(module)
-        return getattr(found, attribute) if attribute else found
-    entries = [entry for entry in installed(kind) if entry.name == name]
+        return _import(BUILT_IN[kind][name])
+    label, entries = KIND_LABELS.get(kind, kind), [entry for entry in installed(kind) if entry.name == name]
     if not entries:
         known = ", ".join(names(kind)) or "none"
-        raise ConfigError(f"unknown {_label(kind)} '{name}'{nearest(name, names(kind))}; known: {known}")
+        raise ConfigError(f"unknown {label} '{name}'{nearest(name, names(kind))}; known: {known}")
     if len({entry.value for entry in entries}) > 1:
         packages = " and ".join(sorted(package_of(entry) for entry in entries))
-        raise PluginError(f"{_label(kind)} '{name}': is declared by {packages}; uninstall one of them")
+        raise PluginError(f"{label} '{name}': is declared by {packages}; uninstall one of them")
     with blaming(kind, name):
         found = entries[0].load()
     defect = find_defect(kind, found)
     if defect is not None:
         raise PluginError(f"{plugin_label(kind, name)}: {defect}")
     return found
+
+
+def _import(place: str) -> Any:
+    name, _, attribute = place.partition(":")
+    module = importlib.import_module(name)
+    return getattr(module, attribute) if attribute else module
 
 
 def is_built_in(kind: str, name: str) -> bool:
@@ -195,7 +194,7 @@ def is_built_in(kind: str, name: str) -> bool:
 def plugin_label(kind: str, name: str) -> str:
     """Name a plug-in for messages: its kind, its name and, of another package, that package and the place in it."""
     places = [f" of {package_of(e)} ({e.value})" for e in installed(kind) if e.name == name]
-    return f"{_label(kind)} '{name}'{places[0] if places and not is_built_in(kind, name) else ''}"
+    return f"{KIND_LABELS.get(kind, kind)} '{name}'{places[0] if places and not is_built_in(kind, name) else ''}"
 
 
 @contextmanager
@@ -233,19 +232,13 @@ def exception_line(error: Exception) -> str:
 
 def package_of(entry: EntryPoint) -> str:
     """Name the package of an entry point with its version."""
-    if entry.dist is None:
-        return "an unknown package"
-    return f"package '{entry.dist.name} {entry.dist.version}'"
+    return "an unknown package" if entry.dist is None else f"package '{entry.dist.name} {entry.dist.version}'"
 
 
 def nearest(word: str, known: list[str]) -> str:
     """Return a hint " (did you mean '...'?)", or "" when no known word is similar."""
     close = difflib.get_close_matches(word, known, n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
-
-
-def _label(kind: str) -> str:
-    return KIND_LABELS.get(kind, kind)
 
 
 LATE_FUNCTIONS = {
@@ -258,9 +251,8 @@ LATE_FUNCTIONS = {
 
 
 def call(name: str, *arguments: Any, **options: Any) -> Any:
-    """Call the function that `FUNCTIONS` names."""
-    module, _, attribute = LATE_FUNCTIONS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)(*arguments, **options)
+    """Call one of `LATE_FUNCTIONS`."""
+    return _import(LATE_FUNCTIONS[name])(*arguments, **options)
 
 
 def html_or_none(value: Any) -> str | None:

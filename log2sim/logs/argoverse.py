@@ -30,6 +30,7 @@ from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import (
     MAX_SWEEP_BYTES,
     MAX_SWEEP_POINTS,
+    FolderReader,
     checked_poses,
     image_stream,
     list_files,
@@ -110,13 +111,12 @@ def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_l
 
     def read(i: int) -> Sweep:
         stamp, columns = int(t_ns[i]), _read_points(files[i])
-        strength = columns.get("intensity")
-        rows = columns["laser_number"] // LASERS == LIDARS[lidar] // LASERS
+        own = columns["laser_number"] // LASERS == LIDARS[lidar] // LASERS
+        columns = {name: column[own] for name, column in columns.items()}
         # Points are moved in double precision: they were stored in half precision, to which nothing should be added.
-        xyz_ego = np.stack([columns[k][rows] for k in "xyz"], axis=1).astype(np.float64)
+        xyz_ego = np.stack([columns[k] for k in "xyz"], axis=1).astype(np.float64)
         xyz = apply(lidar_T_ego, xyz_ego).astype(np.float32)
-        strength = None if strength is None else strength[rows]
-        return sweep_of(xyz, stamp, columns["offset_ns"][rows], "lidar", stamp, strength)
+        return sweep_of(xyz, stamp, columns["offset_ns"], "lidar", stamp, columns.get("intensity"))
 
     return Stream(lidar, t_ns, read)
 
@@ -125,13 +125,14 @@ def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_l
 @lru_cache(maxsize=4)
 def _read_points(path: Path) -> dict[str, NDArray[Any]]:
     columns = read_columns(path, COLUMNS, optional=OPTIONAL, error=RecordError, limits=SWEEP_LIMITS)
-    laser, offset_ns = columns["laser_number"], columns["offset_ns"]
-    if len(laser) and not (laser.min() >= 0 and laser.max() < LASERS * len(LIDARS)):
-        raise RecordError(f"{path}, column 'laser_number': {laser.min()} to {laser.max()}, expected 0 to 63")
-    if len(laser) and np.abs(offset_ns).max() > MAX_OFFSET_NS:
-        raise RecordError(
-            f"{path}, column 'offset_ns': {offset_ns.min()} to {offset_ns.max()}, expected less than 1 s from the stamp"
-        )
+    for name, low, high, expected in (
+        ("laser_number", 0, LASERS * len(LIDARS) - 1, "0 to 63"),
+        ("offset_ns", -MAX_OFFSET_NS, MAX_OFFSET_NS, "less than 1 s from the stamp"),
+    ):
+        values = columns[name]
+        if len(values) and not (values.min() >= low and values.max() <= high):
+            found = f"{values.min()} to {values.max()}"
+            raise RecordError(f"{path}, column '{name}': {found}, expected {expected}")
     finite = np.isfinite(columns["x"]) & np.isfinite(columns["y"]) & np.isfinite(columns["z"])
     return columns if finite.all() else {name: column[finite] for name, column in columns.items()}
 
@@ -227,10 +228,9 @@ def _join_riders(
 
     The road user has the vehicle's track, length and width; a rider without a vehicle stays as it is.
     """
-    poses, kinds, keep = ego_T_box.copy(), kinds.copy(), np.ones(len(kinds), dtype=bool)
-    original = kinds.copy()
-    for rider in np.flatnonzero(np.isin(original, list(RIDDEN_BY))):
-        same = np.flatnonzero((t_ns == t_ns[rider]) & (original == RIDDEN_BY[str(original[rider])]))
+    poses, joined, keep = ego_T_box.copy(), kinds.copy(), np.ones(len(kinds), dtype=bool)
+    for rider in np.flatnonzero(np.isin(kinds, list(RIDDEN_BY))):
+        same = np.flatnonzero((t_ns == t_ns[rider]) & (kinds == RIDDEN_BY[str(kinds[rider])]))
         away = np.linalg.norm(ego_T_box[same, :2, 3] - ego_T_box[rider, :2, 3], axis=1)
         if not len(same) or away.min() > MAX_RIDER_DISTANCE_M:
             continue
@@ -239,8 +239,8 @@ def _join_riders(
         bottom = (ego_T_box[rows, 2, 3] - size[rows, 2] / 2).min()
         top = (ego_T_box[rows, 2, 3] + size[rows, 2] / 2).max()
         size[vehicle, 2], poses[vehicle, 2, 3] = top - bottom, (top + bottom) / 2
-        kinds[vehicle], keep[rider] = original[rider], False
-    return size, poses, kinds, keep
+        joined[vehicle], keep[rider] = kinds[rider], False
+    return size, poses, joined, keep
 
 
 POSES = "city_SE3_egovehicle.feather"
@@ -260,22 +260,21 @@ INTRINSIC_COLUMNS: dict[str, Kind] = {
 }  # fmt: skip
 
 
-class ArgoverseReader:
+class ArgoverseReader(FolderReader):
     """Reader of Argoverse 2 logs; the root is a log, a split or a folder of splits."""
 
     name = "argoverse2"
     looks_for = f"a folder with {POSES} and calibration/, or a folder up to three levels above such folders"
-    suffixes = ()
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder is a log or holds some."""
         return next(_logs(path, MAX_DEPTH), None) is not None
 
-    def sequences(self, path: Path) -> list[str]:
-        """Return the names of the logs, sorted; below other folders with these ("sensor/val/LOG")."""
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the logs at a folder by name; below other folders with these ("sensor/val/LOG")."""
         if _is_log(path):
-            return [path.resolve().name]
-        return sorted(log.relative_to(path).as_posix() for log in _logs(path, MAX_DEPTH))
+            return {path.resolve().name: path}
+        return {log.relative_to(path).as_posix(): log for log in _logs(path, MAX_DEPTH)}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a log; no image, no sweep and no annotation is read."""
@@ -365,7 +364,20 @@ def _cameras(folder: Path, mounts: dict[str, Array], notes: list[str]) -> tuple[
         left_out = f"images of {len(found)} cameras left out: {INTRINSICS} is missing"
         notes.append(left_out if found else "no images: sensors/cameras/ holds none")
         return {}, {}
-    cameras, streams = _read_cameras(path, mounts), {}
+    # k1, k2, k3 of the file are those of the lens, which the images lack.
+    columns, cameras, streams = read_columns(path, INTRINSIC_COLUMNS), dict[str, Camera](), dict[str, Stream]()
+    for row, name in enumerate(columns.pop("sensor_name")):
+        values = {key: float(column[row]) for key, column in columns.items()}
+        fx, fy, cx, cy, height, width = values.values()
+        if (
+            not np.isfinite(list(values.values())).all()
+            or min(fx, fy, height, width) <= 0
+            or width * height > MAX_IMAGE_PX
+        ):
+            raise LogError(f"{path}, row {row} ('{name}'): {values}, expected a size in px and focal lengths above 0")
+        if name in mounts:
+            K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+            cameras[str(name)] = Camera(str(name), int(width), int(height), K, "ego", mounts[name])
     for name, (t_ns, files) in found.items():
         if name in cameras:
             streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
@@ -375,21 +387,6 @@ def _cameras(folder: Path, mounts: dict[str, Array], notes: list[str]) -> tuple[
     if without:
         notes.append(f"no images of {', '.join(without)}")
     return {name: cameras[name] for name in streams}, streams
-
-
-def _read_cameras(path: Path, mounts: dict[str, Array]) -> dict[str, Camera]:
-    """Cameras of `intrinsics.feather` that have a mount. Its k1, k2, k3 are those of the lens, which the images lack."""
-    columns = read_columns(path, INTRINSIC_COLUMNS)
-    cameras = {}
-    for row, name in enumerate(columns["sensor_name"]):
-        values = {key: float(columns[key][row]) for key in INTRINSIC_COLUMNS if key != "sensor_name"}
-        sizes = (values["width_px"], values["height_px"], values["fx_px"], values["fy_px"])
-        if not np.isfinite(list(values.values())).all() or min(sizes) <= 0 or sizes[0] * sizes[1] > MAX_IMAGE_PX:
-            raise LogError(f"{path}, row {row} ('{name}'): {values}, expected a size in px and focal lengths above 0")
-        K = np.array([[values["fx_px"], 0, values["cx_px"]], [0, values["fy_px"], values["cy_px"]], [0, 0, 1.0]])
-        if name in mounts:
-            cameras[str(name)] = Camera(str(name), int(sizes[0]), int(sizes[1]), K, "ego", mounts[name])
-    return cameras
 
 
 def stamped_files(folder: Path, suffix: str, notes: list[str]) -> tuple[NDArray[np.int64], list[Path]]:

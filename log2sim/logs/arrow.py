@@ -139,48 +139,30 @@ def values_of(column: Any, kind: Kind) -> NDArray[Any]:
     types = pyarrow.types
     if types.is_dictionary(column.type):
         column = column.dictionary_decode()
-    if kind in ("floats", "ints"):
+    of = column.type
+    if kind == "floats" or kind == "ints":
         return _lists(column, "float" if kind == "floats" else "int")
-    if kind in ("float", "int", "bool"):
-        return _numbers(column, kind)
-    if kind == "text":
-        return _text(column)
-    if not (types.is_binary(column.type) or types.is_large_binary(column.type)):
-        raise ValueError(f"is {column.type}, expected bytes")
-    return _objects(column.to_pylist())
-
-
-def _numbers(column: Any, kind: Literal["float", "int", "bool"]) -> NDArray[Any]:
-    import pyarrow
-
-    types = pyarrow.types
-    if kind == "bool":
-        if not types.is_boolean(column.type) or column.null_count:
-            raise ValueError(f"is {column.type} with {column.null_count} missing values, expected true or false")
-        return np.asarray(column.to_numpy(zero_copy_only=False))
-    if kind == "int":
-        if not types.is_integer(column.type) or column.null_count:
-            raise ValueError(f"is {column.type} with {column.null_count} missing values, expected whole numbers")
+    if kind in ("bool", "int"):
+        fits, expected = (types.is_boolean, "true or false") if kind == "bool" else (types.is_integer, "whole numbers")
+        if not fits(of) or column.null_count:
+            raise ValueError(f"is {of} with {column.null_count} missing values, expected {expected}")
         numbers: NDArray[Any] = column.to_numpy(zero_copy_only=False)
         if numbers.dtype == np.uint64 and len(numbers) and numbers.max() > np.iinfo(np.int64).max:
             raise ValueError("holds a number beyond int64")
-        return numbers.astype(np.int64)
-    if not (types.is_integer(column.type) or types.is_floating(column.type)):
-        raise ValueError(f"is {column.type}, expected numbers")
-    numbers = column.to_numpy(zero_copy_only=False)
-    return numbers.astype(np.float32 if column.type in (pyarrow.float16(), pyarrow.float32()) else np.float64)
-
-
-def _text(column: Any) -> NDArray[Any]:
-    import pyarrow
-
-    types = pyarrow.types
-    if types.is_integer(column.type):
+        return numbers if kind == "bool" else numbers.astype(np.int64)
+    if kind == "float":
+        if not (types.is_integer(of) or types.is_floating(of)):
+            raise ValueError(f"is {of}, expected numbers")
+        is_short = of in (pyarrow.float16(), pyarrow.float32())
+        return np.asarray(column.to_numpy(zero_copy_only=False).astype(np.float32 if is_short else np.float64))
+    if kind == "bytes" and not (types.is_binary(of) or types.is_large_binary(of)):
+        raise ValueError(f"is {of}, expected bytes")
+    if kind == "text" and types.is_integer(of):
         return _objects([None if n is None else str(n) for n in column.to_pylist()])
-    if not (types.is_string(column.type) or types.is_large_string(column.type)):
-        raise ValueError(f"is {column.type}, expected text")
+    if kind == "text" and not (types.is_string(of) or types.is_large_string(of)):
+        raise ValueError(f"is {of}, expected text")
     cells = column.to_pylist()
-    longest = max((len(cell) for cell in cells if cell is not None), default=0)
+    longest = max((len(cell) for cell in cells if cell is not None), default=0) if kind == "text" else 0
     if longest > MAX_TEXT_CHARACTERS:
         raise ValueError(f"holds a text of {longest} characters, more than the {MAX_TEXT_CHARACTERS} that one may have")
     return _objects(cells)
@@ -192,7 +174,7 @@ def _lists(column: Any, kind: Literal["float", "int"]) -> NDArray[Any]:
     types = pyarrow.types
     if types.is_fixed_size_list(column.type):
         # `flatten` leaves out the values below missing lists, which are missing themselves.
-        numbers = _numbers(column.flatten(), kind).reshape(-1, column.type.list_size)
+        numbers = values_of(column.flatten(), kind).reshape(-1, column.type.list_size)
         if not column.null_count:
             return numbers
         present = iter(numbers)
@@ -202,7 +184,7 @@ def _lists(column: Any, kind: Literal["float", "int"]) -> NDArray[Any]:
     ends = column.offsets.to_numpy(zero_copy_only=False)
     # Of a slice of a table only the part that it refers to is converted.
     first, last = (int(ends[0]), int(ends[-1])) if len(ends) else (0, 0)
-    numbers = _numbers(column.values.slice(first, last - first), kind)
+    numbers = values_of(column.values.slice(first, last - first), kind)
     there = np.ones(len(column), dtype=bool) if not column.null_count else column.is_valid().to_numpy(False)
     return _objects([numbers[a - first : b - first] if t else None for a, b, t in zip(ends, ends[1:], there)])
 
@@ -250,21 +232,37 @@ def read_columns(
     `optional`: names that may be absent, in the result then too. Raises `error`, `RecordError` for one record, that names file,
     column and what was expected; `MissingExtra` when pyarrow is not installed.
     """
+    pyarrow = import_pyarrow()
     with translate_errors(path, error):
         with open_regular(path) as file:
             magic = file.read(len(ARROW_MAGIC))
         if magic.startswith(PARQUET_MAGIC):
-            table = _read_parquet(path, wanted, optional, limits)
+            # Piece by piece, up to the limit: pyarrow does not check the sizes that the metadata declare.
+            from pyarrow.parquet import ParquetFile
+
+            with ParquetFile(path) as whole:
+                names = checked_schema(whole.schema_arrow, wanted, optional)
+                _check_sizes(whole.metadata.num_rows, 0, limits)
+                pieces, size = [], 0
+                for piece in whole.iter_batches(batch_size=ROWS_AT_A_TIME, columns=names, use_threads=False):
+                    pieces.append(piece)
+                    size += piece.nbytes
+                    _check_sizes(0, size, limits)
+                schema = whole.schema_arrow
+                table = pyarrow.Table.from_batches(pieces) if pieces else schema.empty_table().select(names)
         elif magic == ARROW_MAGIC:
-            table = _read_feather(path, wanted, optional, limits)
+            data = read_bytes(path, limits.file_bytes)
+            _check_sizes(*declared_size(data), limits)
+            with pyarrow.ipc.open_file(pyarrow.BufferReader(data)) as whole:
+                names = checked_schema(whole.schema, wanted, optional)
+                fields = [whole.schema.get_field_index(name) for name in names]
+            options = pyarrow.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
+            with pyarrow.ipc.open_file(pyarrow.BufferReader(data), options=options) as chosen:
+                table = chosen.read_all() if names else pyarrow.table({})
         else:
             raise ValueError("neither an Arrow (feather, version 2) nor a parquet file")
         table.validate(full=True)
-        return {
-            name: _column(table.column(name).combine_chunks(), name, wanted)
-            for name in wanted
-            if name in table.column_names
-        }
+        return {name: _column(table.column(name).combine_chunks(), name, wanted) for name in names}
 
 
 def _column(column: Any, name: str, wanted: Mapping[str, Kind]) -> NDArray[Any]:
@@ -305,8 +303,7 @@ def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection
 
     Extension types run code of whoever registered them.
     """
-    pyarrow = import_pyarrow()
-    names = list(schema.names)
+    pyarrow, names = import_pyarrow(), list(schema.names)
     for name in wanted:
         if name not in names and name not in optional:
             there = ", ".join(names[:20]) or "none"
@@ -314,54 +311,19 @@ def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection
         if names.count(name) > 1:
             raise ValueError(f"{names.count(name)} columns '{name}', expected one")
     chosen = [name for name in wanted if name in names]
-    for field in (schema.field(name) for name in chosen):
+    for field in map(schema.field, chosen):
         extension = b"ARROW:extension:name" in (field.metadata or {})
         if extension or isinstance(field.type, pyarrow.BaseExtensionType):
             raise ValueError(f"column '{field.name}' is of the extension type {field.type}, expected a plain type")
     return chosen
 
 
-def _read_parquet(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
-    """Read columns piece by piece, up to the limit: pyarrow does not check the sizes that the metadata declare."""
-    pyarrow = import_pyarrow()
-    from pyarrow.parquet import ParquetFile
-
-    with ParquetFile(path) as file:
-        names = checked_schema(file.schema_arrow, wanted, optional)
-        check_rows(file.metadata.num_rows, limits)
-        pieces, size = [], 0
-        for piece in file.iter_batches(batch_size=ROWS_AT_A_TIME, columns=names, use_threads=False):
-            pieces.append(piece)
-            size += piece.nbytes
-            _check_size(size, limits)
-        return pyarrow.Table.from_batches(pieces) if pieces else file.schema_arrow.empty_table().select(names)
-
-
-def check_rows(rows: int, limits: TableLimits) -> None:
-    """Raise `ValueError` when a table declares more rows than it may have, or less than none."""
+def _check_sizes(rows: int, unpacked_bytes: int, limits: TableLimits) -> None:
+    """Raise `ValueError` when a table has more rows, or less than none, or unpacks to more bytes than it may."""
     if not 0 <= rows <= limits.rows:
         raise ValueError(f"{rows} rows, more than the {limits.rows} that a table may have")
-
-
-def _check_size(unpacked_bytes: int, limits: TableLimits) -> None:
     if unpacked_bytes > limits.unpacked_bytes:
-        raise ValueError(
-            f"unpacks to {unpacked_bytes} bytes, more than the {limits.unpacked_bytes} that a table may have"
-        )
-
-
-def _read_feather(path: Path, wanted: Mapping[str, Kind], optional: Collection[str], limits: TableLimits) -> Any:
-    pyarrow = import_pyarrow()
-    data = read_bytes(path, limits.file_bytes)
-    rows, unpacked = declared_size(data)
-    check_rows(rows, limits)
-    _check_size(unpacked, limits)
-    with pyarrow.ipc.open_file(pyarrow.BufferReader(data)) as whole:
-        names = checked_schema(whole.schema, wanted, optional)
-        fields = [whole.schema.get_field_index(name) for name in names]
-    options = pyarrow.ipc.IpcReadOptions(included_fields=fields, use_threads=False)
-    with pyarrow.ipc.open_file(pyarrow.BufferReader(data), options=options) as file:
-        return file.read_all() if names else pyarrow.table({})
+        raise ValueError(f"unpacks to {unpacked_bytes} bytes, more than the {limits.unpacked_bytes} allowed")
 
 
 # Decoded rows are kept up to this size; see `ParquetRows`.
@@ -389,8 +351,7 @@ class ParquetRows:
         self._file: Any = None
         self._process = 0  # whose file it is
         self._names: list[str] = []
-        # First rows of the row groups, and their end.
-        self._starts = np.zeros(1, dtype=np.int64)
+        self._starts = np.zeros(1, dtype=np.int64)  # first rows of the row groups, and their end
         self._group, self._next = -1, 0
         self._batches: Iterator[Any] = iter(())
         self._kept: OrderedDict[int, Row] = OrderedDict()
@@ -429,8 +390,8 @@ class ParquetRows:
         file = ParquetFile(self._path, buffer_size=READ_BYTES)
         self._names = checked_schema(file.schema_arrow, self._wanted, self._optional)
         groups = [file.metadata.row_group(g).num_rows for g in range(file.metadata.num_row_groups)]
-        check_rows(min(groups, default=0), self._limits)
-        check_rows(sum(groups), self._limits)
+        for rows in (min(groups, default=0), sum(groups)):
+            _check_sizes(rows, 0, self._limits)
         self._starts = np.concatenate([[0], np.cumsum(np.array(groups, dtype=np.int64))])
         self._file = file
 
@@ -441,14 +402,11 @@ class ParquetRows:
                 batch_size=PARQUET_ROWS_AT_A_TIME, row_groups=[group], columns=self._names, use_threads=False
             )
             self._group, self._next = group, int(self._starts[group])
-        while True:
+        while index >= self._next:
             batch = next(self._batches, None)
             if batch is None:
                 raise ValueError("its row group holds fewer rows than the file says")
-            if batch.nbytes > self._limits.unpacked_bytes:
-                raise ValueError(
-                    f"unpacks to {batch.nbytes} bytes, more than the {self._limits.unpacked_bytes} allowed"
-                )
+            _check_sizes(0, batch.nbytes, self._limits)
             batch.validate(full=True)
             columns = {name: _column(batch.column(name), name, self._wanted) for name in self._names}
             rows = {self._next + k: {n: values[k] for n, values in columns.items()} for k in range(batch.num_rows)}
@@ -458,8 +416,7 @@ class ParquetRows:
                 self._kept[number] = row
             while self._kept_bytes > MAX_KEPT_BYTES:
                 self._kept_bytes -= _size(self._kept.popitem(last=False)[1])
-            if index in rows:
-                return rows[index]
+        return rows[index]
 
 
 def _size(row: Row) -> int:

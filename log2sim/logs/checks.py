@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -58,21 +58,17 @@ MAX_FOLDED_SHARE, MAX_USABLE_FOLDED_SHARE = 0.01, 0.5
 GRID = 32
 
 
-@dataclass(frozen=True)
-class CalibrationProblem:
-    """A value of a calibration that no sensor, or hardly one, can have."""
-
-    message: str  # names the sensor, where its calibration is, the field and its value
-    is_impossible: bool  # whether nothing that is measured with it can be right; else it is only doubtful
-
-
 def list_calibration_problems(log: Log) -> list[str]:
     """List what is wrong with the calibrations of a log, one line each."""
-    return [problem.message for name in log.streams for problem in problems_of(log, name)]
+    return [message for name in log.streams for message, _ in problems_of(log, name)]
 
 
-def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
-    """Check the calibration of a sensor of a log."""
+def problems_of(log: Log, name: str) -> Iterator[tuple[str, bool]]:
+    """Find values in the calibration of a sensor that none, or hardly one, can have.
+
+    Yields a message, which names the sensor, where its calibration is, the field and its value, and whether nothing that is
+    measured with it can be right; else it is only doubtful.
+    """
     place = log.calibrations.get(name, log.name)
     camera = log.cameras.get(name)
     if camera is not None:
@@ -88,22 +84,17 @@ def problems_of(log: Log, name: str) -> Iterator[CalibrationProblem]:
     distance_m = float(np.linalg.norm(mount_T_sensor[:3, 3]))
     if mount == "ego" and not distance_m <= MAX_MOUNT_DISTANCE_M:
         x, y, z = mount_T_sensor[:3, 3].tolist()
-        yield CalibrationProblem(
-            f"{where}: its mounting is {distance_m:.6g} m from the ego, at ({x:.6g}, {y:.6g}, {z:.6g}) m; expected at most "
-            f"{MAX_MOUNT_DISTANCE_M:g} m, so check its unit and its frame",
-            True,
-        )
+        is_at = f"its mounting is {distance_m:.6g} m from the ego, at ({x:.6g}, {y:.6g}, {z:.6g}) m"
+        expected = f"expected at most {MAX_MOUNT_DISTANCE_M:g} m, so check its unit and its frame"
+        yield f"{where}: {is_at}; {expected}", True
 
 
-def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+def _pinhole(camera: Camera, where: str) -> Iterator[tuple[str, bool]]:
     for field, value_px in (("fx", camera.K[0, 0]), ("fy", camera.K[1, 1])):
         widths = float(value_px) / camera.width_px
         if not MIN_FOCAL_WIDTHS <= widths <= MAX_FOCAL_WIDTHS:
-            yield CalibrationProblem(
-                f"{where}: its focal length {field} is {value_px:.6g} px, {widths:.3g} image widths; expected "
-                f"{MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the size of the images",
-                True,
-            )
+            expected = f"expected {MIN_FOCAL_WIDTHS:g} to {MAX_FOCAL_WIDTHS:g}, so check its unit and the image size"
+            yield f"{where}: its focal length {field} is {value_px:.6g} px, {widths:.3g} image widths; {expected}", True
     limit = np.tan(np.radians(MAX_RAY_DEGREES))
     for field, axis, size_px in (("cx", 0, camera.width_px), ("cy", 1, camera.height_px)):
         value_px = float(camera.K[axis, 2])
@@ -111,18 +102,17 @@ def _pinhole(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
         inside = "beside the edge" if outside_px == 0.0 else f"{outside_px:.6g} px outside"
         # Fails for a value that is not a number.
         if not MIN_PRINCIPAL_SHARE <= value_px / size_px <= 1.0 - MIN_PRINCIPAL_SHARE:
-            yield CalibrationProblem(
-                f"{where}: its principal point {field} is {value_px:.6g} px, {inside} of images of "
-                f"{camera.width_px}x{camera.height_px} px; check its unit, and whether the images are cropped or scaled",
-                bool(not outside_px <= limit * camera.K[axis, axis]),
-            )
+            of = f"of images of {camera.width_px}x{camera.height_px} px"
+            advice = "check its unit, and whether the images are cropped or scaled"
+            is_impossible = bool(not outside_px <= limit * camera.K[axis, axis])
+            yield f"{where}: its principal point {field} is {value_px:.6g} px, {inside} {of}; {advice}", is_impossible
 
 
-def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
+def _distortion(camera: Camera, where: str) -> Iterator[tuple[str, bool]]:
     wrong = [value for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
     if wrong:
         expected = f"expected numbers up to {MAX_DISTORTION:g}"
-        yield CalibrationProblem(f"{where}: its distortion has the coefficient {wrong[0]:.6g}, {expected}", True)
+        yield f"{where}: its distortion has the coefficient {wrong[0]:.6g}, {expected}", True
     fold_deg = 90.0 if wrong or camera.rectified else float(np.degrees(np.arctan(fold_radius(camera))))
     if not fold_deg < MAX_FOLD_DEGREES:
         return
@@ -131,11 +121,10 @@ def _distortion(camera: Camera, where: str) -> Iterator[CalibrationProblem]:
     share = float(np.isnan(undistort(camera, pixels)).any(axis=1).mean())
     if share > MAX_FOLDED_SHARE:
         values = ", ".join(f"{value:.6g}" for value in camera.distortion)
-        yield CalibrationProblem(
-            f"{where}: its distortion ({camera.distortion_model}: {values}) folds the image at {fold_deg:.0f} degrees off the axis: "
-            f"{100 * share:.0f} % of the pixels have no ray; check the order and signs of the coefficients",
-            share > MAX_USABLE_FOLDED_SHARE,
-        )
+        folds = f"folds the image at {fold_deg:.0f} degrees off the axis: {100 * share:.0f} % of the pixels have no ray"
+        advice = "check the order and signs of the coefficients"
+        message = f"{where}: its distortion ({camera.distortion_model}: {values}) {folds}; {advice}"
+        yield message, share > MAX_USABLE_FOLDED_SHARE
 
 
 # Streams of a second that has no record of another may still belong together: a log may hold one frame and one sweep.
@@ -179,10 +168,6 @@ class Span:
         """Whether more than a distance lies between two spans."""
         return max(self.first_ns, other.first_ns) - min(self.last_ns, other.last_ns) > distance_ns
 
-    def joined(self, other: Span) -> Span:
-        """Return the span of both, with the words of the first."""
-        return Span(self.words, min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns))
-
 
 def list_time_problems(log: Log) -> list[str]:
     """List what is wrong with the stamps of a log, one line each; only stamps are read, and the labels."""
@@ -191,18 +176,15 @@ def list_time_problems(log: Log) -> list[str]:
 
 def describe_gap(one: Span, other: Span) -> str:
     """Say that two spans do not overlap, by how much, and which clocks would explain it."""
+
+    def shown(t_ns: int) -> str:  # in s with ms, exactly
+        sign, t_ms = "-" * (t_ns < 0), abs(t_ns) // 10**6
+        return f"{sign}{t_ms // 1000}.{t_ms % 1000:03d}"
+
     hint = _explain(one, other)
-    first, second = (f"{_seconds(span.first_ns)} to {_seconds(span.last_ns)} s" for span in (one, other))
-    return (
-        f"the {one.words} are from {first}, the {other.words} from {second}: they do not overlap (the difference is "
-        f"{abs(one.first_ns - other.first_ns) / NS_PER_S:.6g} s{f': {hint}?' * bool(hint)})"
-    )
-
-
-def _seconds(t_ns: int) -> str:
-    """Format a stamp in s with ms, exactly."""
-    sign, t_ms = "-" * (t_ns < 0), abs(t_ns) // 10**6
-    return f"{sign}{t_ms // 1000}.{t_ms % 1000:03d}"
+    first, second = (f"{shown(span.first_ns)} to {shown(span.last_ns)} s" for span in (one, other))
+    difference = f"{abs(one.first_ns - other.first_ns) / NS_PER_S:.6g} s{f': {hint}?' * bool(hint)}"
+    return f"the {one.words} are from {first}, the {other.words} from {second}: they do not overlap (the difference is {difference})"
 
 
 def _explain(one: Span, other: Span) -> str:
@@ -228,66 +210,64 @@ def _explain(one: Span, other: Span) -> str:
 
 def _other_clocks(log: Log) -> list[str]:
     """Report streams and poses whose times are far from those of most others."""
-    groups: list[tuple[list[str], Span]] = []
     found = [
         Span.of(f"{'frames' if name in log.cameras else 'sweeps'} of '{name}'", stream.t_ns)
         for name, stream in log.streams.items()
         if len(stream.t_ns)
     ]
     found += [] if log.ego is None else [Span.of("ego poses", log.ego.t_ns)]
+    groups: list[tuple[list[str], Span]] = []
     for span in sorted(found, key=lambda span: span.first_ns):
         if groups and not groups[-1][1].is_apart(span):
-            groups[-1] = ([*groups[-1][0], span.words], groups[-1][1].joined(span))
+            words, joined = groups.pop()
+            ends = min(joined.first_ns, span.first_ns), max(joined.last_ns, span.last_ns)
+            groups.append(([*words, span.words], Span("", *ends)))
         else:
             groups.append(([span.words], span))
-    if len(groups) < 2:
-        return []
     spans = []
     for words, span in groups:
         more = len(words) - MAX_NAMES
         rest = f" and {more} other stream{'s' * (more > 1)}" if more > 0 else ""
-        spans.append(Span(", ".join(words[:MAX_NAMES]) + rest, span.first_ns, span.last_ns))
-    most = max(range(len(groups)), key=lambda k: len(groups[k][0]))
+        spans.append(replace(span, words=", ".join(words[:MAX_NAMES]) + rest))
+    most = max(range(len(groups)), key=lambda k: len(groups[k][0]), default=0)
     return [describe_gap(span, spans[most]) for k, span in enumerate(spans) if k != most]
 
 
 def _reference_problem(log: Log) -> list[str]:
     """Report when the sensor whose records are the ticks begins late or ends early, since a run lasts as long as it does."""
-    streams = {name: s.t_ns for name, s in log.streams.items() if len(s.t_ns)}
-    reference = reference_of(log, [name for name in log.cameras if name in streams]) if streams else ""
-    if reference not in streams or len(streams) < 2:
+    spans = {name: Span.of(name, s.t_ns) for name, s in log.streams.items() if len(s.t_ns)}
+    reference = reference_of(log, [name for name in log.cameras if name in spans]) if spans else ""
+    own = spans.pop(reference, None)
+    if own is None or not spans:
         return []
-    others = [Span.of(name, t_ns) for name, t_ns in streams.items() if name != reference]
-    own = Span.of(reference, streams[reference])
-    begin_ns = max(own.first_ns - min(span.first_ns for span in others), 0)
-    end_ns = max(max(span.last_ns for span in others) - own.last_ns, 0)
-    whole_ns = own.last_ns - own.first_ns + begin_ns + end_ns
+    late_ns = np.array([own.first_ns - span.first_ns for span in spans.values()])
+    early_ns = np.array([span.last_ns - own.last_ns for span in spans.values()])
+    begin_ns, end_ns = max(int(late_ns.max()), 0), max(int(early_ns.max()), 0)
+    length_ns = own.last_ns - own.first_ns
+    whole_ns = length_ns + begin_ns + end_ns
     least_ns = max(MIN_MISSING_NS, MIN_MISSING_SHARE * whole_ns)
-    late, early = (
-        gap_ns >= least_ns and sum(own_ns >= least_ns for own_ns in gaps) * 2 >= len(others)
-        for gap_ns, gaps in (
-            (begin_ns, [own.first_ns - span.first_ns for span in others]),
-            (end_ns, [span.last_ns - own.last_ns for span in others]),
+    parts = [
+        f"{verb} {gap_ns / NS_PER_S:.1f} s {word}"
+        for verb, word, gap_ns, gaps_ns in (
+            ("begins", "after", begin_ns, late_ns),
+            ("ends", "before", end_ns, early_ns),
         )
-    )
-    if not late and not early:
+        if gap_ns >= least_ns and (gaps_ns >= least_ns).sum() * 2 >= len(spans)
+    ]
+    if not parts:
         return []
-    parts = [f"begins {begin_ns / NS_PER_S:.1f} s after"] * late + [f"ends {end_ns / NS_PER_S:.1f} s before"] * early
+    # Off the others by the same time at both ends, as by another clock.
+    first_ns = own.first_ns - int(np.median([span.first_ns for span in spans.values()]))
+    last_ns = own.last_ns - int(np.median([span.last_ns for span in spans.values()]))
+    least, shifted = min(abs(first_ns), abs(last_ns)), ""
+    if least >= MIN_MISSING_NS and abs(first_ns - last_ns) <= MAX_END_MISMATCH * least:
+        word = "late" if first_ns > 0 else "early"
+        shifted = f" (both its ends are {abs(first_ns) / NS_PER_S:.1f} s {word}, as by another clock)"
     kind = "camera" if reference in log.cameras else "LiDAR"
     return [
-        f"the reference {kind} '{reference}' {' and '.join(parts)} other sensors{_shifted(own, others)}: a run of its ticks lasts "
-        f"{(own.last_ns - own.first_ns) / NS_PER_S:.1f} s of the {whole_ns / NS_PER_S:.1f} s of the log"
+        f"the reference {kind} '{reference}' {' and '.join(parts)} other sensors{shifted}: a run of its ticks lasts "
+        f"{length_ns / NS_PER_S:.1f} s of the {whole_ns / NS_PER_S:.1f} s of the log"
     ]
-
-
-def _shifted(own: Span, others: Sequence[Span]) -> str:
-    """Say that a stream is off the others by the same time at both ends, as by another clock; "" where it is not."""
-    first_ns = own.first_ns - int(np.median([span.first_ns for span in others]))
-    last_ns = own.last_ns - int(np.median([span.last_ns for span in others]))
-    alike = abs(first_ns - last_ns) <= MAX_END_MISMATCH * min(abs(first_ns), abs(last_ns))
-    if not alike or min(abs(first_ns), abs(last_ns)) < MIN_MISSING_NS:
-        return ""
-    return f" (both its ends are {abs(first_ns) / NS_PER_S:.1f} s {'late' if first_ns > 0 else 'early'}, as by another clock)"
 
 
 def _image_label_problems(log: Log) -> list[str]:

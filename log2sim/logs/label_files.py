@@ -45,35 +45,36 @@ def replace_labels(log: Log, path: Path) -> Log:
 
     Raises `LogError` for a file of none of the formats, and for one without a box at a time at which the log has a pose.
     """
-    first = read_file(path, JSON_LIMIT_BYTES, LogError)[:4096].decode("utf-8-sig", errors="replace").lstrip()
+    text = read_file(path, JSON_LIMIT_BYTES, LogError).decode("utf-8-sig", errors="replace")
+    first = text[:4096].lstrip()
     notes: list[str] = []
     regions: dict[str, ImageRegions] = {}
     if first[:1] in ("{", "["):
         document = read_json(path)
-        if isinstance(document, dict) and "openlabel" in document:
-            labels = _labels_of(log, path, _openlabel_boxes(log, path, document["openlabel"]), notes)
-        else:
-            labels = _labels_of(log, path, _nuscenes_boxes(log, path, document), notes)
+        is_openlabel = isinstance(document, dict) and "openlabel" in document
+        boxes = (
+            _openlabel_boxes(log, path, document["openlabel"]) if is_openlabel else _nuscenes_boxes(log, path, document)
+        )
+        labels = _labels_of(log, path, list(boxes), notes)
     elif "," in first.partition("\n")[0]:
         labels = boxes_3d(read_csv_table(path, BOX_3D_COLUMNS, BOX_3D_OPTIONAL))
         labels = replace(labels, center_m=labels.center_m - np.array(log.map.offset_m))
     elif len(first.partition("\n")[0].split()) in (kitti.LABEL_FIELDS, kitti.RESULT_FIELDS):
-        labels, regions = _kitti_labels(log, path, notes)
+        labels, regions = _kitti_labels(log, path, text, notes)
     else:
         raise LogError(f"{path}: is no file of boxes; expected {EXPECTED}")
     possible = find_possible(labels)
     if not possible.all():
         row = int(np.argmin(possible))
         raise LogError(f"{path}: box of '{labels.track_id[row]}': no object has this size or place")
-    spans = [s.t_ns[[0, -1]] for s in log.streams.values() if len(s.t_ns)]
     if not len(labels.t_ns):
         raise LogError(f"{path}: no box at a time and place that {log.name} knows")
+    spans = [s.t_ns[[0, -1]] for s in log.streams.values() if len(s.t_ns)]
     first_ns, last_ns = (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else (0, MAX_STAMP_NS)
     if labels.t_ns.max() < first_ns or labels.t_ns.min() > last_ns:
         times = [f"{int(t) / NS_PER_S:.3f}" for t in (labels.t_ns.min(), labels.t_ns.max(), first_ns, last_ns)]
-        raise LogError(
-            f"{path}: its boxes are of {times[0]} to {times[1]} s, {log.name} of {times[2]} to {times[3]} s; are both of one drive?"
-        )
+        spanned = f"its boxes are of {times[0]} to {times[1]} s, {log.name} of {times[2]} to {times[3]} s"
+        raise LogError(f"{path}: {spanned}; are both of one drive?")
     said = [f"{path.name}: {note}" for note in notes]
     return log.changed(labels=labels, ignored_regions=regions, notes=lambda: (*log.notes, *said))
 
@@ -91,31 +92,30 @@ class _Box:
     frame: str = "map"
 
 
-def _labels_of(log: Log, path: Path, boxes: Iterator[_Box], notes: list[str]) -> Labels:
+def _labels_of(log: Log, path: Path, boxes: list[_Box], notes: list[str]) -> Labels:
     """Place boxes in the map."""
-    found = list(boxes)
-    unknown = [box.word for box in found if box.word.lower() not in CATEGORY_OF]
+    unknown = [box.word for box in boxes if box.word.lower() not in CATEGORY_OF]
     if unknown:
         notes.append(f"labels left out, of no known category: {count_words(unknown)}")
-    found = [box for box in found if box.word.lower() in CATEGORY_OF]
+    found = [box for box in boxes if box.word.lower() in CATEGORY_OF]
     if not found:
         raise LogError(f"{path}: no box of a known category; known: {', '.join(CATEGORY_OF)}")
     t_ns = np.array([box.t_ns for box in found], dtype=np.int64)
     map_T_box = np.stack([box.pose for box in found])
     frames = np.array([box.frame for box in found])
     known = np.ones(len(found), dtype=bool)
-    for frame in np.unique(frames):
+    for frame in np.unique(frames).tolist():
         rows = np.flatnonzero(frames == frame)
         if frame == "map":
             map_T_box[rows, :3, 3] -= np.array(log.map.offset_m)
             continue
         where = found[rows[0]].where
-        if frame == "ego":
-            if log.ego is None:
-                raise LogError(f"{where}: is in the frame of the ego, and the log has none; state boxes in the map")
+        if frame == "ego" and log.ego is None:
+            raise LogError(f"{where}: is in the frame of the ego, and the log has none; state boxes in the map")
+        if frame == "ego" and log.ego is not None:
             map_T_frame, known[rows] = log.ego.at(t_ns[rows])
         elif frame in log.cameras or frame in log.lidars:
-            map_T_frame, known[rows] = log.map_T_sensor(str(frame), t_ns[rows])
+            map_T_frame, known[rows] = log.map_T_sensor(frame, t_ns[rows])
         else:
             there = ", ".join(["map", "ego", *log.cameras, *log.lidars])
             raise LogError(f"{where}: coordinate system '{frame}' is not known; known: {there}")
@@ -134,19 +134,17 @@ def _labels_of(log: Log, path: Path, boxes: Iterator[_Box], notes: list[str]) ->
     )
 
 
-def _kitti_labels(log: Log, path: Path, notes: list[str]) -> tuple[Labels, dict[str, ImageRegions]]:
+def _kitti_labels(log: Log, path: Path, text: str, notes: list[str]) -> tuple[Labels, dict[str, ImageRegions]]:
     """Place the rows of a KITTI file: frames are those of the reference camera, boxes in its axes."""
     camera, stamps = _reference(log, path)
     if camera not in log.cameras:
         raise LogError(f"{path}: KITTI's boxes are in the frame of a camera, and {log.name} has none")
-    text = read_file(path, JSON_LIMIT_BYTES, LogError).decode("utf-8", errors="replace")
     rows = kitti.parse_labels_noting(text, path, notes)
     inside = rows.frame < len(stamps)
     if not inside.all():
         notes.append(f"{int((~inside).sum())} labels left out: of frames after the last of '{camera}'")
-    placed = kitti.labels_of_rows(
-        rows.take(inside), partial(log.map_T_sensor, camera), lambda frame: stamps[frame], "", camera
-    )
+    poses_at = partial(log.map_T_sensor, camera)
+    placed = kitti.labels_of_rows(rows.take(inside), poses_at, lambda frame: stamps[frame], "", camera)
     assert placed.boxes_3d is not None
     return placed.boxes_3d, dict(placed.ignored)
 
@@ -170,19 +168,16 @@ def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
         if not isinstance(entry, dict):
             raise LogError(f"{where}: expected an object with translation, size and rotation")
         instance = tables["instance"].get(str(entry.get("instance_token")), {})
-        names = [entry.get(key) for key in ("detection_name", "tracking_name", "category_name")]
-        names.append(tables["category"].get(str(instance.get("category_token")), {}).get("name"))
+        category = tables["category"].get(str(instance.get("category_token")), {})
         sample = tables["sample"].get(str(entry.get("sample_token")), {})
+        names = [entry.get(key) for key in ("detection_name", "tracking_name", "category_name")]
+        word = next((name for name in (*names, category.get("name")) if isinstance(name, str)), None)
         stamp = entry.get("timestamp", sample.get("timestamp"))
-        track = next(
-            (entry[key] for key in ("tracking_id", "instance_token") if entry.get(key) not in (None, "")), None
-        )
-        word = next((name for name in names if isinstance(name, str)), None)
+        tracks = [entry.get(key) for key in ("tracking_id", "instance_token")]
+        track = next((token for token in tracks if token not in (None, "")), None)
+        named = "tracking_name, detection_name or category_name, or instance.json and category.json beside the file"
         for value, what in (
-            (
-                word,
-                "tracking_name, detection_name or category_name, or instance.json and category.json beside the file",
-            ),
+            (word, named),
             (stamp, "timestamp in microseconds, or sample.json beside the file"),
             (track, "tracking_id or instance_token: who is the same must be known over time"),
         ):
@@ -196,40 +191,30 @@ def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
 
 def _openlabel_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:
     """Read the cuboids of the frames of an OpenLABEL document (ASAM OpenLABEL 1.0.0, section 8)."""
-    frames, objects = (_mapping(document, key, path) for key in ("frames", "objects"))
-    systems = {
-        name: str(s.get("type"))
-        for name, s in _mapping(document, "coordinate_systems", path).items()
-        if isinstance(s, dict)
-    }
-    for number, content in frames.items():
+    for key in ("frames", "objects", "coordinate_systems"):
+        if not isinstance(document, dict) or not isinstance(document.get(key, {}), dict):
+            raise LogError(f"{path}: openlabel.{key} is no object")
+    systems = _inner(document, "coordinate_systems")
+    for number, content in _inner(document, "frames").items():
         stamp = _inner(content, "frame_properties").get("timestamp")
         t_ns = None
         for uid, entry in _inner(content, "objects").items():
-            about = objects.get(uid)
-            word = about.get("type") if isinstance(about, dict) else None
+            word = _inner(_inner(document, "objects"), uid).get("type")
             cuboids = _inner(entry, "object_data").get("cuboid", [])
             for cuboid in cuboids if isinstance(cuboids, list) else [cuboids]:
                 where = f"{path}, frame {number}, object '{uid[:40]}'"
                 if not isinstance(cuboid, dict) or not isinstance(word, str):
-                    raise LogError(
-                        f"{where}: expected a cuboid with 'val', and the object with its 'type' in 'objects'"
-                    )
+                    expected = "expected a cuboid with 'val', and the object with its 'type' in 'objects'"
+                    raise LogError(f"{where}: {expected}")
                 if t_ns is None:
                     t_ns = _frame_ns(number, log, path) if stamp is None else _stamp_ns(stamp, log, where)
                 values = _numbers(cuboid.get("val"), (9, 10), f"{where}, val")
                 angles = len(values) == 9
                 turn = rotation_from_rpy(*values[3:6]) if angles else _rotation(values[[6, 3, 4, 5]], where)
                 name = str(cuboid.get("coordinate_system", ""))
-                frame = {"scene_cs": "map", "geo": "map", "local_cs": "ego"}.get(systems.get(name, ""), name or "ego")
+                kind = str(_inner(systems, name).get("type"))
+                frame = {"scene_cs": "map", "geo": "map", "local_cs": "ego"}.get(kind, name or "ego")
                 yield _Box(where, t_ns, uid, word, transform(turn, values[:3]), values[-3:].tolist(), frame)
-
-
-def _mapping(document: Any, key: str, path: Path) -> dict[str, Any]:
-    value = document.get(key, {}) if isinstance(document, dict) else None
-    if not isinstance(value, dict):
-        raise LogError(f"{path}: openlabel.{key} is no object")
-    return value
 
 
 def _inner(entry: Any, key: str) -> dict[str, Any]:
@@ -267,9 +252,8 @@ def _frame_ns(number: str, log: Log, path: Path) -> int:
     except ValueError:
         frame = -1
     if not 0 <= frame < len(stamps):
-        raise LogError(
-            f"{path}, frame '{number[:20]}': '{name}' has the frames 0 to {len(stamps) - 1}; or state a timestamp"
-        )
+        there = f"'{name}' has the frames 0 to {len(stamps) - 1}; or state a timestamp"
+        raise LogError(f"{path}, frame '{number[:20]}': {there}")
     return int(stamps[frame])
 
 

@@ -1,20 +1,21 @@
-"""Open a folder or a file of recorded data as a `Log` with the reader of its format; parts, digest and summary of logs."""
+"""Open a folder or a file of recorded data as a `Log` with the reader of its format, and read all of it to list its problems."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from log2sim.datatypes import Log
-from log2sim.errors import ConfigError, Log2SimError, LogError, PluginError
+import numpy as np
+
+from log2sim.datatypes import Log, Sweep
+from log2sim.errors import ConfigError, Log2SimError, LogError, PluginError, RecordError
 from log2sim.files import plugins
 from log2sim.files.inputs import following_links
 from log2sim.logs.checks import drop_impossible_labels, list_calibration_problems, list_time_problems
+from log2sim.logs.excerpt import summarize_stamps
 from log2sim.logs.records import guard_log, translate_parser_errors
-
-__all__ = ["Reader", "find_reader", "open_log"]
 
 
 class Reader(Protocol):
@@ -122,7 +123,17 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
         raise LogError(f"{root}: is a file, which format '{name}' cannot be; expected {reader.looks_for}")
     with plugins.blaming("log", name):
         available = reader.sequences(root)
-    chosen = _select_sequence(root, name, available, sequence)
+    if not available:
+        raise LogError(f"{root}: holds no sequence of format '{name}'; expected {reader.looks_for}")
+    if sequence is None and len(available) > 1:
+        raise ConfigError(
+            f"{root}: holds {len(available)} sequences; choose one with --sequence NAME: {_joined(available)}; "
+            "`log2sim batch` takes them all"
+        )
+    chosen = available[0] if sequence is None else sequence
+    if chosen not in available:
+        hint = plugins.nearest(chosen, available)
+        raise ConfigError(f"{root}: no sequence '{chosen}'{hint}; there are: {_joined(available)}")
     with translate_parser_errors(f"{root}: cannot be read as format '{name}'", LogError):
         with plugins.blaming("log", name):
             opened = reader.open(root, chosen)
@@ -146,20 +157,25 @@ def _find_reader(root: Path, readers: Mapping[str, Reader], defects: list[str]) 
     for name, reader in readers.items():
         if _matches(name, reader, root):
             return name
-    broken = "".join(f"; {defect}" for defect in defects)
-    if root.is_file():
-        suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
-        raise LogError(
-            f"{root}: is a file of no known log format; give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}{_log_above(root, readers)}{broken}"
-        )
-    below = _logs_below(root)
+    broken, below = "".join(f"; {defect}" for defect in defects), list[str]()
+    if root.is_dir():  # the folder of many logs, where a short search finds some
+        with suppress(Log2SimError, OSError):
+            below = [str(log.path) for log in plugins.call("find_logs", root, max_folders=MAX_FOLDERS_BELOW)]
     if below:
         count = f"{len(below)} log{'s' * (len(below) != 1)} below"
         raise LogError(f"{root}: {count}: `log2sim batch` takes them all, other commands one of them: {_joined(below)}")
+    above = ""  # the folder of the log, where a part of one was given
+    for folder in list(root.absolute().parents)[:-1][:MAX_LEVELS_ABOVE]:
+        holds = next((name for name, reader in readers.items() if _seems_to_match(name, reader, folder)), None)
+        if holds is not None:
+            above = f"; {folder}, which it is in, holds logs of the format '{holds}'"
+            break
+    if root.is_file():
+        suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
+        expected = f"give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}"
+        raise LogError(f"{root}: is a file of no known log format; {expected}{above}{broken}")
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
-    raise LogError(
-        f"{root}: no known log format{_log_above(root, readers)}; a log is one of: {known}. Force one with --format{broken}"
-    )
+    raise LogError(f"{root}: no known log format{above}; a log is one of: {known}. Force one with --format{broken}")
 
 
 def _usable_readers() -> tuple[dict[str, Reader], list[str]]:
@@ -187,22 +203,6 @@ def _seems_to_match(name: str, reader: Reader, root: Path) -> bool:
     return False
 
 
-def _log_above(path: Path, readers: Mapping[str, Reader]) -> str:
-    """Say which folder above a path is a log, for who gave a part of one; "" when none is."""
-    for folder in list(path.absolute().parents)[:-1][:MAX_LEVELS_ABOVE]:
-        for name, reader in readers.items():
-            if _seems_to_match(name, reader, folder):
-                return f"; {folder}, which it is in, holds logs of the format '{name}'"
-    return ""
-
-
-def _logs_below(root: Path) -> list[str]:
-    """Return the logs below a folder, for who gave the folder of many; none where a short search finds none."""
-    with suppress(Log2SimError, OSError):
-        return [str(log.path) for log in plugins.call("find_logs", root, max_folders=MAX_FOLDERS_BELOW)]
-    return []
-
-
 def is_log_file(path: Path) -> bool:
     """Return whether a file has a suffix of a format of which a file is a log."""
     return path.is_file() and any(_may_read(reader, path) for reader in _usable_readers()[0].values())
@@ -213,23 +213,77 @@ def _may_read(reader: Reader, root: Path) -> bool:
     return root.is_dir() or root.suffix.lower() in reader.suffixes
 
 
-def _select_sequence(root: Path, name: str, available: list[str], sequence: str | None) -> str:
-    if not available:
-        reader: Reader = plugins.load("log", name)
-        raise LogError(f"{root}: holds no sequence of format '{name}'; expected {reader.looks_for}")
-    if sequence is not None:
-        if sequence not in available:
-            hint = plugins.nearest(sequence, available)
-            raise ConfigError(f"{root}: no sequence '{sequence}'{hint}; there are: {_joined(available)}")
-        return sequence
-    if len(available) > 1:
-        raise ConfigError(
-            f"{root}: holds {len(available)} sequences; choose one with --sequence NAME: {_joined(available)}; "
-            "`log2sim batch` takes them all"
-        )
-    return available[0]
-
-
 def _joined(names: list[str]) -> str:
     more = len(names) - MAX_LISTED
     return ", ".join(names[:MAX_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+MAX_POINT_DISTANCE_M = 1000.0
+
+
+def validate_log(
+    path: Path | str | Log,
+    *,
+    format: str = "auto",
+    sequence: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[str]:
+    """List the problems of a log, one line each; all records are read.
+
+    `path`, `format`, `sequence`: as for `open_log`; or an open log. `progress`: called as `progress(done, total)` after
+    each record. Raises `LogError` when the log cannot be opened at all.
+    """
+    log = path if isinstance(path, Log) else open_log(path, format=format, sequence=sequence)
+    # Notes on other formats say what the format lacks; those on native logs say what is wrong with the stamps.
+    problems = list(log.notes) if log.format == "log2sim" else []
+    total = sum(len(s.t_ns) for s in log.streams.values())
+    done = 0
+    for stream in log.streams.values():
+        bad = 0
+        for i in range(len(stream.t_ns)):
+            try:
+                record = stream.read(i)
+            except RecordError as error:
+                bad += 1
+                problems.append(f"stream '{stream.name}': {error}")
+            else:
+                defect = _defect_of(record) if isinstance(record, Sweep) else ""
+                problems += [f"stream '{stream.name}', stamp {stream.t_ns[i]}: {defect}"] if defect else []
+            done += 1
+            if progress is not None:
+                progress(done, total)
+        if bad == len(stream.t_ns):
+            problems.append(f"stream '{stream.name}': none of its {bad} records can be read")
+    on_ego = [n for n in log.streams if (log.cameras.get(n) or log.lidars[n]).mount == "ego"]
+    if log.ego is None and on_ego:
+        missing = f"the log has no poses of the ego, on which {', '.join(on_ego)} are mounted"
+        return [*problems, f"{missing}; reconstruct estimates them"]
+    for name, stream in log.streams.items():
+        known = log.map_T_sensor(name, stream.t_ns)[1]
+        if not known.all():
+            count, first = f"{np.sum(~known)} of {len(known)} records", stream.t_ns[np.argmin(known)]
+            problems.append(f"stream '{name}': no ego pose for {count}, first at stamp {first}")
+    return problems
+
+
+def _defect_of(sweep: Sweep) -> str:
+    if not len(sweep.xyz_m):
+        return "the sweep has no points"
+    most_m = float(np.abs(sweep.xyz_m).max())
+    is_far = sweep.frame == "lidar" and most_m > MAX_POINT_DISTANCE_M
+    return f"a point is {most_m:.0f} m from the LiDAR; are the units meters?" if is_far else ""
+
+
+def list_gaps(log: Log) -> list[str]:
+    """List the streams in which records seem to be missing, by the steps between their stamps, one line each."""
+    lines = []
+    for name, stream in log.streams.items():
+        summary = summarize_stamps(stream.t_ns)
+        if summary["gaps"]:
+            longest = max(summary["gaps"], key=lambda gap: float(gap["length_s"]))
+            count = len(summary["gaps"])
+            lines.append(
+                f"stream '{name}': {count} gap{'s' * (count > 1)} in its records at {summary['rate_hz']:g} Hz, the longest of "
+                f"{longest['length_s']:g} s after stamp {longest['after_ns']}"
+            )
+    return lines

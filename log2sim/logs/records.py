@@ -9,6 +9,7 @@ import threading
 import tokenize
 import zipfile
 import zlib
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -46,16 +47,11 @@ def checked_poses(q: Array, position: Array, where: Callable[[int], str]) -> Arr
     """
     bad = np.union1d(find_not_unit(q), np.flatnonzero(~(np.abs(position) <= MAX_POSITION_M).all(axis=1)))
     if len(bad):
-        k = int(bad[0])
-        raise LogError(
-            f"{where(k)}: position {position[k].tolist()}, quaternion {q[k].tolist()}, expected finite numbers up to {MAX_POSITION_M:g} "
-            "and a unit quaternion"
-        )
+        k, expected = int(bad[0]), f"expected finite numbers up to {MAX_POSITION_M:g} and a unit quaternion"
+        raise LogError(f"{where(k)}: position {position[k].tolist()}, quaternion {q[k].tolist()}, {expected}")
     return transform(rotation_from_quaternion(q), position)
 
 
-MAX_NUMBER = np.iinfo(np.int64).max
-# More digits are no int64, and converting many of them takes long.
 MAX_DIGITS = 19
 
 
@@ -66,9 +62,9 @@ def list_numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Pa
     """
     found = {}
     for path in list_files(folder, suffixes):
-        suffix = next(s for s in suffixes if path.name.lower().endswith(s))
-        word = path.name[: -len(suffix)]
-        if word.isdecimal() and len(word) <= MAX_DIGITS and int(word) <= MAX_NUMBER:
+        word = path.name[: -next(len(s) for s in suffixes if path.name.lower().endswith(s))]
+        # More digits are no int64, and converting many of them takes long.
+        if word.isdecimal() and len(word) <= MAX_DIGITS and int(word) <= np.iinfo(np.int64).max:
             found[int(word)] = path
     return dict(sorted(found.items()))
 
@@ -132,39 +128,11 @@ def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]
 MAX_KEPT_BYTES = 256 * 1024 * 1024
 
 
-class _LastSweeps:
-    """The sweeps of a log that were read last, up to `MAX_KEPT_BYTES`; safe to share between threads."""
-
-    def __init__(self) -> None:
-        self._sweeps: dict[tuple[str, int], Sweep] = {}
-        self._bytes, self._lock = 0, threading.Lock()
-
-    def read(self, stream: str, i: int, read: Callable[[int], Any]) -> Any:
-        """Return record i of a stream, which is read if it is not kept; pictures are never kept."""
-        with self._lock:
-            kept = self._sweeps.pop((stream, i), None)
-            if kept is not None:
-                self._sweeps[stream, i] = kept  # the last one in
-                return kept
-        record = read(i)
-        if isinstance(record, Sweep):
-            with self._lock:
-                self._bytes += 0 if (stream, i) in self._sweeps else _bytes_of(record)
-                self._sweeps[stream, i] = record
-                while self._bytes > MAX_KEPT_BYTES:
-                    self._bytes -= _bytes_of(self._sweeps.pop(next(iter(self._sweeps))))
-        return record
-
-
-def _bytes_of(sweep: Sweep) -> int:
-    return sum(column.nbytes for column in vars(sweep).values() if isinstance(column, np.ndarray))
-
-
 def guard_log(log: Log, where: str) -> Log:
     """Return the log of a reader with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
 
-    The sweeps that were read last are kept. `where`: its path, for errors. Raises `LogError` for poses of the ego that are not
-    finite, or farther from the origin of the map than any place on Earth.
+    The sweeps that were read last are kept, up to `MAX_KEPT_BYTES`. `where`: its path, for errors. Raises `LogError` for poses of the
+    ego that are not finite, or farther from the origin of the map than any place on Earth.
     """
     if log.ego is not None:
         wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
@@ -182,18 +150,31 @@ def guard_log(log: Log, where: str) -> Log:
 
         return reading
 
-    sweeps = _LastSweeps()
+    sweeps: OrderedDict[tuple[str, int], tuple[Sweep, int]] = OrderedDict()  # those read last, with their bytes
+    lock = threading.Lock()
 
     def guarded_stream(stream: Stream) -> Stream:
         def record(read: Callable[[int], Any], i: int) -> Any:
             with translate_parser_errors(f"{where}: record {i} of '{stream.name}' cannot be read", RecordError):
                 return read(i)
 
+        def read_or_keep(i: int) -> Any:
+            with lock:
+                if (stream.name, i) in sweeps:
+                    sweeps.move_to_end((stream.name, i))
+                    return sweeps[stream.name, i][0]
+            found = record(stream.read, i)
+            if isinstance(found, Sweep):
+                size = sum(column.nbytes for column in vars(found).values() if isinstance(column, np.ndarray))
+                with lock:
+                    sweeps[stream.name, i] = found, size
+                    while sum(bytes_of for _, bytes_of in sweeps.values()) > MAX_KEPT_BYTES:
+                        sweeps.popitem(last=False)
+            return found
+
         stamps = guarded(lambda: stream.t_ns, f"the stamps of '{stream.name}' cannot be read")
         encoded = None if stream.encoded is None else partial(record, stream.encoded)
-        return Stream(
-            stream.name, stamps, partial(sweeps.read, stream.name, read=partial(record, stream.read)), encoded
-        )
+        return Stream(stream.name, stamps, read_or_keep, encoded)
 
     return log.changed(
         streams={name: guarded_stream(stream) for name, stream in log.streams.items()},
@@ -246,47 +227,18 @@ MAX_HEADER_BYTES = 16 * 1024
 MAX_ASCII_VALUES = 20_000_000
 TIME_FIELDS = ("t_offset_ns", "offset", "t", "timestamp")
 INTENSITY_FIELDS = ("intensity", "reflectivity", "reflectance")
+PCD_TYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
+# Times of points relative to the stamp of their sweep, ns, and how strong returns are; None when the file does not tell.
+Offset = NDArray[np.int64] | None
+Intensity = NDArray[Any] | None
 
 
-def parse_pcd(
-    data: bytes, t_ns: int, limit_points: int
-) -> tuple[NDArray[Any], NDArray[np.int64] | None, NDArray[Any] | None]:
+def parse_pcd(data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:
     """Parse points (N, 3), their times (N,) int64 ns relative to the stamp and their intensities (N,); None without such a field.
 
     A time field is `t_offset_ns`, `offset` or `t` (relative to the stamp) or `timestamp` (absolute); whole numbers are
     nanoseconds, floating-point numbers seconds. Raises `ValueError` when the header or the data do not follow the format.
     """
-    header, body = _read_header(data)
-    layout = _layout(header)
-    words = header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
-    count = int(words[0])
-    if not 0 <= count <= limit_points:
-        raise ValueError(f"{count} points, more than the {limit_points} that a sweep may have")
-    encoding = header["DATA"][0].lower()
-    if encoding == "binary":
-        if len(body) < count * layout.itemsize:
-            raise ValueError(f"truncated: {len(body)} of {count * layout.itemsize} bytes")
-        rows = np.frombuffer(body, layout, count)
-    elif encoding == "ascii":
-        rows = _parse_ascii(body, layout, count)
-    else:
-        raise ValueError(
-            f"DATA {encoding} is not supported; convert it to binary (pcl_convert_pcd_ascii_binary IN OUT 1)"
-        )
-    xyz = np.stack([rows[k] for k in ("x", "y", "z")], axis=1)
-    field = next((f for f in TIME_FIELDS if f in (layout.names or ())), None)
-    offset_ns = None if field is None else _offset_ns(rows[field], t_ns, absolute=field == "timestamp")
-    strength = find_intensity_field(layout)
-    return xyz, offset_ns, None if strength is None else rows[strength]
-
-
-def find_intensity_field(layout: np.dtype[Any]) -> str | None:
-    """Find the field of the points' intensities, one number each; None where there is none."""
-    named = {name.lower(): name for name in layout.names or () if layout[name].shape == ()}
-    return next((named[name] for name in INTENSITY_FIELDS if name in named), None)
-
-
-def _read_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
@@ -300,7 +252,31 @@ def _read_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     for key in ("FIELDS", "SIZE", "TYPE", "DATA"):
         if not header.get(key):
             raise ValueError(f"PCD header lacks {key}")
-    return header, data[start:]
+    layout, body = _layout(header), data[start:]
+    words = header.get("POINTS") or [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))]
+    count = int(words[0])
+    _check_count(count)
+    encoding = header["DATA"][0].lower()
+    if encoding == "binary":
+        if len(body) < count * layout.itemsize:
+            raise ValueError(f"truncated: {len(body)} of {count * layout.itemsize} bytes")
+        rows = np.frombuffer(body, layout, count)
+    elif encoding == "ascii":
+        rows = _parse_ascii(body, layout, count)
+    else:
+        advice = "convert it to binary (pcl_convert_pcd_ascii_binary IN OUT 1)"
+        raise ValueError(f"DATA {encoding} is not supported; {advice}")
+    xyz = np.stack([rows[k] for k in ("x", "y", "z")], axis=1)
+    field = next((f for f in TIME_FIELDS if f in (layout.names or ())), None)
+    offset_ns = None if field is None else _offset_ns(rows[field], t_ns if field == "timestamp" else 0)
+    strength = find_intensity_field(layout)
+    return xyz, offset_ns, None if strength is None else rows[strength]
+
+
+def find_intensity_field(layout: np.dtype[Any]) -> str | None:
+    """Find the field of the points' intensities, one number each; None where there is none."""
+    named = {name.lower(): name for name in layout.names or () if layout[name].shape == ()}
+    return next((named[name] for name in INTENSITY_FIELDS if name in named), None)
 
 
 def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
@@ -310,19 +286,17 @@ def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
         raise ValueError("PCD header: FIELDS, SIZE, TYPE and COUNT differ in length")
     spec: list[tuple[str, str, tuple[int, ...]]] = []
     for k, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts)):
-        code = {"F": "f", "I": "i", "U": "u"}.get(kind.upper())
-        sizes_of = {"f": ("4", "8"), "i": ("1", "2", "4", "8"), "u": ("1", "2", "4", "8")}
-        if code is None or size not in sizes_of[code] or not count.isdigit() or int(count) > 4096:
+        code = kind.lower()
+        if f"{code}{size}" not in PCD_TYPES or not count.isdigit() or int(count) > 4096:
             raise ValueError(f"PCD header: field '{name}' has TYPE {kind} SIZE {size} COUNT {count}")
+        if count != "1" and name in ("x", "y", "z", *TIME_FIELDS):
+            raise ValueError(f"PCD header: field '{name}' has COUNT {count}, expected 1")
         # Padding fields are all called "_", so names are made unique by their index.
         unique = name if names.index(name) == k and name != "_" else f"_{k}"
         spec.append((unique, f"<{code}{size}", () if count == "1" else (int(count),)))
     for axis in ("x", "y", "z"):
         if axis not in names:
             raise ValueError(f"PCD header: no field '{axis}'")
-    for name, _, shape in spec:
-        if shape and name in ("x", "y", "z", *TIME_FIELDS):
-            raise ValueError(f"PCD header: field '{name}' has COUNT {shape[0]}, expected 1")
     return np.dtype(spec)
 
 
@@ -343,15 +317,15 @@ def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]
     return rows
 
 
-def _offset_ns(values: NDArray[Any], t_ns: int, *, absolute: bool) -> NDArray[np.int64]:
+def _offset_ns(values: NDArray[Any], begin_ns: int) -> NDArray[np.int64]:
     if values.dtype.kind in "iu":
-        return checked_offset_ns(values, t_ns if absolute else 0)
+        return checked_offset_ns(values, begin_ns)
     with np.errstate(invalid="ignore"):  # damaged bytes may be signaling NaNs
         seconds = values.astype(np.float64)
     seconds = np.where(np.isfinite(seconds), seconds, 0.0)
     if np.abs(seconds).max(initial=0.0) > MAX_TIME_S:
         raise ValueError(f"a point has the time {np.abs(seconds).max():g} s, expected at most {MAX_TIME_S:g}")
-    return checked_offset_ns(np.round((seconds - (t_ns / NS_PER_S if absolute else 0.0)) * NS_PER_S))
+    return checked_offset_ns(np.round((seconds - begin_ns / NS_PER_S) * NS_PER_S))
 
 
 MAX_SWEEP_POINTS = 20_000_000
@@ -366,11 +340,6 @@ PARSER_ERRORS = (
     ValueError, TypeError, KeyError, IndexError, OverflowError, EOFError, OSError, RuntimeError, SyntaxError,
     struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error, lzma.LZMAError,
 )  # fmt: skip
-
-# Times of points relative to the stamp of their sweep, ns; None when the file has none.
-Offset = NDArray[np.int64] | None
-# How strong returns are; None when the file does not tell.
-Intensity = NDArray[Any] | None
 
 
 def read_sweep(path: Path, t_ns: int, frame: Literal["lidar", "map"] = "lidar") -> Sweep:
@@ -400,8 +369,7 @@ def sweep_of(
     if len(xyz_m) and not (xyz_m.min() >= -MAX_POSITION_M and xyz_m.max() <= MAX_POSITION_M):
         possible = (np.abs(xyz_m) <= MAX_POSITION_M).all(axis=1)
         xyz_m = xyz_m[possible]
-        offset_ns = None if offset_ns is None else offset_ns[possible]
-        intensity = None if intensity is None else intensity[possible]
+        offset_ns, intensity = (None if column is None else column[possible] for column in (offset_ns, intensity))
     point_ns = None if offset_ns is None else t_ns + checked_offset_ns(offset_ns)
     strengths: NDArray[np.float32] | None = None
     if intensity is not None:
@@ -420,28 +388,20 @@ def _parse(suffix: str, data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, I
         return rows[:, :3], None, rows[:, 3] if rows[:, 3].any() else None
     if suffix == ".npy":
         return _sweep_points(_read_npy(io.BytesIO(data), "the array")), None, None
-    if suffix == ".npz":
-        return _parse_npz(data)
     if suffix == ".pcd":
-        return parse_pcd(data, t_ns, MAX_SWEEP_POINTS)
-    raise ValueError(f"unknown suffix '{suffix}', expected .npz, .npy, .bin or .pcd")
-
-
-def _parse_npz(data: bytes) -> tuple[NDArray[Any], Offset, Intensity]:
+        return parse_pcd(data, t_ns)
+    if suffix != ".npz":
+        raise ValueError(f"unknown suffix '{suffix}', expected .npz, .npy, .bin or .pcd")
+    arrays = {}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        names = archive.namelist()
-        if "xyz_m.npy" not in names:
-            raise ValueError(
-                f"no array 'xyz_m' in it, only {', '.join(n.removesuffix('.npy') for n in names[:9]) or 'none'}"
-            )
-        with archive.open("xyz_m.npy") as member:
-            xyz = _sweep_points(_read_npy(member, "xyz_m"))
-        columns = {}
-        for name in ("t_offset_ns", "intensity"):
-            if f"{name}.npy" in names:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+        if "xyz_m.npy" not in archive.namelist():
+            raise ValueError(f"no array 'xyz_m' in it, only {', '.join(names[:9]) or 'none'}")
+        for name in ("xyz_m", "t_offset_ns", "intensity"):
+            if f"{name}.npy" in archive.namelist():
                 with archive.open(f"{name}.npy") as member:
-                    columns[name] = _read_npy(member, name)
-    offset, intensity = columns.get("t_offset_ns"), columns.get("intensity")
+                    arrays[name] = _read_npy(member, name)
+    xyz, offset, intensity = _sweep_points(arrays["xyz_m"]), arrays.get("t_offset_ns"), arrays.get("intensity")
     if offset is not None and (offset.dtype.kind not in "iu" or offset.shape != (len(xyz),)):
         raise ValueError(f"t_offset_ns is {offset.dtype} {offset.shape}, expected whole numbers ({len(xyz)},)")
     if intensity is not None and intensity.shape != (len(xyz),):

@@ -133,11 +133,11 @@ NORTH_STEP_DEG = 1e-5
 
 def map_frame_of(map_frame: MapFrame, latitude_deg: float, longitude_deg: float, altitude_m: float) -> MapFrame:
     """Complete a map frame: the first fix becomes the origin where none is given, a transverse Mercator the projection."""
-    given = map_frame.latitude_deg is not None and map_frame.longitude_deg is not None
-    latitude = map_frame.latitude_deg if map_frame.latitude_deg is not None and given else latitude_deg
-    longitude = map_frame.longitude_deg if map_frame.longitude_deg is not None and given else longitude_deg
-    altitude = map_frame.altitude_m if map_frame.altitude_m is not None else altitude_m
-    return MapFrame(latitude, longitude, altitude, map_frame.projection or transverse_mercator(latitude, longitude))
+    if map_frame.latitude_deg is not None and map_frame.longitude_deg is not None:
+        latitude_deg, longitude_deg = map_frame.latitude_deg, map_frame.longitude_deg
+    altitude_m = altitude_m if map_frame.altitude_m is None else map_frame.altitude_m
+    projection = map_frame.projection or transverse_mercator(latitude_deg, longitude_deg)
+    return MapFrame(latitude_deg, longitude_deg, altitude_m, projection)
 
 
 def transverse_mercator(latitude_deg: float, longitude_deg: float) -> str:

@@ -43,8 +43,10 @@ class Sighting:
         Whether the ray passed the agent, ended on it, was stopped before, or was lost where its neighbors ended on it.
     intensity : (N,) float32
         Relative; NaN where unknown.
-    cell_rad : (2,) float64
-        Between rays, of azimuth and elevation.
+    step_rad : float
+        Of azimuth, between rays.
+    line_rad : (L,) float64
+        Elevations of the lines of the LiDAR, increasing, which may be closer to each other where it looks far.
     """
 
     t_s: float
@@ -52,16 +54,17 @@ class Sighting:
     point_m: Floats
     state: NDArray[np.int8]
     intensity: Floats
-    cell_rad: Array
+    step_rad: float
+    line_rad: Array
 
     def angles(self, offset: Array | Floats) -> Array:
         """Return azimuth and elevation (N, 2) of vectors (N, 3) from a sensor, in steps between rays."""
         middle = np.arctan2(-self.view_m[1], -self.view_m[0])
         c, s = np.cos(middle), np.sin(middle)
         ahead, left = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
-        return (
-            np.column_stack([np.arctan2(left, ahead), np.arctan2(offset[:, 2], np.hypot(ahead, left))]) / self.cell_rad
-        )
+        elevation = np.arctan2(offset[:, 2], np.hypot(ahead, left))
+        row = np.interp(elevation, self.line_rad, np.arange(len(self.line_rad)))
+        return np.column_stack([np.arctan2(left, ahead) / self.step_rad, row])
 
 
 def is_non_rigid(agent: Agent) -> bool:
@@ -71,7 +74,7 @@ def is_non_rigid(agent: Agent) -> bool:
 
 def sighting(
     t_s: float, view_m: Array, offset: Array, *, range_m: Floats, on: NDArray[np.bool_], intensity: Floats,
-    half_m: Array, cell_rad: Array,
+    half_m: Array, step_rad: float, line_rad: Array,
 ) -> Sighting | None:  # fmt: skip
     """Take what rays around an agent met; None where none ended on it.
 
@@ -87,6 +90,8 @@ def sighting(
         Whether the ray ended on the agent.
     half_m : (3,) float64, m
         Of its size.
+    step_rad, line_rad
+        Between rays, of azimuth, and elevations of lines, with one beyond each end.
     """
     away = float(np.linalg.norm(view_m))
     near = np.flatnonzero(on | (np.abs(view_m + away * offset) < half_m + AROUND_M).all(axis=1))
@@ -97,7 +102,7 @@ def sighting(
     state = np.where(on, ENDED, np.where(range_m < away - np.hypot(*half_m[:2]), HIDDEN, PASSED)).astype(np.int8)
     length = np.where(on, range_m, away)[:, None]
     point = (view_m + length * offset[near]).astype(np.float32)
-    seen = Sighting(t_s, view_m, point, state, intensity[near], cell_rad)
+    seen = Sighting(t_s, view_m, point, state, intensity[near], step_rad, line_rad)
     at = seen.angles(offset[near])
     if not back.all():
         neighbor = cKDTree(at[back]).query(at[~back])[1]

@@ -19,6 +19,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.perception.records import RecordSource
+from log2sim.resim.alignment import Alignment, moved
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import (
     Floats,
@@ -26,6 +27,7 @@ from log2sim.resim.rays import (
     Rays,
     Shots,
     all_shots,
+    angles_of,
     bin_of,
     find_pattern,
     poses_of,
@@ -81,6 +83,8 @@ class World:
         By id, in the frame of the agent.
     sightings : mapping of str to list of Sighting
         Of people and riders, by id.
+    alignments : mapping of str to Alignment
+        Of the others, by id.
     models : mapping of str to Model
         By LiDAR.
     notes : tuple of str
@@ -93,8 +97,18 @@ class World:
     background: Surfels
     agents: Mapping[str, Surfels]
     sightings: Mapping[str, list[Sighting]]
+    alignments: Mapping[str, Alignment]
     models: Mapping[str, Model]
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What sweeps have shown of an agent; sightings are of people and riders alone, alignments of the others."""
+
+    surfaces: SurfelGrid
+    alignment: Alignment
+    sightings: list[Sighting]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,16 +145,19 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
             continue
         surfels, states = agents[agent.id], agent.trajectory.at(t_s)
         position = np.column_stack([states.x_m, states.y_m, states.z_m]) - rays.shift_m
+        fit = np.zeros((len(t_s), 3))
+        if agent.id in world.alignments:
+            fit = world.alignments[agent.id].at(t_s, states.x_m, states.y_m)
         bins = np.full(len(surfels), len(t_s) // 2)
         for _ in range(2):
             at = bins
-            points = _turned(surfels.center_m, states.yaw_rad[at]) + position[at]
+            points = _turned(moved(surfels.center_m, fit[at]), states.yaw_rad[at]) + position[at]
             seen = points @ sensor[:3, :3].T + sensor[:3, 3]
             bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
         own = there[bins]
         parts.append(surfels.take(own))
         center.append(points[own].astype(np.float32))
-        normal.append(_turned(surfels.normal[own], states.yaw_rad[at[own]]).astype(np.float32))
+        normal.append(_turned(surfels.normal[own], states.yaw_rad[at[own]] + fit[at[own], 2]).astype(np.float32))
         ids.append(agent.id)
     first = np.cumsum([0, *(len(p) for p in parts)])
     return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
@@ -190,8 +207,8 @@ def build_world(
     """
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
-    background, own = SurfelGrid(), {agent.id: SurfelGrid() for agent in scenario.others}
-    sightings: dict[str, list[Sighting]] = {agent.id: [] for agent in scenario.others if is_non_rigid(agent)}
+    background = SurfelGrid()
+    seen = {agent.id: Seen(SurfelGrid(), Alignment(agent), []) for agent in scenario.others}
     refined = refine_poses(log)
     surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
@@ -211,9 +228,7 @@ def build_world(
                 scale = float(known.mean()) if len(known) and known.mean() > 0 else np.nan
                 top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
             far = max(far, float(shots.range_m.max()))
-            noise.append(
-                _add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, own, sightings)
-            )
+            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, seen))
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
         if name in models:
             level = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
@@ -222,13 +237,15 @@ def build_world(
         raise LogError(
             f"log '{log.name}': no sweep of {', '.join(lidars)} can be used; there is nothing to simulate from"
         )
-    seen = {id: grid.surfels() for id, grid in own.items()}
-    agents = {agent.id: completed(agent, seen[agent.id]) for agent in scenario.others}
-    unseen = [id for id, surfels in seen.items() if not len(surfels)]
+    surfaces = {id: s.alignment.centered(s.surfaces.surfels()) for id, s in seen.items()}
+    agents = {agent.id: completed(agent, surfaces[agent.id]) for agent in scenario.others}
+    unseen = [id for id, surfels in surfaces.items() if not len(surfels)]
     notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
     standing = background.surfels()
     standing = joined([standing, *(ground_below(a, standing, shift) for a in scenario.others if a.static)])
-    world = World(shift, log.ego if refined is not None else None, refined, standing, agents, sightings, models, notes)
+    given = log.ego if refined is not None else None
+    sightings, alignments = {id: s.sightings for id, s in seen.items()}, {id: s.alignment for id, s in seen.items()}
+    world = World(shift, given, refined, standing, agents, sightings, alignments, models, notes)
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
     for _ in range(2):
@@ -291,8 +308,7 @@ def _add_sweep(
     scale: float,
     shift: Array,
     background: SurfelGrid,
-    own: Mapping[str, SurfelGrid],
-    sightings: Mapping[str, list[Sighting]],
+    seen: Mapping[str, Seen],
 ) -> float:
     """Share out the points of a sweep to the background and the agents; return the noise of its ranges, m."""
     surface = local_surface(shots, pattern)
@@ -319,21 +335,24 @@ def _add_sweep(
             return np.column_stack([c * v[:, 0] + s * v[:, 1], c * v[:, 1] - s * v[:, 0], v[:, 2]])
 
         inside = local(points[near] - np.column_stack([at.x_m, at.y_m, at.z_m]))
-        high = inside[:, 2] > GROUND_M - half[2]
-        out = high & (np.abs(inside) < half + LEFT_OUT_M).all(axis=1)
+        out = (inside[:, 2] > GROUND_M - half[2]) & (np.abs(inside) < half + LEFT_OUT_M).all(axis=1)
+        rows, inside, axes = near[out], inside[out], local(normal[near])[out]
+        on_agent = free[rows]
+        free[rows] = False
+        if on_agent.any() and not is_non_rigid(agent):
+            inside, axes = seen[agent.id].alignment.fit(float(t_s[rows].mean()), inside, axes, on_agent)
         own_half = half + TAKEN_M
         if GROUP_OF[agent.category] == "two_wheeler":
             own_half[0] = half[0] + LEFT_OUT_M  # wheels have few points, so that boxes end before them
-        taken = out & free[near] & (np.abs(inside) < own_half).all(axis=1)
-        free[near[out]] = False
-        rows = near[taken]
+        taken = on_agent & (np.abs(inside) < own_half).all(axis=1)
+        rows = rows[taken]
         if len(rows):
-            axes = local(normal[near])[taken].astype(np.float32)
-            own[agent.id].add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
-            if agent.id in sightings:
+            axes = axes[taken].astype(np.float32)
+            seen[agent.id].surfaces.add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
+            if is_non_rigid(agent):
                 people.append((agent, rows))
     if people:
-        _add_sightings(log, scenario, name, all_shots(shots, pattern), pattern, scale, people, sightings)
+        _add_sightings(log, scenario, name, all_shots(shots, pattern), pattern, scale, people, seen)
     poses, moment, _ = poses_of(surveyed, name, shots.t_ns[free])
     rotation = poses[moment, :3, :3]
     points = np.einsum("nij,nj->ni", rotation, shots.direction[free] * shots.range_m[free, None])
@@ -351,13 +370,16 @@ def _add_sightings(
     pattern: Pattern,
     scale: float,
     people: list[tuple[Agent, NDArray[np.intp]]],
-    sightings: Mapping[str, list[Sighting]],
+    of: Mapping[str, Seen],
 ) -> None:
     """Add what the rays of a sweep, those that did not come back included, met around agents, of which rows of `shots` are."""
     poses, moment, _ = poses_of(log, name, shots.t_ns)
     direction = np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction)
     intensity = (shots.intensity / scale).astype(np.float32)
-    cell_rad = np.array([pattern.step_rad, pattern.gap_rad])
+    lines = pattern.elevation_rad if len(pattern.elevation_rad) else np.arange(-1.5, 1.5, pattern.gap_rad)
+    lines = np.concatenate([[2 * lines[0] - lines[1]], lines, [2 * lines[-1] - lines[-2]]])
+    # How much the LiDAR is tilted there.
+    raised = angles_of(direction)[1] - angles_of(shots.direction @ pattern.level_R_sensor.T)[1]
     for agent, rows in people:
         middle = rows[len(rows) // 2]
         t_s = (int(shots.t_ns[middle]) - scenario.t0_ns) / NS_PER_S
@@ -367,10 +389,11 @@ def _add_sightings(
         on[rows] = True
         half = np.array(agent.size_m) / 2
         seen = sighting(
-            t_s, view, direction @ agent_R_map.T, range_m=shots.range_m, on=on, intensity=intensity, half_m=half, cell_rad=cell_rad
+            t_s, view, direction @ agent_R_map.T, range_m=shots.range_m, on=on, intensity=intensity, half_m=half,
+            step_rad=pattern.step_rad, line_rad=lines + np.median(raised[rows]),
         )  # fmt: skip
         if seen is not None:
-            sightings[agent.id].append(seen)
+            of[agent.id].sightings.append(seen)
 
 
 def _on_ego(log: Log, name: str, shots: Shots, points: Array) -> NDArray[np.bool_]:

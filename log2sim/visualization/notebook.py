@@ -23,8 +23,7 @@ from log2sim.perception.records import RecordSource
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.result import Replay
 from log2sim.visualization.overlay import draw_moment, read_moment
-from log2sim.visualization.plot.drawing import draw_collisions
-from log2sim.visualization.plot.layers import new_collisions
+from log2sim.visualization.plot.layers import draw_collisions, new_collisions
 from log2sim.visualization.plot.scene import plot
 from log2sim.visualization.plot.style import new_figure, png_bytes
 
@@ -32,7 +31,6 @@ WIDTH_IN, HEIGHT_IN, DPI = 5.2, 3.6, 100
 MAX_CAMERAS = 6
 FRAME_WIDTH_PX, JPEG_QUALITY = 236, 80
 ABOVE_PX, ABOVE_REACH_M = 236, 40.0
-
 Thumbnail = tuple[str, bytes, str]  # a small picture: "image/png" or "image/jpeg", the bytes, and a caption
 
 
@@ -91,19 +89,48 @@ def _jpeg(image: NDArray[np.uint8], caption: str) -> Thumbnail:
 
 MAX_TEXT = 200  # letters of a name or a note that are shown
 MAX_SENSORS = 12
-Row = tuple[str, str]
 
 
 def notebook_html(value: Log | Scenario | Replay) -> str:
     """Return the HTML of a value; its text is escaped, and without a picture where that cannot be drawn."""
-    rows: list[Row]
+    rows: list[tuple[str, str]] = []
     draw: Callable[[], list[Thumbnail]]
     if isinstance(value, Log):
-        rows, draw = _rows_of_log(value), partial(thumbnails_of_log, value)
+        draw = partial(thumbnails_of_log, value)
+        kinds = [*((n, "camera") for n in value.cameras), *((n, "LiDAR") for n in value.lidars)]
+        for name, kind in kinds[:MAX_SENSORS]:
+            t_ns = value.streams[name].t_ns
+            span_s = float(t_ns[-1] - t_ns[0]) / NS_PER_S if len(t_ns) else 0.0
+            rate = f" at {(len(t_ns) - 1) / span_s:.1f} Hz" if span_s > 0 else ""
+            size = ""
+            if kind == "camera":
+                size = f", {value.cameras[name].width_px} x {value.cameras[name].height_px} px"
+            rows.append((name, f"{kind}{size}, {_count(len(t_ns), 'record')}{rate}"))
+        if len(kinds) > MAX_SENSORS:
+            rows.append(("", f"and {_count(len(kinds) - MAX_SENSORS, 'more sensor')}"))
+        rows.append(("ego", "no poses" if value.ego is None else _count(len(value.ego.t_ns), "pose")))
     elif isinstance(value, Scenario):
-        rows, draw = _rows_of_scenario(value), partial(thumbnail_of_scenario, value)
+        draw = partial(thumbnail_of_scenario, value)
+        rows.append(("agents", _by_category(a.category for a in value.others)))
+        if value.doubtful:
+            rows.append(("doubtful", ", ".join(a.id for a in value.doubtful)))
+        features, place = value.map_features, value.map
+        found = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
+        found.append((len(value.signals), "traffic light"))
+        if any(count for count, _ in found):
+            rows.append(("road", ", ".join(_count(count, noun) for count, noun in found if count)))
+        if place.latitude_deg is not None and place.longitude_deg is not None:
+            rows.append(("origin", f"{place.latitude_deg:.5f}°, {place.longitude_deg:.5f}°"))
     else:
-        rows, draw = _rows_of_replay(value), partial(thumbnail_of_replay, value)
+        draw = partial(thumbnail_of_replay, value)
+        events = [e for e in value.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
+        hits = "; ".join(f"{' and '.join(e['agents'])} at {e['t_s']:.2f} s" for e in events)
+        models = Counter(a.model for a in value.agents if a.model != "none").most_common()
+        rows.append(("agents", _by_category(a.category for a in value.agents if a.id != EGO)))
+        rows.append(("models", ", ".join(f"{name} {count}" for name, count in models) or "none"))
+        rows.append(("collisions", hits or "none"))
+        if value.metrics.get("cross_track_rms_m") is not None:
+            rows.append(("beside the path", f"{value.metrics['cross_track_rms_m']:.3f} m rms"))
     try:
         drawn = draw()
     except Exception:  # a picture that cannot be drawn must not hide the rest
@@ -123,48 +150,6 @@ def notebook_html(value: Log | Scenario | Replay) -> str:
         f'<table style="border-collapse:collapse;margin:4px 0">{table}</table>'
         f'<div style="display:flex;flex-wrap:wrap;gap:8px">{shown}</div></div>'
     )
-
-
-def _rows_of_log(log: Log) -> list[Row]:
-    kinds = [*((n, "camera") for n in log.cameras), *((n, "LiDAR") for n in log.lidars)]
-    rows = []
-    for name, kind in kinds[:MAX_SENSORS]:
-        t_ns = log.streams[name].t_ns
-        span_s = float(t_ns[-1] - t_ns[0]) / NS_PER_S if len(t_ns) else 0.0
-        rate = f" at {(len(t_ns) - 1) / span_s:.1f} Hz" if span_s > 0 else ""
-        size = f", {log.cameras[name].width_px} x {log.cameras[name].height_px} px" if kind == "camera" else ""
-        rows.append((name, f"{kind}{size}, {_count(len(t_ns), 'record')}{rate}"))
-    if len(kinds) > MAX_SENSORS:
-        rows.append(("", f"and {_count(len(kinds) - MAX_SENSORS, 'more sensor')}"))
-    poses = "no poses" if log.ego is None else _count(len(log.ego.t_ns), "pose")
-    return [*rows, ("ego", poses)]
-
-
-def _rows_of_scenario(scenario: Scenario) -> list[Row]:
-    rows = [("agents", _by_category(a.category for a in scenario.others))]
-    if scenario.doubtful:
-        rows.append(("doubtful", ", ".join(a.id for a in scenario.doubtful)))
-    features = scenario.map_features
-    found = [] if features is None else [(len(features.lanes), "lane"), (len(features.markings), "marking")]
-    found.append((len(scenario.signals), "traffic light"))
-    if any(count for count, _ in found):
-        rows.append(("road", ", ".join(_count(count, noun) for count, noun in found if count)))
-    if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
-        rows.append(("origin", f"{scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°"))
-    return rows
-
-
-def _rows_of_replay(replay: Replay) -> list[Row]:
-    events = [e for e in replay.metrics.get("collisions", ()) if e["belongs_to"] == REPLAY]
-    models = Counter(a.model for a in replay.agents if a.model != "none")
-    rows = [
-        ("agents", _by_category(a.category for a in replay.agents if a.id != EGO)),
-        ("models", ", ".join(f"{name} {count}" for name, count in models.most_common()) or "none"),
-        ("collisions", "; ".join(f"{' and '.join(e['agents'])} at {e['t_s']:.2f} s" for e in events) or "none"),
-    ]
-    if replay.metrics.get("cross_track_rms_m") is not None:
-        rows.append(("beside the path", f"{replay.metrics['cross_track_rms_m']:.3f} m rms"))
-    return rows
 
 
 def _text(text: str) -> str:
@@ -210,11 +195,7 @@ class Picture:
 
 
 def show_log(
-    log: Log,
-    when: float | Tick | None = None,
-    *,
-    camera: str | Sequence[str] = (),
-    scenario: Scenario | None = None,
+    log: Log, when: float | Tick | None = None, *, camera: str | Sequence[str] = (), scenario: Scenario | None = None
 ) -> Picture:
     """Draw one moment of a log, as `Log.show` does; see there."""
     cameras = (camera,) if isinstance(camera, str) else tuple(camera)

@@ -25,7 +25,7 @@ from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
 from log2sim.perception.sync import synchronize
-from log2sim.visualization.plot.drawing import add_lines
+from log2sim.visualization.plot.layers import add_lines
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, new_figure, printable_label, save_png
 from log2sim.visualization.recording import corners_in_view, require_cameras
 
@@ -195,7 +195,6 @@ def _shot(log: Log, name: str, index: int, read_sweeps: Callable[[], tuple[Sweep
 
 # Colors of boxes by group, none of which the colors of depths have.
 COLORS = {"vehicle": "#FFFFFF", "two_wheeler": "#FF4FD8", "pedestrian": "#00E5FF", "other": "#B0B0B0"}
-
 IMAGE_BOX_COLOR = "#FFE000"
 DEPTHS = "turbo_r"
 MIN_DEPTH_M, MAX_DEPTH_M = 2.0, 100.0
@@ -205,11 +204,9 @@ MAX_POINTS = 60_000
 TILE_IN, HEAD_IN, FOOT_IN, CAPTION_IN, SIDE_IN = 5.2, 0.4, 0.5, 0.36, 0.85
 ABOVE_REACH_M, MAX_HEIGHT_M = 60.0, 3.0
 MOTION = {
-    "in the log": "compensated in the log",
-    "no times": "not compensated: no point times",
-    "at rest": "at rest",
+    "in the log": "compensated in the log", "no times": "not compensated: no point times", "at rest": "at rest",
     "moving": "compensated by point times",
-}
+}  # fmt: skip
 DPI = 150
 
 
@@ -243,9 +240,8 @@ def draw_moment(moment: OverlayMoment, *, box_name: str = "3D label") -> Figure:
         above = k == len(moment.shots)
         # The view from above is the last tile and takes what is left of its row.
         wide_in = (columns - column if above else 1) * tile_in - 0.12
-        ax = figure.add_axes(
-            ((column * tile_in + 0.06) / width, bottom_in / height, wide_in / width, picture_in / height)
-        )
+        left_in = column * tile_in + 0.06
+        ax = figure.add_axes((left_in / width, bottom_in / height, wide_in / width, picture_in / height))
         caption = _draw_above(ax, moment, wide_in / picture_in) if above else _draw_shot(ax, moment.shots[k], moment)
         text = "\n".join(printable_label(line, 110) for line in caption)
         ax.set_title(text, fontsize=6.5, color=INK, family=FONT, parse_math=False, pad=3, loc="left")

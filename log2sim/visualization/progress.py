@@ -6,7 +6,6 @@ import sys
 import time
 
 OPENING, VALIDATING = "open", "validate"
-
 # What people read of a stage; a stage without words of its own shows its name.
 WORDS = {
     OPENING: "opening the log",
@@ -35,9 +34,7 @@ WORDS = {
     "evaluate": "comparing with the truth",
     "write": "writing",
 }
-
 WORDS_BEFORE_SENSORS = {"check ": "checking the clock and mount of ", "register ": "registering "}
-
 REDRAWN_EVERY_S = 0.1
 WIDTH = 72  # letters of the line, which cover those of the one before
 _drawn_s = [-REDRAWN_EVERY_S]

@@ -95,7 +95,6 @@ def take_evenly(count: int, most: int) -> NDArray[np.int64]:
 MIN_SHARE = 1 / 200  # of the height of a picture: smaller boxes would be dots in it
 # Of the width of a picture, one pixel of the usual size: edges that a lens bends by less are drawn straight.
 STRAIGHT_SHARE = 1 / 640
-
 # Kinds of outlines: eight corners u, v in the order of `box_corners`, or segments u0, v0, u1, v1.
 CORNERS, SEGMENTS = 1, 0
 
@@ -170,7 +169,6 @@ PICTURE_DETAILS = (
     Detail(960, 10), Detail(800, 10), Detail(640, 10), Detail(640, 5), Detail(480, 5), Detail(400, 5), Detail(400, 2),
     Detail(320, 2), Detail(320, 1), Detail(240, 1), Detail(240, 0.5), Detail(160, 0.5), Detail(160, 0.2),
 )  # fmt: skip
-
 PROBES = 3  # pictures of each camera that are encoded in all sizes, to estimate how many bytes the others will have
 SAFETY = 1.1  # by how much a scene may have more bytes than its probes tell; what is still too much is thinned out
 POSE_BYTES = 140  # of the pose of a camera: twelve numbers
@@ -222,7 +220,19 @@ def picture_document(
     """
     within = {name: records_within(log.streams[name].t_ns, scenario) for name in cameras if name in log.streams}
     within = {name: index for name, index in within.items() if len(index)}
-    probes = _probe(log, scenario, within, reader)
+    # The estimated bytes in a page of a picture of each camera, by width; none for cameras that cannot be read.
+    widths = sorted({int(detail.size) for detail in PICTURE_DETAILS})
+    probes: dict[str, dict[float, float]] = {}
+    for name, index in within.items():
+        sizes: dict[int, list[int]] = {width: [] for width in widths}
+        for i in index[take_evenly(len(index), PROBES)].tolist():
+            image = reader.get(name, i)
+            if image is not None:
+                shown = OUTLINE_BYTES * len(outlines_in(log, scenario, name, int(log.streams[name].t_ns[i])))
+                for width in widths:
+                    sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + shown + POSE_BYTES)
+        if sizes[widths[0]]:
+            probes[name] = {width: SAFETY * float(np.mean(found)) for width, found in sizes.items()}
     known = {name: within[name] for name in probes}
     what = "pictures", "one of each camera", ", or choose fewer cameras with --cameras"
     detail, chosen = _fit(log, scenario.t0_ns, known, probes, PICTURE_DETAILS, budget_bytes, what)
@@ -247,26 +257,6 @@ def picture_document(
         "rate_hz": detail.rate_hz,
         "bytes": sum(map(_bytes_of, entries.values())),
     }
-
-
-def _probe(
-    log: Log, scenario: Scenario, within: Mapping[str, NDArray[np.int64]], reader: RecordSource
-) -> dict[str, dict[float, float]]:
-    """Estimate the bytes in a page of a picture of each camera, by width; none for cameras that cannot be read."""
-    widths = sorted({int(detail.size) for detail in PICTURE_DETAILS})
-    out: dict[str, dict[float, float]] = {}
-    for name, index in within.items():
-        sizes: dict[int, list[int]] = {width: [] for width in widths}
-        for i in index[take_evenly(len(index), PROBES)].tolist():
-            image = reader.get(name, i)
-            if image is None:
-                continue
-            outlines = OUTLINE_BYTES * len(outlines_in(log, scenario, name, int(log.streams[name].t_ns[i])))
-            for width in widths:
-                sizes[width].append((4 * -(-len(encode_small(image, width)) // 3)) + outlines + POSE_BYTES)
-        if sizes[widths[0]]:
-            out[name] = {width: SAFETY * float(np.mean(found)) for width, found in sizes.items()}
-    return out
 
 
 def _fit(
@@ -330,14 +320,11 @@ REACH_M = 120.0  # points farther from the ego, or from the middle of the sensor
 MIN_HEIGHT_M, MAX_HEIGHT_M = -1.0, 5.0
 HEIGHT_UNIT_M = (MAX_HEIGHT_M - MIN_HEIGHT_M) / 255
 MAX_APART_S = 0.1  # between the sweeps of several LiDARs that are shown as one
-
-
 # From the best down; the first that fits is taken. People are still seen as a point or two at 0.4 m.
 POINT_DETAILS = (
     Detail(0.15, 10), Detail(0.25, 10), Detail(0.4, 10), Detail(0.4, 5), Detail(0.6, 5), Detail(0.6, 2), Detail(1.0, 2),
     Detail(1.0, 1), Detail(1.0, 0.5), Detail(1.0, 0.2),
 )  # fmt: skip
-
 POINT_PROBES, POINT_SAFETY = 3, 1.15
 BYTES_OF_ENTRY = 60  # time and origin of a sweep in the page
 
@@ -450,8 +437,6 @@ def _points_around(
 
 
 POINT_SHARE = 0.3  # of the budget, for points, where there are pictures too; what they leave is for the pictures
-
-
 # Of a page with pictures: mail and chat programs take so much, and a phone still opens it.
 DEFAULT_MAX_BYTES = 40_000_000
 

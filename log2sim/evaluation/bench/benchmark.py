@@ -52,10 +52,7 @@ from log2sim.visualization.plot.style import (
 )
 
 __all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
-
-
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
-
 WITHOUT_TRUTH = "the log has no labels: these figures say how steady a setting is, not how right"
 
 
@@ -103,7 +100,14 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[setti
     """Run all settings and make one panel for each stage and one for whole runs, with those of the default beside them."""
     runs, observations = run_all(context, report)
     homographies = homography_points(context, observations, report)
-    whole = [*default, *(_whole_point(context, r, compared=not default) for r in runs)]
+    # Where there is no default beside them, the run of the present settings is marked.
+    present_name = f"{context.grid.present.config.detect.name} alone" if default else "present settings"
+    whole, error = list(default), ERRORS["whole run"][context.truth is None][0]
+    for r in runs:
+        name, marked = present_name if r.setting.present else r.setting.key, r.setting.present and not default
+        stages = {stage: context.ms_per_tick(s) for stage, s in r.stages_s.items()}
+        ms = context.ms_per_tick(r.seconds)
+        whole.append(r.score.point(name, marked, ms, error, stages_ms_per_tick=stages))
     if homographies:  # whole runs state the share of the obstacles that their homographies place
         shares = {f"homography: {p.setting}": p.figures["placed_share"] for p in homographies}
         present = next(p for p in homographies if p.present).figures["placed_share"]
@@ -137,16 +141,6 @@ def _point(context: BenchContext, stage: str, run: BenchRun) -> settings.Point:
     ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
     score = run.measurement_score if stage == "measure" and context.truth is not None else run.score
     return score.point(name, run.setting.present, ms, ERRORS[stage][context.truth is None][0])
-
-
-def _whole_point(context: BenchContext, run: BenchRun, *, compared: bool) -> settings.Point:
-    """Make the point of a run; where it is `compared` with the others, that of the present settings is marked."""
-    present = "present settings" if compared else f"{context.grid.present.config.detect.name} alone"
-    name = present if run.setting.present else run.setting.key
-    stages = {stage: context.ms_per_tick(s) for stage, s in run.stages_s.items()}
-    error = ERRORS["whole run"][context.truth is None][0]
-    marked, ms = run.setting.present and compared, context.ms_per_tick(run.seconds)
-    return run.score.point(name, marked, ms, error, stages_ms_per_tick=stages)
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,9 +339,8 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     ax.text(0, 1.035, printable_label(label, 90), fontsize=6.8, color=MUTED, **style)
     hidden = [p.setting for p in panel.points if p.error is None]
     if hidden:
-        ax.text(
-            0.02, 0.025, printable_label(f"no error known: {', '.join(hidden)}"), fontsize=6.8, color=MUTED, **style
-        )
+        unknown = printable_label(f"no error known: {', '.join(hidden)}")
+        ax.text(0.02, 0.025, unknown, fontsize=6.8, color=MUTED, **style)
     if not shown:
         ax.set(xticks=[], yticks=[])
         return

@@ -101,8 +101,6 @@ def detect_once(
 
 REPEATS = 3  # repetitions of short stages, taking turns; the least time counts, since other processes only add to it
 MEASURE_REPEATS = 2  # repetitions of the measurement, which takes longer
-
-
 Progress = Callable[[str, int, int], None]
 
 
@@ -188,7 +186,12 @@ def run_settings(
 
     Settings take turns `REPEATS` times; the least time of each stage counts.
     """
-    (observations, before_s), measurement_score = observed, score_of_measurements(context, observed[0])
+    (observations, before_s), measurement_score = observed, Score({})
+    if context.truth is not None:
+        across = context.plan.keeps(Stage.FUSION)
+        fused = replace(observations, measurements=fuse(observations.measurements, across=across))
+        known = true_positions(context.log, context.schedule, fused, context.truth)
+        measurement_score = score_measurements(fused, known)
     scores: dict[str, Score] = {}
     spent: dict[str, list[dict[str, float]]] = {s.key: [] for s in settings}
     for repeat in range(REPEATS):
@@ -218,29 +221,18 @@ def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Ob
     short = replace(context, schedule=take_ticks(context.schedule, slice(1)))
     first, _ = timed_first_pass(short, grid.present, grid.measure[0], lambda *_: None)
     _concluded(short, grid.present, first, StageClock())
-    passes = [
-        [timed_first_pass(context, grid.present, s, report) for s in grid.measure] for _ in range(MEASURE_REPEATS)
-    ]
+    one_pass = partial(timed_first_pass, context, grid.present, report=report)
+    passes = [[one_pass(s) for s in grid.measure] for _ in range(MEASURE_REPEATS)]
     observations = [one for one, _ in passes[-1]]
     stages_s = [{k: min(each[n][1][k] for each in passes) for k in passes[0][n][1]} for n in range(len(observations))]
-    runs = run_settings(
-        context, (grid.present, *grid.homography[1:], *grid.smooth[1:]), (observations[0], stages_s[0]), report
-    )
+    shared = (grid.present, *grid.homography[1:], *grid.smooth[1:])
+    runs = run_settings(context, shared, (observations[0], stages_s[0]), report)
     for n, setting in enumerate(grid.measure[1:], 1):
         runs += run_settings(context, [setting], (observations[n], stages_s[n]), report)
     for setting in grid.detect[1:]:
         runs += run_settings(context, [setting], timed_first_pass(context, setting, grid.measure[0], report), report)
     least = min(r.stages_s["cloud"] for r in runs)
     return [replace(r, stages_s={**r.stages_s, "cloud": least}) for r in runs], observations[0]
-
-
-def score_of_measurements(context: BenchContext, observations: Observations) -> Score:
-    """Score the measured centers; empty without truth."""
-    if context.truth is None:
-        return Score({})
-    across = context.plan.keeps(Stage.FUSION)
-    fused = replace(observations, measurements=fuse(observations.measurements, across=across))
-    return score_measurements(fused, true_positions(context.log, context.schedule, fused, context.truth))
 
 
 def homography_points(context: BenchContext, observations: Observations, report: Progress) -> list[Point]:
@@ -260,9 +252,8 @@ def homography_points(context: BenchContext, observations: Observations, report:
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
             begin, rng = time.perf_counter(), np.random.default_rng(setting.config.seed)
-            fits[setting.name] = fit_homographies(
-                context.log, holdout.observations, plan, setting.config.topdown, rng=rng
-            )
+            ours = setting.config.topdown
+            fits[setting.name] = fit_homographies(context.log, holdout.observations, plan, ours, rng=rng)
             spent[setting.name].append(time.perf_counter() - begin)
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
@@ -291,9 +282,7 @@ def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | No
     Raises `LogError` for a log without LiDARs at both ends.
     """
     if not ends:
-        raise LogError(
-            f"{log.name}: the log has no camera, and bench compares methods for images; use detect and evaluate"
-        )
+        raise LogError(f"{log.name}: has no camera, and bench compares methods for images; use detect and evaluate")
     check_scope(truth, scope)
     config = ends[0].config
     sensors = select_sensors(log, config)

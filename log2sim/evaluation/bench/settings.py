@@ -19,7 +19,6 @@ from log2sim.plan import IMAGE_DETECTOR, choose_detector
 
 # By object: sum of its squared errors, m^2, and their number. The error is the root of the ratio of both sums.
 ErrorSums = Mapping[str, tuple[float, float]]
-
 RESAMPLES = 1000
 MIN_OBJECTS = 5
 INTERVAL = (0.05, 0.95)
@@ -179,7 +178,7 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     for name in names:
         if config.changed(detect={"name": name}).detect.in_sweeps:
             raise ConfigError(
-                f"bench: compares detectors in images, and '{name}' searches LiDAR sweeps; see log2sim detect"
+                f"bench: compares detectors in images, '{name}' searches LiDAR sweeps; see log2sim detect"
             )
     out: list[Setting] = []
     stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]

@@ -172,10 +172,10 @@ class DetectedBoxes:
             valid = valid and all(_column_is_valid([row[k] for row in rows], v) for k, v in box["properties"].items())
         except (AttributeError, KeyError, TypeError):
             valid = False
-        without = (
-            {**document, "frames": [{**frame, "boxes": []} for frame in document["frames"]]} if valid else document
-        )
-        check(without, "boxes-1", LogError)
+        if valid:
+            check({**document, "frames": [{**frame, "boxes": []} for frame in document["frames"]]}, "boxes-1", LogError)
+        else:
+            check(document, "boxes-1", LogError)
         frames = document["frames"]
         try:
             t_ns = np.array([f["t_ns"] for f in frames], dtype=np.int64)

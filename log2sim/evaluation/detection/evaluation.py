@@ -224,8 +224,10 @@ def class_figures(boxes: BothBoxes, of_class: ObjectClass, min_score: float) -> 
     rows = [figures("all", found, enough, far, c) for c in of_class.criteria]
     if boxes.found_views is not None and boxes.truth_views is not None:
         for level in DIFFICULTIES:
-            true = truth.ignoring(level.ignores_truth(boxes.truth_views, boxes.occlusion))
-            mine = found.ignoring(level.ignores_found(boxes.found_views))
+            views, small = boxes.truth_views, boxes.found_views.height_px < level.min_height_px
+            hard = (views.height_px <= level.min_height_px) | (views.truncation > level.max_truncation)
+            true = truth.ignoring(hard | (boxes.occlusion > level.max_occlusion))
+            mine = found.ignoring(small)
             rows += [figures(level.name, mine, true, far, c) for c in of_class.criteria]
     by_range, by_points = [], []
     for low, high in RANGES_M:
@@ -256,9 +258,8 @@ def overall(classes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     Categories whose group is among the classes count once.
     """
     members = {name: set(figures["categories"]) for name, figures in classes.items()}
-    whole = [
-        figures for name, figures in classes.items() if not any(members[name] < other for other in members.values())
-    ]
+    part = {name for name, own in members.items() if any(own < other for other in members.values())}
+    whole = [figures for name, figures in classes.items() if name not in part]
     counts: dict[str, list[int]] = {}
     for figures in whole:
         for row in (figures["figures"][0], *figures["by_range"], *(figures["by_points"] or [])):

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.truth import ImageViews
 from log2sim.geometry import Array, rectangle_iou, upright_box_iou
 
 Measure = Literal["iou_3d", "iou_bev", "center_m"]
@@ -171,15 +170,6 @@ class Difficulty:
     max_occlusion: int
     max_truncation: float
 
-    def ignores_truth(self, views: ImageViews, occlusion: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mark (L,) the true boxes that are harder than this."""
-        low = views.height_px <= self.min_height_px
-        return np.asarray(low | (occlusion > self.max_occlusion) | (views.truncation > self.max_truncation))
-
-    def ignores_found(self, views: ImageViews) -> NDArray[np.bool_]:
-        """Mark (M,) the found boxes that are too small to be judged."""
-        return np.asarray(views.height_px < self.min_height_px)
-
 
 # Geiger, Lenz, Urtasun (CVPR 2012), and the development kit of the object benchmark.
 DIFFICULTIES = (Difficulty("easy", 40, 0, 0.15), Difficulty("moderate", 25, 1, 0.3), Difficulty("hard", 25, 2, 0.5))
@@ -191,9 +181,7 @@ def _ious(*limits: float) -> tuple[Criterion, ...]:
 
 # nuScenes' distances; the table uses 1 m, about the IoU of 0.5 of a car shifted along its length.
 CENTERS = tuple(Criterion("center_m", limit) for limit in (1.0, 0.5, 2.0, 4.0))
-
 VEHICLES, PEOPLE, RIDERS = ("car", "truck", "bus"), ("pedestrian",), ("motorcycle", "cyclist")
-
 PROTOCOLS: Mapping[str, Protocol] = {
     "kitti": Protocol(
         "kitti",

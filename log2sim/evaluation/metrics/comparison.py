@@ -14,7 +14,6 @@ from log2sim.geometry import NS_PER_S, Array, PoseTrack, choose_pairs, inverse, 
 
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
 GATE_M = 2.0
 GATE_PER_LENGTH = 0.25
 
@@ -137,7 +136,6 @@ MAX_TRUTH_GAP_S = 0.25
 MAX_SIMPLIFIED_GAP_S = 1.05  # simplified trajectories omit waypoints of straight uniform motion for up to a second
 # Instants taken from the waypoints of all agents are not nearer to each other: some logs stamp every label by itself.
 MIN_TICK_S = 0.02
-
 # A truth agent is extrapolated this far beyond its first and last label, without being counted there.
 TRUTH_MARGIN_S = 0.15
 
@@ -180,24 +178,20 @@ def evaluation_ticks_s(scenario: Scenario, truth: Scenario) -> Array:
         # Agents of one tick may differ in the last digits of their stamps.
         _, index = np.unique(np.round(np.concatenate(times), 4), return_index=True)
         t = np.sort(np.concatenate(times)[index])
-        t = _thinned(t, ego_t_s)
+        # Those of the ego stay, and others at least `MIN_TICK_S` from these and each other.
+        wanted = np.isin(t, ego_t_s)
+        away = np.full(len(t), np.inf)
+        if wanted.any():
+            away = np.abs(t - t[wanted][nearest_index(t[wanted], t)])
+        kept, last_s = wanted.copy(), -np.inf
+        for k in np.flatnonzero(away >= MIN_TICK_S):
+            if t[k] - last_s >= MIN_TICK_S:
+                kept[k], last_s = True, t[k]
+        t = t[kept]
         t = t[(t >= max(first, begin) - TRUTH_MARGIN_S) & (t <= min(last, end) + TRUTH_MARGIN_S)]
         if len(t) > 1 and (t[-1] - t[0]) / (len(t) - 1) <= MAX_TRUTH_GAP_S:
             break
     return t
-
-
-def _thinned(t_s: Array, wanted_s: Array) -> Array:
-    """Keep of increasing instants (T,) those wanted, and others at least `MIN_TICK_S` from these and each other."""
-    wanted = np.isin(t_s, wanted_s)
-    away = np.full(len(t_s), np.inf)
-    if wanted.any():
-        away = np.abs(t_s - t_s[wanted][nearest_index(t_s[wanted], t_s)])
-    keep, last_s = wanted.copy(), -np.inf
-    for k in np.flatnonzero(away >= MIN_TICK_S):
-        if t_s[k] - last_s >= MIN_TICK_S:
-            keep[k], last_s = True, t_s[k]
-    return t_s[keep]
 
 
 def reconstructed_states(agents: tuple[Agent, ...], ticks_s: Array, ego_xy: Array | None) -> StateTable:
@@ -247,9 +241,9 @@ def states_of_ego(
 def _limit_range(
     table: AgentTable, ego_xy: Array | None, visible: Mask, labeled: Mask, lidar_points: Array
 ) -> StateTable:
-    away_m = (
-        np.full(table.present.shape, np.inf) if ego_xy is None else np.hypot(*np.moveaxis(table.xy_m - ego_xy, -1, 0))
-    )
+    away_m = np.full(table.present.shape, np.inf)
+    if ego_xy is not None:
+        away_m = np.hypot(*np.moveaxis(table.xy_m - ego_xy, -1, 0))
     range_m = np.where(table.present, away_m, np.nan)
     columns = table.agents, table.t_s, table.center_m, table.yaw_rad, table.speed_mps
     return StateTable(*columns, range_m, visible, labeled, lidar_points)
@@ -294,7 +288,6 @@ def ignored_ticks(ignore_regions: IgnoreRegions, t_s: Array, agents: StateTable,
 MIN_COUNTED_S = 1.0  # a truth agent counts when its counted ticks make up at least this time
 # Of LiDARs on an object that some sensor hit. Waymo's first level of difficulty is drawn at as many.
 MIN_HIT_POINTS = 5
-
 # Why a labeled object does not count at a tick; the first that applies.
 REASONS = {
     "other_category": "of a category that was not asked for",
@@ -304,7 +297,6 @@ REASONS = {
     "hidden": "hidden according to the truth",
     "short": f"in sight for less than {MIN_COUNTED_S:g} s",
 }
-
 COUNTED, NOT_LABELED = 0, -1
 
 

@@ -332,9 +332,8 @@ def evaluate(
         agents.append(agent)
     scenario = replace(scenario, agents=tuple(agents))
     truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
-    compared, ticks_s, ego = compare_scenarios(
-        scenario, truth, comparison.Selection(max_range_m, _selected(categories))
-    )
+    selection = comparison.Selection(max_range_m, _selected(categories))
+    compared, ticks_s, ego = compare_scenarios(scenario, truth, selection)
     ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
@@ -373,7 +372,7 @@ def evaluate(
         "scenario": scenario.name,
         "truth": truth.name,
         "max_range_m": max_range_m,
-        "categories": None if categories is None else sorted(_selected(categories)),
+        "categories": None if categories is None else sorted(selection.categories),
         "ticks": len(ticks_s),
         "tick_s": tick_s,
         "placement": placement,

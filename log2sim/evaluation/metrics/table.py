@@ -56,28 +56,24 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
         for true, ours in sorted(pairs, key=lambda pair: (*(-n for n in counts[pair]), pair))
     ]
     confused = f"class: {', '.join(taken)}" if taken else ""
+    # For each tenth of confidence how many ticks and agents are right.
+    ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
+    error_of_ticks, error_of_agents = (table["expected_calibration_error"] for table in (ticks, agents))
+    calibration = [
+        f"confidence: expected calibration error {error_of_ticks:.3f} of ticks, {error_of_agents:.3f} of agents",
+        *(
+            f"  {a['low']:.1f}-{a['high']:.1f}: {cell(a['right'], 3)} of {a['count']} ticks right, "
+            f"{cell(b['right'], 3)} of {_noun(b['count'], 'agent')}"
+            for a, b in zip(ticks["bins"], agents["bins"], strict=True)
+            if a["count"]
+        ),
+    ]
     return [
         "", "wrong in % of the reconstructed agents' ticks (agents); doubted in % of the wrong and right ones;",
         "NEES: squared errors of position, yaw and speed over sigma, 1 is right", *columns_text(cells),
-        *textwrap.wrap(confused, 100, subsequent_indent="  "), "", *_calibration_lines(found),
+        *textwrap.wrap(confused, 100, subsequent_indent="  "), "", *calibration,
         "", *worst_agents(found["judged_agents"], MAX_WORST),
     ]  # fmt: skip
-
-
-def _calibration_lines(found: Mapping[str, Any]) -> list[str]:
-    """Say for each tenth of confidence how many ticks and agents are right."""
-    ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
-    errors = [
-        f"{table['expected_calibration_error']:.3f} of {noun}" for noun, table in (("ticks", ticks), ("agents", agents))
-    ]
-    lines = [f"confidence: expected calibration error {', '.join(errors)}"]
-    for a, b in zip(ticks["bins"], agents["bins"], strict=True):
-        if a["count"]:
-            lines.append(
-                f"  {a['low']:.1f}-{a['high']:.1f}: {cell(a['right'], 3)} of {a['count']} ticks right, "
-                f"{cell(b['right'], 3)} of {_noun(b['count'], 'agent')}"
-            )
-    return lines
 
 
 def worst_agents(agents: Sequence[Mapping[str, Any]], count: int, *, brief: bool = False) -> list[str]:
@@ -120,7 +116,17 @@ def format_verdict(result: Mapping[str, Any]) -> str:
         lines.append(("left out", f"quarantined: {', '.join(result['quarantined'])}"))
     if "coverage" in result:
         lines.append(("counted", counted_text(result["coverage"], f" of {result['counts']['truth_agents']} agents")))
-    lines += [("recall", recall_text(result)), *_missed(result["agents"])]
+    lines.append(("recall", recall_text(result)))
+    # The true agents that are missed longest: of the ticks with enough LiDAR points, else of those that count.
+    rows = []
+    for row in result["agents"]:
+        of, matched = (row["ticks"], row["matched"]) if row.get("hit") is None else (row["hit"], row["hit_matched"])
+        if of > matched:
+            name = row["id"] if len(row["id"]) <= MAX_NAME else f"{row['id'][: MAX_NAME - 2]}.."
+            rows.append((matched - of, f"{row['category']} '{name}' in {of - matched} of {of} ticks"))
+    more = [f"and {len(rows) - MAX_NAMED} more"] if len(rows) > MAX_NAMED else []
+    if rows:
+        lines.append(("missed", "; ".join([*(text for _, text in sorted(rows)[:MAX_NAMED]), *more])))
     counts, found = result["counts"], result["correctness"]
     total = counts["matched_ticks"] + counts["false_ticks"]
     ignored = f", {counts['ignored_ticks']} where the labels cannot tell" if counts["ignored_ticks"] else ""
@@ -161,19 +167,6 @@ def error_text(result: Mapping[str, Any]) -> str:
     ego = result.get("ego")
     own = "" if ego is None or ego["position_rmse_m"] is None else f"; ego {ego['position_rmse_m']:.2f} m"
     return f"{', '.join(parts)}{own}"
-
-
-def _missed(agents: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Name the true agents that are missed longest: of the ticks with enough LiDAR points, else of those that count."""
-    rows = []
-    for row in agents:
-        of, matched = (row["ticks"], row["matched"]) if row.get("hit") is None else (row["hit"], row["hit_matched"])
-        if of > matched:
-            name = row["id"] if len(row["id"]) <= MAX_NAME else f"{row['id'][: MAX_NAME - 2]}.."
-            rows.append((matched - of, f"{row['category']} '{name}' in {of - matched} of {of} ticks"))
-    named = [text for _, text in sorted(rows)[:MAX_NAMED]]
-    more = len(rows) - len(named)
-    return [("missed", "; ".join([*named, *([f"and {more} more"] if more else [])]))] if rows else []
 
 
 def verdict_text(lines: Iterable[tuple[str, str]]) -> str:

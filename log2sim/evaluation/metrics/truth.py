@@ -139,7 +139,6 @@ MAX_LAG_S = 0.1  # a label is compared with the nearest sweep and frames within 
 SPEED_WINDOW_S = 0.25
 MAX_STATIC_REACH_M = 0.5
 MAX_STATIC_DRIFT_MPS = 0.2
-
 Progress = Callable[[int, int], None]
 
 
@@ -224,9 +223,8 @@ def truth_from_log(
     used = list(log.cameras) if cameras is None else list(cameras)
     for name in used:
         if name not in log.cameras:
-            raise ConfigError(
-                f"unknown camera '{name}'{nearest(name, list(log.cameras))}; known: {', '.join(log.cameras)}"
-            )
+            hint = f"{nearest(name, list(log.cameras))}; known: {', '.join(log.cameras)}"
+            raise ConfigError(f"unknown camera '{name}'{hint}")
     counts, unreadable = None, 0
     if log.lidars and (points or labels.visible is None):
         counts, unreadable = points_in_labels(log, labels, progress)
@@ -277,9 +275,8 @@ def points_in_labels(log: Log, labels: Labels, progress: Progress | None = None)
     counts, records = np.zeros(len(labels.t_ns), dtype=np.int64), RecordSource(log)
     step = _stepper(log, progress)
     for name in _lidars(log):
-        counts += _points_in_boxes(
-            log, name, records, labels.t_ns, labels.center_m, labels.size_m, labels.yaw_rad, step
-        )
+        boxes = labels.t_ns, labels.center_m, labels.size_m, labels.yaw_rad
+        counts += _points_in_boxes(log, name, records, *boxes, step)
     return counts, sum(len(problems) for problems in records.failed.values())
 
 

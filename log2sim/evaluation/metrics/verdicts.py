@@ -88,18 +88,14 @@ def median(values: Array) -> float | None:
 
 # Six standard deviations of a speed from labels with 5 cm of noise at 10 Hz, 0.16 m/s; see `truth.speed_along`.
 MAX_SPEED_ERROR_MPS = 1.0
-
 MAX_STANDING_MPS = 0.5  # slower is standing: three standard deviations of such a speed, and no more than a body sways
 # From here on an object surely moves, a slow walk already. Speeds between both limits count as neither.
 MIN_MOVING_MPS = 1.0
-
 MAX_SIZE_ERROR_SHARE = 0.25
 # A smaller error of a length or width is never wrong: stride and arms change the box of a person by as much.
 MIN_SIZE_ERROR_M = 0.3
-
 # An agent is wrong at a tick when at least one of these is true of it.
 MEASURES = ("invented", "duplicate", "in_ego", "wrong_speed", "wrong_motion", "backwards", "wrong_size")
-
 REPORTED = (*MEASURES, "wrong_class")
 
 
@@ -150,7 +146,20 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     errors = state_errors(truth, other, c.match, truth.labeled)
     errors = errors.take(known[errors.other, errors.tick])
     measures = {"invented": invented, "duplicate": duplicate, "in_ego": in_ego & judged}
-    for name, wrong in _state_verdicts(truth, other, errors).items():
+    # The states of the K matched agent-ticks.
+    i, j, t = errors.truth, errors.other, errors.tick
+    true_mps, our_mps = truth.speed_mps[i, t], other.speed_mps[j, t]
+    along = true_mps * our_mps * np.cos(other.yaw_rad[j, t] - truth.yaw_rad[i, t])
+    stands, true_stands = np.abs(our_mps) < MAX_STANDING_MPS, np.abs(true_mps) < MAX_STANDING_MPS
+    moves, true_moves = np.abs(our_mps) >= MIN_MOVING_MPS, np.abs(true_mps) >= MIN_MOVING_MPS
+    limit_m = np.maximum(MAX_SIZE_ERROR_SHARE * truth.size_m[i, :2], MIN_SIZE_ERROR_M)
+    states = {
+        "wrong_speed": np.abs(errors.speed_mps) > MAX_SPEED_ERROR_MPS,
+        "wrong_motion": (stands & true_moves) | (moves & true_stands) | (~stands & ~true_stands & (along < 0)),
+        "backwards": np.nan_to_num(errors.yaw_rad) > np.pi / 2,
+        "wrong_size": np.any(np.abs(errors.size_m[:, :2]) > limit_m, axis=1),
+    }
+    for name, wrong in states.items():
         measures[name] = _marked(judged.shape, errors.other[wrong], errors.tick[wrong])
     # (B, T) the matched truth agent, else the nearest within the gate, those of the same kind first; -1 for none.
     p = c.pairs
@@ -174,23 +183,6 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
         error_rad=_spread(errors, np.minimum(errors.yaw_rad, np.pi - errors.yaw_rad), judged.shape),
         error_mps=_spread(errors, errors.speed_mps, judged.shape),
     )
-
-
-def _state_verdicts(truth: StateTable, other: StateTable, errors: StateErrors) -> dict[str, Mask]:
-    """Judge the states of K matched agent-ticks."""
-    i, j, t = errors.truth, errors.other, errors.tick
-    true_mps, our_mps = truth.speed_mps[i, t], other.speed_mps[j, t]
-    along = true_mps * our_mps * np.cos(other.yaw_rad[j, t] - truth.yaw_rad[i, t])
-    stands, true_stands = np.abs(our_mps) < MAX_STANDING_MPS, np.abs(true_mps) < MAX_STANDING_MPS
-    moves, true_moves = np.abs(our_mps) >= MIN_MOVING_MPS, np.abs(true_mps) >= MIN_MOVING_MPS
-    off_m = np.abs(errors.size_m[:, :2])
-    limit_m = np.maximum(MAX_SIZE_ERROR_SHARE * truth.size_m[i, :2], MIN_SIZE_ERROR_M)
-    return {
-        "wrong_speed": np.abs(errors.speed_mps) > MAX_SPEED_ERROR_MPS,
-        "wrong_motion": (stands & true_moves) | (moves & true_stands) | (~stands & ~true_stands & (along < 0)),
-        "backwards": np.nan_to_num(errors.yaw_rad) > np.pi / 2,
-        "wrong_size": np.any(off_m > limit_m, axis=1),
-    }
 
 
 def _overlapping(side: StateTable, ego: StateTable) -> Mask:

@@ -75,9 +75,8 @@ def _pose(node: Element, where: str) -> list[float]:
     world = node.find("Position/WorldPosition")
     if world is None:
         raise ScenarioError(f"{where}: a position that is no <WorldPosition>; only those can be read without the road")
-    x, y, z = (
-        require_number(world.get(key, "0" if key == "z" else None), f"{where}: WorldPosition {key}") for key in "xyz"
-    )
+    given = {"z": "0"} | world.attrib  # players take a missing height for 0
+    x, y, z = (require_number(given.get(key), f"{where}: WorldPosition {key}") for key in "xyz")
     text = world.get("h")
     heading = float("nan") if text is None else require_number(text, f"{where}: WorldPosition h")
     if abs(heading) > MAX_HEADING_RAD:
@@ -111,9 +110,8 @@ def _scenario(root: Element, path: Path) -> Scenario:
         raise ScenarioError(
             f"its root is <{root.tag[:40]}>, expected <OpenSCENARIO> with <Entities> and a <Storyboard>"
         )
-    parameters = {
-        p.get("name", ""): p.get("value", "") for p in root.iterfind("ParameterDeclarations/ParameterDeclaration")
-    }
+    declared = root.iterfind("ParameterDeclarations/ParameterDeclaration")
+    parameters = {p.get("name", ""): p.get("value", "") for p in declared}
     for node in root.iter():  # references to parameters in attributes stand for their values
         for key, value in node.attrib.items():
             if value.startswith("$"):
@@ -261,9 +259,8 @@ def _waypoints(
     columns: dict[str, Any] = dict(zip(("x_m", "y_m", "z_m", "yaw_rad"), placement.back(centers).T))
     if not exported:  # along the heading
         steady = len(t) > 1 and np.all(np.diff(t) > 0)
-        speeds = (
-            np.gradient(x, t) * np.cos(heading) + np.gradient(y, t) * np.sin(heading) if steady else np.zeros(len(t))
-        )
+        vx, vy = (np.gradient(v, t) if steady else np.zeros(len(t)) for v in (x, y))
+        speeds = vx * np.cos(heading) + vy * np.sin(heading)
     columns |= {"t_s": t, "speed_mps": speeds}
     columns["sigma_xy_m"] = np.zeros(len(t))
     columns |= {key: sigma for key, sigma in sigmas.items() if sigma is not None and len(sigma) == len(t)}

@@ -20,7 +20,7 @@ from log2sim.datatypes import EGO, Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export import xml_text
 from log2sim.export.checks import require_start_as_in_scenario
-from log2sim.export.exporters import EXTERNAL, ExportPlacement, Options
+from log2sim.export.exporters import EXTERNAL, Options
 from log2sim.export.roads.opendrive import add_road_file
 from log2sim.export.xml_text import element, escaped, number, unique_names
 from log2sim.geometry import Array
@@ -147,24 +147,6 @@ class AgentStory:
     start: Array  # (5,) the first vertex, or the pose at 0 s if its waypoints begin before
 
 
-def _agent_story(
-    agent: Agent, name: str, duration_s: float, placement: ExportPlacement, hidden_m: float, *, external: bool
-) -> AgentStory:
-    """Return the story of an agent: the center of its rear axle on the ground, with unwrapped headings."""
-    w = agent.waypoints
-    states = placement.forward(np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad)]))
-    heading, axle_m = states[:, 3], agent.rear_axle_offset_m
-    back = np.column_stack([axle_m * np.cos(heading), axle_m * np.sin(heading), np.full(len(w), agent.size_m[2] / 2)])
-    vertices = np.column_stack([w.t_s, states[:, :3] - back, heading])
-    if len(vertices) == 1:
-        vertices = np.repeat(vertices, 2, axis=0) + np.outer([0, MIN_DURATION_S], [1, 0, 0, 0, 0])
-    enters, leaves = bool(w.t_s[0] > SAME_TIME_S), bool(vertices[-1, 0] < duration_s - SAME_TIME_S)
-    # Players refuse a negative initial speed; a reversing agent takes its speed from the trajectory at once.
-    speed_mps = max(float(w.speed_mps[0]), 0.0)
-    start = np.array([np.interp(max(vertices[0, 0], 0.0), vertices[:, 0], column) for column in vertices.T])
-    return AgentStory(name, vertices, speed_mps, enters, leaves, hidden_m, external, start)
-
-
 def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float, minor: int) -> None:
     """Add the `Storyboard` of all agents."""
     storyboard = element("Storyboard", parent)
@@ -271,8 +253,6 @@ def _add_trigger(parent: Element, tag: str, name: str, t_s: float, minor: int) -
 
 REVISIONS = {"1.0": 0, "1.1": 1, "1.2": 2}  # the second number
 NEWEST = "1.2"
-
-
 options: tuple[str, ...] = ("revision", "map", "ego")
 loses = (
     "states of traffic lights, confidences of lanes and markings, cameras, quality, stages and provenance; players take a"
@@ -302,14 +282,26 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     names = unique_names(a.id for a in scenario.agents)
     duration_s = max(scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in scenario.agents))
     driven = [external and agent.id == EGO for agent in scenario.agents]
-    stories = [
-        _agent_story(agent, name, duration_s, placement, HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k, external=flag)
-        for k, (agent, name, flag) in enumerate(zip(scenario.agents, names, driven))
-    ]
+    # What each agent does: of the center of its rear axle on the ground, with unwrapped headings.
+    stories = []
+    for k, (agent, name, flag) in enumerate(zip(scenario.agents, names, driven)):
+        w, axle_m = agent.waypoints, agent.rear_axle_offset_m
+        states = placement.forward(np.column_stack([w.x_m, w.y_m, w.z_m, np.unwrap(w.yaw_rad)]))
+        heading = states[:, 3]
+        ahead = np.column_stack([axle_m * np.cos(heading), axle_m * np.sin(heading)])
+        back = np.column_stack([ahead, np.full(len(w), agent.size_m[2] / 2)])
+        vertices = np.column_stack([w.t_s, states[:, :3] - back, heading])
+        if len(vertices) == 1:
+            vertices = np.repeat(vertices, 2, axis=0) + np.outer([0, MIN_DURATION_S], [1, 0, 0, 0, 0])
+        enters, leaves = bool(w.t_s[0] > SAME_TIME_S), bool(vertices[-1, 0] < duration_s - SAME_TIME_S)
+        # Players refuse a negative initial speed; a reversing agent takes its speed from the trajectory at once.
+        speed_mps, hidden_m = max(float(w.speed_mps[0]), 0.0), HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k
+        start = np.array([np.interp(max(vertices[0, 0], 0.0), vertices[:, 0], column) for column in vertices.T])
+        stories.append(AgentStory(name, vertices, speed_mps, enters, leaves, hidden_m, flag, start))
     # Box centers and headings at the start (A, 4); NaN for agents added later.
     _, x, y, z, heading = np.array([story.start for story in stories]).T
-    enters, below_m = np.array([s.enters for s in stories]), np.array([s.hidden_m for s in stories])
-    z = np.where(enters, np.nan if minor > 0 else z - below_m, z)
+    late, below_m = np.array([s.enters for s in stories]), np.array([s.hidden_m for s in stories])
+    z = np.where(late, np.nan if minor > 0 else z - below_m, z)
     ahead_m = np.array([a.rear_axle_offset_m for a in scenario.agents])
     up_m = np.array([a.size_m[2] for a in scenario.agents]) / 2
     boxes = np.column_stack([x + ahead_m * np.cos(heading), y + ahead_m * np.sin(heading), z + up_m, heading])
@@ -320,18 +312,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         "FileHeader", root, revMajor="1", revMinor=str(minor), date=_date(scenario.t0_ns), author="log2sim",
         description=f"log2sim: {escaped(scenario.name)}",
     )  # fmt: skip
-    _add_parameters(root, scenario, placement)
-    element("CatalogLocations", root)
-    element("LogicFile", element("RoadNetwork", root), filepath=road)
-    entities = element("Entities", root)
-    for agent, name, flag in zip(scenario.agents, names, driven):
-        add_entity(entities, agent, name, minor, external=flag)
-    add_storyboard(root, stories, duration_s, minor)
-    xml_text.write(root, folder / "scenario.xosc")
-
-
-def _add_parameters(root: Element, scenario: Scenario, placement: ExportPlacement) -> None:
-    """Add what an import needs of the scenario as a whole; 1.0 and 1.1 have no properties without an agent."""
+    # What an import needs of the scenario as a whole; 1.0 and 1.1 have no properties without an agent.
     values = {
         "log2sim_name": escaped(scenario.name),
         "log2sim_t0_ns": str(scenario.t0_ns),
@@ -344,6 +325,13 @@ def _add_parameters(root: Element, scenario: Scenario, placement: ExportPlacemen
     parameters = element("ParameterDeclarations", root)
     for name, value in values.items():
         element("ParameterDeclaration", parameters, name=name, parameterType="string", value=value)
+    element("CatalogLocations", root)
+    element("LogicFile", element("RoadNetwork", root), filepath=road)
+    entities = element("Entities", root)
+    for agent, name, flag in zip(scenario.agents, names, driven):
+        add_entity(entities, agent, name, minor, external=flag)
+    add_storyboard(root, stories, duration_s, minor)
+    xml_text.write(root, folder / "scenario.xosc")
 
 
 def _date(t0_ns: int) -> str:

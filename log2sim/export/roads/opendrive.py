@@ -53,10 +53,8 @@ def edges_of(lane: MapLane) -> tuple[Array, Array]:
 
 # Lamps face the traffic that they are for; posts beside the road turn them by some degrees towards it.
 FACING_RAD = float(np.deg2rad(40.0))
-
 # A light beyond a junction is at most so far from where its lanes end: across six lanes and two sidewalks.
 REACH_M = 40.0
-
 ASIDE_M = 12.0  # it is at most so far beside the middle of a lane: three lanes and a sidewalk
 
 
@@ -80,12 +78,9 @@ def signal_lanes(signal: Signal, lanes: Sequence[MapLane]) -> list[MapLane]:
 
 
 MARGIN_M = 5.0  # lights before the junction stand at the stop line, which may be behind where the lane ends
-
-
 LIGHT_TYPE = "1000001"  # of a traffic light with three lamps, in the catalog "OpenDRIVE" that players know
 LIGHT_HEIGHT_M, LIGHT_WIDTH_M = 0.9, 0.3  # of a signal head with three lamps of 200 mm (EN 12368)
 DIGITS = 4
-
 STEP_M = 0.5  # stations at which the nearest point of a road is looked for
 MAX_ASIDE_M = 15.0  # crosswalks farther beside a road's reference line belong to another one
 
@@ -100,7 +95,15 @@ def road_objects(
     crosswalks: dict[int, list[tuple[Marking, float, float]]] = {}
     for marking in scenario.map_features.markings if scenario.map_features is not None else ():
         if marking.kind == "crosswalk":
-            places = [(*_place_on(road, marking.points_m[:, :2].mean(axis=0)), road.number) for road in roads]
+            mx, my = marking.points_m[:, :2].mean(axis=0)
+            places = []  # stations and offsets on the roads, infinite before and after them
+            for road in roads:
+                stations = np.linspace(0.0, road.line.length_m, max(int(road.line.length_m / STEP_M), 1) + 1)
+                x, y, heading = road.line.at(stations).T
+                k = int(np.hypot(x - mx, y - my).argmin())
+                dx, dy, c, sine = mx - x[k], my - y[k], np.cos(heading[k]), np.sin(heading[k])
+                aside = np.inf if abs(dx * c + dy * sine) > STEP_M else float(dy * c - dx * sine)
+                places.append((float(stations[k]), aside, road.number))
             s, t, owner = min(places, key=lambda place: abs(place[1]))
             if abs(t) <= MAX_ASIDE_M:
                 crosswalks.setdefault(owner, []).append((marking, s, t))
@@ -111,17 +114,6 @@ def road_objects(
         for lane in signal_lanes(signal, found)[:1]:
             signals.setdefault(owners[lane.id], []).append((signal, lane))
     return crosswalks, signals
-
-
-def _place_on(road: Road, xy_m: Array) -> tuple[float, float]:
-    """Return the station and offset of a point (2,) on a road; an infinite offset before and after it."""
-    s = np.linspace(0.0, road.line.length_m, max(int(road.line.length_m / STEP_M), 1) + 1)
-    x, y, heading = road.line.at(s).T
-    k = int(np.hypot(x - xy_m[0], y - xy_m[1]).argmin())
-    dx, dy = xy_m[0] - x[k], xy_m[1] - y[k]
-    along = dx * np.cos(heading[k]) + dy * np.sin(heading[k])
-    beyond = abs(along) > STEP_M
-    return float(s[k]), np.inf if beyond else float(dy * np.cos(heading[k]) - dx * np.sin(heading[k]))
 
 
 def _add_crosswalk(parent: Element, road: Road, marking: Marking, s: float, t: float) -> None:
@@ -176,39 +168,31 @@ def require_roads(root: Element, where: str) -> None:
     if not roads:
         raise ScenarioError(f"{where}: has no roads, expected at least one")
     for road in roads:
-        _require_road(road, f"{where}: road '{road.get('id', '')[:40]}'")
-
-
-def _require_road(road: Element, where: str) -> None:
-    s = 0.0
-    pieces = road.findall("planView/geometry")
-    for piece in pieces:
-        start, length = (require_number(piece.get(key), f"{where}: geometry {key}") for key in ("s", "length"))
-        if abs(start - s) > GAP_M or length <= 0:
-            raise ScenarioError(
-                f"{where}: geometry at s={start:g} with length {length:g}, expected s={s:g} and a positive length"
-            )
-        s = start + length
-    length = require_number(road.get("length"), f"{where}: length")
-    if not pieces or abs(length - s) > GAP_M:
-        raise ScenarioError(f"{where}: length {length:g}, but its geometry ends at {s:g}")
-    for path in ("elevationProfile/elevation", "lanes/laneOffset", "lanes/laneSection"):
-        last = -1.0
-        for node in road.iterfind(path):
-            s = require_number(node.get("s"), f"{where}: {node.tag} s")
-            if s <= last:
-                raise ScenarioError(
-                    f"{where}: {node.tag} at s={s:g} follows one at s={last:g}, expected stations in order"
-                )
-            last = s
-    sections = road.findall("lanes/laneSection")
-    if not sections:
-        raise ScenarioError(f"{where}: has no lanes, expected at least one <laneSection>")
-    for section in sections:
-        for lane in (*section.iterfind("left/lane"), *section.iterfind("right/lane")):
+        here, s, pieces = f"{where}: road '{road.get('id', '')[:40]}'", 0.0, road.findall("planView/geometry")
+        for piece in pieces:
+            start, length = (require_number(piece.get(key), f"{here}: geometry {key}") for key in ("s", "length"))
+            if abs(start - s) > GAP_M or length <= 0:
+                wrong = f"geometry at s={start:g} with length {length:g}"
+                raise ScenarioError(f"{here}: {wrong}, expected s={s:g} and a positive length")
+            s = start + length
+        length = require_number(road.get("length"), f"{here}: length")
+        if not pieces or abs(length - s) > GAP_M:
+            raise ScenarioError(f"{here}: length {length:g}, but its geometry ends at {s:g}")
+        for path in ("elevationProfile/elevation", "lanes/laneOffset", "lanes/laneSection"):
+            last = -1.0
+            for node in road.iterfind(path):
+                s = require_number(node.get("s"), f"{here}: {node.tag} s")
+                if s <= last:
+                    wrong = f"{node.tag} at s={s:g} follows one at s={last:g}"
+                    raise ScenarioError(f"{here}: {wrong}, expected stations in order")
+                last = s
+        sections = road.findall("lanes/laneSection")
+        if not sections:
+            raise ScenarioError(f"{here}: has no lanes, expected at least one <laneSection>")
+        for lane in (lane for s in sections for lane in (*s.iterfind("left/lane"), *s.iterfind("right/lane"))):
             first = lane.find("width") if lane.find("width") is not None else lane.find("border")
-            if first is None or require_number(first.get("sOffset"), f"{where}: width sOffset") != 0:
-                raise ScenarioError(f"{where}: lane {lane.get('id', '')[:10]} has no width from its start on")
+            if first is None or require_number(first.get("sOffset"), f"{here}: width sOffset") != 0:
+                raise ScenarioError(f"{here}: lane {lane.get('id', '')[:10]} has no width from its start on")
 
 
 FILE_NAME = "road.xodr"
@@ -323,12 +307,7 @@ def _add_road(root: Element, road: Road, placement: ExportPlacement, marks: Mark
     for s, a, *rest in road.elevation:
         _add_cubic(profile, "elevation", "s", s, [a - z0, *rest])
     element("lateralProfile", parent)
-    _add_lanes(parent, road, marks)
-    return parent
-
-
-def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
-    """Add lanes -1, -2, ... to the right of the left edge of the first, and 1, 2, ... to the left of it."""
+    # Lanes -1, -2, ... to the right of the left edge of the first, and 1, 2, ... to the left of it.
     parts = element("lanes", parent)
     for s, *rest in road.offset:
         _add_cubic(parts, "laneOffset", "s", s, rest)
@@ -342,6 +321,7 @@ def _add_lanes(parent: Element, road: Road, marks: MarkFinder) -> None:
     right = element("right", section)
     for row, (lane, widths) in enumerate(zip(road.lanes, road.widths)):
         _add_lane(right, road, -1 - row, lane, widths, marks)
+    return parent
 
 
 def _add_lane(parent: Element, road: Road, id: int, lane: MapLane, widths: Array, marks: MarkFinder) -> None:

@@ -1,36 +1,46 @@
 """KITTI raw drives and the layout of its tracking benchmark.
 
 A file label_02.txt in the drive holds its labels in the format of the tracking benchmark, whose sequences are such drives
-frame by frame (sequence 0000 is drive 2011_09_26_0005).
+frame by frame (sequence 0000 is drive 2011_09_26_0005). The layout of its object detection benchmark, training/{image_2, velodyne,
+calib, label_2}, has single frames: those of a split become one log, in which the ego stands still and a frame is taken every 100 s,
+so that nothing connects them: a log to detect in and to evaluate with, not to track in.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Log, Stream
+from log2sim.datatypes import Log, Stream, Sweep
 from log2sim.errors import LogError
-from log2sim.files.inputs import require_links_inside
-from log2sim.geometry import Camera, PoseTrack, transform
+from log2sim.files.inputs import is_present, require_links_inside
+from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.kitti.labels import (
     CAMERA,
+    EGO_T_IMU,
     Calibration,
+    DriveLabels,
+    LabelRows,
     Rig,
     drive_log,
+    labels_of_rows,
+    parse_labels,
     parse_oxts,
     poses_from_oxts,
+    poses_of_rect,
     read_labels,
     read_text,
     sweep_stream,
 )
-from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_numbered_files
-from log2sim.logs.stamps import strictly_increasing
+from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_numbered_files, read_sweep, sweep_of
+from log2sim.logs.stamps import note_damaged_rows, strictly_increasing
 
 CALIBRATION = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt")
 REFERENCE_CAMERAS = ("image_02", "image_00", "image_03", "image_01")
@@ -38,7 +48,6 @@ PATTERN = "*_drive_*_sync"
 PICTURES = (".png", ".jpg", ".jpeg")
 # A scanner begins a sweep where the one before ends; stamps of this share of a sweep are none that a clock's resolution explains.
 MAX_OVERLAP = 0.1
-_NOT_A_TIME = np.iinfo(np.int64).min
 _TIME = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]{1,9})?")
 
 
@@ -46,9 +55,7 @@ class KittiRawReader(FolderReader):
     """Reader of KITTI raw drives; the root is a drive, its date folder or the parent of date folders."""
 
     name = "kitti"
-    looks_for = (
-        "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or their parent"
-    )
+    looks_for = "a folder DATE_drive_NNNN_sync with oxts/data, its date folder with calib_cam_to_cam.txt, or its parent"
 
     def find(self, path: Path) -> dict[str, Path]:
         """Find the drives at a folder by name."""
@@ -68,15 +75,14 @@ class KittiRawReader(FolderReader):
         projections = {k: cam.projection(f"P_rect_{k:02d}") for k in numbers}
         velo_T_imu, cam_T_velo = (transform(c.rotation("R"), c.entry((3,), "T")) for c in (imu, velo))
         rig = Rig.of(velo_T_imu, cam_T_velo, rect, projections)
-        notes: list[str] = []
-        streams: dict[str, Stream] = {}
-        cameras: dict[str, Camera] = {}
+        notes = list[str]()
+        cameras, streams = dict[str, Camera](), dict[str, Stream]()
         for number in numbers:
-            width, height = cam.entry((2,), f"S_rect_{number:02d}")
-            camera = rig.camera(number, round(width), round(height))
+            width, height = (round(v) for v in cam.entry((2,), f"S_rect_{number:02d}"))
+            camera = rig.camera(number, width, height)
             t_ns, images, _ = _records(drive / camera.name, PICTURES, notes)
             cameras[camera.name] = camera
-            streams[camera.name] = image_stream(camera.name, t_ns, images, (camera.width_px, camera.height_px))
+            streams[camera.name] = image_stream(camera.name, t_ns, images, (width, height))
         if (drive / "velodyne_points").is_dir():
             streams["velodyne"] = _sweeps(drive / "velodyne_points", notes)
         ego_t_ns, oxts, _ = _records(drive / "oxts", (".txt",), notes)
@@ -94,9 +100,8 @@ class KittiRawReader(FolderReader):
             stamps = _stamps(times)
             strange = frame[(frame < 0) | (frame >= len(stamps))]
             if len(strange):
-                raise LogError(
-                    f"{path}: frame {strange[0]}, but {times} has {len(stamps)} lines; is it of another drive?"
-                )
+                has = f"{times} has {len(stamps)} lines"
+                raise LogError(f"{path}: frame {strange[0]}, but {has}; is it of another drive?")
             return stamps[frame]
 
         labels = read_labels(path, rig, track, stamp_of, notes)
@@ -125,10 +130,8 @@ def _sweeps(folder: Path, notes: list[str]) -> Stream:
         (early, "begin while the one before still turns"),
     ):
         if len(rows):
-            notes.append(
-                f"{folder.name}: {len(rows)} of {len(numbers)} sweeps {what}, first number {numbers[rows[0]]:010d}; check "
-                "timestamps_start.txt and timestamps_end.txt"
-            )
+            count, advice = f"{len(rows)} of {len(numbers)}", "check timestamps_start.txt and timestamps_end.txt"
+            notes.append(f"{folder.name}: {count} sweeps {what}, first number {numbers[rows[0]]:010d}; {advice}")
     return sweep_stream(t_ns, begin, end, files)
 
 
@@ -157,18 +160,18 @@ def _files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 
 def _stamps(path: Path) -> NDArray[np.int64]:
-    lines = read_text(path).rstrip().split("\n")
-    stamps = np.zeros(len(lines) if lines != [""] else 0, dtype=np.int64)
-    for k, line in enumerate(line.strip() for line in lines[: len(stamps)]):
+    text = read_text(path).rstrip()
+    stamps = list[Any]()
+    for k, line in enumerate(map(str.strip, text.split("\n") if text else ()), start=1):
+        # A date alone, of a line that was cut, would be a time.
+        whole = _TIME.fullmatch(line) is not None
         try:
-            if _TIME.fullmatch(line) is None:
-                raise ValueError  # a date alone, of a line that was cut, would be a time
-            stamps[k] = np.array([line.replace(" ", "T")], dtype="datetime64[ns]").astype(np.int64)[0]
-        except ValueError:
-            stamps[k] = _NOT_A_TIME
-        if stamps[k] == _NOT_A_TIME:
-            raise LogError(f"{path}, line {k + 1}: '{line[:40]}', expected YYYY-MM-DD HH:MM:SS.nnnnnnnnn")
-    return stamps
+            stamps.append(np.datetime64(line.replace(" ", "T") if whole else "NaT", "ns"))
+        except (ValueError, OverflowError):
+            stamps.append(np.datetime64("NaT"))
+        if np.isnat(stamps[-1]):
+            raise LogError(f"{path}, line {k}: '{line[:40]}', expected YYYY-MM-DD HH:MM:SS.nnnnnnnnn")
+    return np.array(stamps, dtype="datetime64[ns]").astype(np.int64)
 
 
 PERIOD_NS = 100_000_000
@@ -199,10 +202,11 @@ class KittiTrackingReader(FolderReader):
         cameras, streams = dict[str, Camera](), dict[str, Stream]()
         for number in numbers:
             files = _files(base / f"image_{number:02d}" / sequence, PICTURES)
-            size_px = first_image_size(list(files.values()))
+            images = list(files.values())
+            size_px = first_image_size(images)
             camera = rig.camera(number, *size_px)
             cameras[camera.name] = camera
-            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), list(files.values()), size_px)
+            streams[camera.name] = image_stream(camera.name, _nominal_stamps(files), images, size_px)
         if (base / "velodyne" / sequence).is_dir():
             sweeps = _files(base / "velodyne" / sequence, (".bin",))
             t_ns, half = _nominal_stamps(sweeps), PERIOD_NS // 2
@@ -218,9 +222,8 @@ class KittiTrackingReader(FolderReader):
         for name, stream in streams.items():
             missing = np.setdiff1d(np.arange(len(rows)), stream.t_ns // PERIOD_NS)
             if len(missing):
-                notes.append(
-                    f"{name}: {len(missing)} of {len(rows)} records are missing, first number {missing[0]:06d}"
-                )
+                count = f"{len(missing)} of {len(rows)} records"
+                notes.append(f"{name}: {count} are missing, first number {missing[0]:06d}")
         label_file = base / "label_02" / f"{sequence}.txt"
         labels = read_labels(label_file, rig, track, lambda frame: frame * PERIOD_NS, notes)
         records = sorted(p for folder in streams for p in (base / folder / sequence).iterdir())
@@ -239,5 +242,152 @@ def _base(path: Path) -> Path:
     return path / "training" if (path / "training" / "calib").is_dir() else path
 
 
-def _nominal_stamps(numbers: Iterable[int]) -> NDArray[np.int64]:
-    return np.array(list(numbers), dtype=np.int64) * PERIOD_NS
+def _nominal_stamps(numbers: Iterable[int], period_ns: int = PERIOD_NS) -> NDArray[np.int64]:
+    return np.array(list(numbers), dtype=np.int64) * period_ns
+
+
+SPLITS = ("training", "testing")
+OBJECT_PERIOD_NS = 100_000_000_000
+IMAGES = "image_2"
+SINGLE_FRAMES = "single frames: taken to be 100 s apart, and the ego to stand still; use detect and evaluate"
+EGO_R_RECT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""The ego has the axes of the rectified camera 0, in which labels stand upright."""
+LIDAR_HEIGHT_M = 1.73
+"""Of KITTI's car (Geiger et al., IJRR 2013, fig. 1), for frames whose calibration does not state it."""
+
+
+class KittiObjectReader(FolderReader):
+    """Reader of the object detection layout; the root is a split or the parent of splits."""
+
+    name = "kitti-object"
+    looks_for = "a folder training/ (or that folder) with velodyne/NNNNNN.bin and calib/NNNNNN.txt"
+
+    def find(self, path: Path) -> dict[str, Path]:
+        """Find the splits at a folder by name."""
+        path = path.resolve()
+        places = [path, *(path / name for name in SPLITS)]
+        return {p.name: p for p in places if (p / "calib").is_dir() and any((p / "velodyne").glob("*.bin"))}
+
+    def open(self, path: Path, sequence: str) -> Log:
+        """Open a split."""
+        base = self.find(path)[sequence]
+        require_links_inside(base, path)
+        sweeps = list_numbered_files(base / "velodyne", (".bin",))
+        places = {number: base / "calib" / f"{file.stem}.txt" for number, file in sweeps.items()}
+        known: dict[str, _Frame] = {}  # by the text of their files; most frames share one
+        frames = {number: _frame_of(place, known) for number, place in places.items()}
+        first = next(iter(frames.values()))
+        t_ns, files = _nominal_stamps(sweeps, OBJECT_PERIOD_NS), list(sweeps.values())
+
+        def read(i: int) -> Sweep:
+            """Read a sweep in the map frame, each by its own calibration, so that labels fit them."""
+            sweep = read_sweep(files[i], int(t_ns[i]))
+            map_T_velo = first.ego_T_rect @ frames[list(sweeps)[i]].rect_T_velo
+            points = apply(map_T_velo, sweep.xyz_m.astype(np.float64))
+            return sweep_of(points, sweep.stamp_ns, None, "map", intensity=sweep.intensity)
+
+        streams, cameras = {"velodyne": Stream("velodyne", t_ns, read)}, dict[str, Camera]()
+        images = list_numbered_files(base / IMAGES, PICTURES)
+        if images:
+            size_px = first_image_size(list(images.values()))
+            cameras[CAMERA] = first.camera(*size_px)
+            streams[CAMERA] = image_stream(
+                CAMERA, _nominal_stamps(images, OBJECT_PERIOD_NS), list(images.values()), size_px
+            )
+        ego = PoseTrack(t_ns, np.repeat(np.eye(4)[None], len(t_ns), axis=0))
+        notes = [SINGLE_FRAMES]
+        without = sorted(set(images) - set(sweeps))
+        if without:
+            notes.append(f"{len(without)} of {len(images)} images have no sweep, first number {without[0]:06d}")
+        nameless = [number for number, frame in frames.items() if not frame.names_imu]
+        if nameless:
+            notes.append(
+                f"{len(nameless)} of {len(t_ns)} calibrations have no entry 'Tr_imu_to_velo', first {nameless[0]:06d}.txt: "
+                "the ego is put below the LiDAR there"
+            )
+        labels = _labels(base, sweeps, first, ego, notes)
+        ground_z_m, boxes = 0.0, labels.boxes_3d
+        if not first.knows_ground and boxes is not None and len(boxes.t_ns):
+            # The median of the lower faces of labels.
+            ground_z_m = float(np.median(boxes.center_m[:, 2] - boxes.size_m[:, 2] / 2))
+        others = sum(not np.allclose(frame.P, first.P, rtol=1e-2, atol=1e-3) for frame in frames.values())
+        if others:
+            notes.append(f"{others} of {len(t_ns)} frames have another P2 by more than 1 %; that of the first is used")
+        return drive_log(
+            Rig(first.ego_T_rect @ first.rect_T_velo, first.ego_T_rect, {}), cameras, streams, ego, labels,
+            name=f"kitti-object-{base.name}", format=self.name, ground_z_ego_m=ground_z_m,
+            reference_camera=CAMERA if cameras else None, digest=digest_of([*known, labels.text], files),
+            notes=tuple(notes), calibrations=dict.fromkeys(streams, str(next(iter(places.values())))),
+        )  # fmt: skip
+
+
+OBJECT_READER = KittiObjectReader()
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Calibration of one frame."""
+
+    ego_T_rect: Array  # (4, 4): for an ego on the ground below the LiDAR of this frame
+    rect_T_velo: Array  # (4, 4)
+    P: Array  # (3, 4): from the rectified camera 0 to the image; may hold a rotation
+    knows_ground: bool  # whether the height of the LiDAR is known from that of the IMU
+    names_imu: bool  # whether the file has an entry for the IMU
+
+    def camera(self, width_px: int, height_px: int) -> Camera:
+        """Split P into intrinsics and a rotation.
+
+        RQ decomposition (Hartley and Zisserman, "Multiple View Geometry", A4.1.1), by QR of the reversed rows.
+        """
+        q, r = np.linalg.qr(self.P[::-1, :3].T)
+        K, rotation = r.T[::-1, ::-1], q.T[::-1]
+        sign = np.sign(np.diag(K))
+        K, rotation = K * sign, sign[:, None] * rotation
+        K = K / K[2, 2]
+        cam_T_rect = transform(rotation, np.linalg.solve(K, self.P[:, 3] / np.linalg.norm(self.P[2, :3])))
+        return Camera(CAMERA, width_px, height_px, K, "ego", self.ego_T_rect @ inverse(cam_T_rect))
+
+
+def _frame_of(path: Path, known: dict[str, _Frame]) -> _Frame:
+    text = read_text(path)
+    if text in known:
+        return known[text]
+    c = Calibration(path)
+    names_imu = "Tr_imu_to_velo" in c.values
+    c.entry((3, 3), "R0_rect", "R_rect")
+    P = c.entry((3, 4), "P2")
+    if not np.linalg.det(P[:, :3]) > 0:
+        raise LogError(
+            f"{path}, entry 'P2': {P.tolist()} is singular or mirrors the image; expected intrinsics, or these and a rotation"
+        )
+    velo_T_imu = c.rigid("Tr_imu_to_velo") if names_imu else np.eye(4)
+    knows_ground = not np.array_equal(velo_T_imu, np.eye(4))
+    if not knows_ground:
+        velo_T_imu = transform(np.eye(3), [0.0, 0.0, EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
+    rect_T_velo = transform(c.rotation("R0_rect", "R_rect"), np.zeros(3)) @ c.rigid("Tr_velo_to_cam")
+    velo_ego = (EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
+    ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
+    known[text] = _Frame(ego_T_rect, rect_T_velo, P, knows_ground, names_imu)
+    return known[text]
+
+
+def _labels(base: Path, sweeps: Mapping[int, Path], first: _Frame, ego: PoseTrack, notes: list[str]) -> DriveLabels:
+    """Read the labels of all frames; each object is a track of its own."""
+    parts, texts, labeled, damaged = list[LabelRows](), [], [], list[str]()
+    for number, file in sweeps.items():
+        path = base / "label_2" / f"{file.stem}.txt"
+        if is_present(path):
+            texts.append(read_text(path))
+            lines = [
+                f"{number} {number}-{k} {line}" * bool(line.strip()) for k, line in enumerate(texts[-1].splitlines())
+            ]
+            parts.append(parse_labels("\n".join(lines), path, damaged))
+            labeled.append(number)
+    if not parts:
+        return DriveLabels()
+    rows = LabelRows(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts))))
+    note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
+    poses_at = poses_of_rect(ego, first.ego_T_rect)
+    found = labels_of_rows(rows, poses_at, lambda frame: frame * OBJECT_PERIOD_NS, "\n".join(texts))
+    assert found.boxes_3d is not None
+    return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=_nominal_stamps(labeled, OBJECT_PERIOD_NS)))

@@ -120,9 +120,8 @@ class Calibration:
         """Entry that is the P (3, 4) of a rectified camera."""
         P = self.entry((3, 4), key)
         if not (P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] == 1 and P[1, 0] == 0 and not P[2, :2].any()):
-            raise LogError(
-                f"{self.path}, entry '{key}': K is {P[:, :3].tolist()}, expected positive focal lengths and a last row 0 0 1"
-            )
+            expected = "expected positive focal lengths and a last row 0 0 1"
+            raise LogError(f"{self.path}, entry '{key}': K is {P[:, :3].tolist()}, {expected}")
         return P
 
     def _nearest_rotation(self, rotation: Array, key: str) -> Array:
@@ -283,25 +282,24 @@ def labels_of_rows(
     objects were labeled.
     """
     is_ignored = rows.type == NOT_LABELED
-    ignored = rows.take(is_ignored)
-    rows = rows.take(~is_ignored)
+    ignored, rows = rows.take(is_ignored), rows.take(~is_ignored)
     t_ns = stamp_of(rows.frame)
     category = np.array([CATEGORY_OF[name] for name in rows.type.tolist()], dtype="<U16")
     map_T_rect, k = poses_at(t_ns)
-    center, size, yaw = boxes_in_map(map_T_rect, rows.values[:, 7:14])
+    # Rows hold height, width, length, the center of the bottom, and the rotation about the camera's y axis.
+    height, width, length, turn = rows.values[:, [7, 8, 9, 13]].T
+    level = np.zeros(len(t_ns))
+    center = rows.values[:, 10:13] - np.stack([level, height / 2, level], axis=1)
+    ahead = np.stack([np.cos(turn), level, -np.sin(turn)], axis=1)
+    heading = np.einsum("lij,lj->li", map_T_rect[:, :3, :3], ahead)
+    yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
+    size = np.stack([length, width, height], axis=1)
+    boxes = Labels(
+        t_ns[k], rows.track_id[k], category[k], apply(map_T_rect, center)[k], size[k], yaw[k], cameras=(camera,),
+        kind=rows.type[k], occlusion=rows.values[k, 1].astype(np.int64), never_labeled=NEVER_LABELED,
+    )  # fmt: skip
     return DriveLabels(
-        Labels(
-            t_ns[k],
-            rows.track_id[k],
-            category[k],
-            center[k],
-            size[k],
-            yaw[k],
-            cameras=(camera,),
-            kind=rows.type[k],
-            occlusion=rows.values[k, 1].astype(np.int64),
-            never_labeled=NEVER_LABELED,
-        ),
+        boxes,
         {camera: ImageLabels(t_ns, rows.values[:, 3:7], category)},
         {camera: ImageRegions(stamp_of(ignored.frame), ignored.values[:, 3:7])},
         text,
@@ -312,67 +310,40 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
     """Parse the lines of a label file; `damaged` takes a message for each that is wrong, without it the first is a `LogError`."""
     rows = []
     for k, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
+        words, problem = line.split(), ""
         if not words:
             continue
-        try:
-            if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or (
-                words[2] not in CATEGORY_OF and words[2] != NOT_LABELED
-            ):
-                known = ", ".join([*CATEGORY_OF, NOT_LABELED])
-                raise ValueError(f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers")
+        if not LABEL_FIELDS <= len(words) <= RESULT_FIELDS or words[2] not in (*CATEGORY_OF, NOT_LABELED):
+            known = ", ".join([*CATEGORY_OF, NOT_LABELED])
+            problem = f"expected frame, track id, type ({known}) and {LABEL_FIELDS - 3} numbers"
+        else:
             try:
                 frame, row = parse_int(words[0]), [parse_float(word) for word in words[3:LABEL_FIELDS]]
             except ValueError:
-                raise ValueError(f"expected numbers after the type, found '{' '.join(words)[:60]}'") from None
-            if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
-                raise ValueError(f"a number is not finite, or larger than {MAX_POSITION_M:g}")
-            if not 0 <= frame <= MAX_FRAME:
-                raise ValueError(f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}")
-        except ValueError as problem:
-            message = f"{path}, line {k}: {problem}"
-            if damaged is None:
-                raise LogError(message) from None
-            damaged.append(message)
-            continue
-        rows.append((frame, words[1], words[2], row))
+                problem = f"expected numbers after the type, found '{' '.join(words)[:60]}'"
+            else:
+                if not (np.abs(row) <= MAX_POSITION_M).all():  # False for NaN
+                    problem = f"a number is not finite, or larger than {MAX_POSITION_M:g}"
+                elif not 0 <= frame <= MAX_FRAME:
+                    problem = f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}"
+        if not problem:
+            rows.append((frame, words[1], words[2], row))
+        elif damaged is None:
+            raise LogError(f"{path}, line {k}: {problem}")
+        else:
+            damaged.append(f"{path}, line {k}: {problem}")
     frames, ids, types, values = zip(*rows) if rows else ((), (), (), ())
     table = np.array(values, dtype=np.float64).reshape(-1, LABEL_FIELDS - 3)
     return LabelRows(np.array(frames, np.int64), np.array(ids, "<U16"), np.array(types, "<U16"), table)
 
 
-def boxes_in_map(map_T_rect: Array, values: Array) -> tuple[Array, Array, Array]:
-    """Box centers (L, 3), sizes (L, 3) and yaws (L,) in the map.
-
-    `map_T_rect` (L, 4, 4): pose of the rectified camera 0, whose frame the labels are in, at the stamp of each label.
-    `values` (L, 7): height, width, length, x, y, z of the bottom's center, rotation about the camera's y axis.
-    """
-    height, width, length, turn = values[:, 0], values[:, 1], values[:, 2], values[:, 6]
-    level = np.zeros_like(turn)
-    center = values[:, 3:6] - np.stack([level, height / 2, level], axis=1)
-    ahead = np.stack([np.cos(turn), level, -np.sin(turn)], axis=1)
-    heading = np.einsum("lij,lj->li", map_T_rect[:, :3, :3], ahead)
-    yaw = wrap_angle(np.arctan2(heading[:, 1], heading[:, 0]))
-    return apply(map_T_rect, center), np.stack([length, width, height], axis=1), yaw
-
-
 def drive_log(
-    rig: Rig,
-    cameras: Mapping[str, Camera],
-    streams: Mapping[str, Stream],
-    track: PoseTrack,
-    labels: DriveLabels,
+    rig: Rig, cameras: Mapping[str, Camera], streams: Mapping[str, Stream], track: PoseTrack, labels: DriveLabels,
     **about: Any,
-) -> Log:
+) -> Log:  # fmt: skip
     """Make the log of a drive of KITTI's car."""
+    lidars = {"velodyne": Lidar("velodyne", "ego", rig.ego_T_velo)} if "velodyne" in streams else {}
     return Log(
-        cameras=cameras,
-        lidars={"velodyne": Lidar("velodyne", "ego", rig.ego_T_velo)} if "velodyne" in streams else {},
-        streams=streams,
-        ego=track,
-        ego_vehicle=EGO_VEHICLE,
-        labels=labels.boxes_3d,
-        image_labels=labels.boxes_2d,
-        ignored_regions=labels.ignored,
-        **about,
-    )
+        cameras=cameras, lidars=lidars, streams=streams, ego=track, ego_vehicle=EGO_VEHICLE, labels=labels.boxes_3d,
+        image_labels=labels.boxes_2d, ignored_regions=labels.ignored, **about,
+    )  # fmt: skip

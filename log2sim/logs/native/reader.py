@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -108,10 +108,8 @@ def read_csv_table(
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         rows = [(reader.line_num, row) for row in reader if row]
     except UnicodeDecodeError as problem:
-        number = data.count(b"\n", 0, problem.start) + 1
-        raise LogError(
-            f"{path}, line {number}: not text in UTF-8: byte 0x{data[problem.start]:02x}; save the table as UTF-8"
-        ) from None
+        number, byte = data.count(b"\n", 0, problem.start) + 1, f"byte 0x{data[problem.start]:02x}"
+        raise LogError(f"{path}, line {number}: not text in UTF-8: {byte}; save the table as UTF-8") from None
     except csv.Error as problem:
         raise LogError(f"{path}: not a CSV table: {problem}") from None
     if not rows:
@@ -129,51 +127,40 @@ def read_csv_table(
     whole = [(n, row) for n, row in rows[1:] if len(row) == len(header)]
     wrong = [(n, row) for n, row in rows[1:] if len(row) != len(header)]
     said = [f"{path}, line {n}: {len(row)} fields, the header has {len(header)}" for n, row in wrong]
+    if said and damaged is None:
+        raise LogError(said[0])
     if damaged is not None:
         damaged += said
-    elif said:
-        raise LogError(said[0])
     line = np.array([n for n, _ in whole], dtype=np.int64)
-    cells = {name: [row[k].strip() for _, row in whole] for k, name in enumerate(header)}
-    values = {name: _parse(path, line, name, text, kinds[name]) for name, text in cells.items()}
+    values = {}
+    for k, name in enumerate(header):
+        cells, kind = [row[k].strip() for _, row in whole], kinds[name]
+        values[name], bad = _parse(cells, kind)
+        if bad is not None:
+            expected = f"expected {_EXPECTED[kind]}"
+            raise LogError(f"{path}, line {line[bad]}, field '{name}': '{cells[bad][:40]}', {expected}")
     return CsvTable(path, values, line, hashlib.sha256(data).hexdigest())
 
 
-def _parse(path: Path, line: NDArray[np.int64], name: str, text: list[str], kind: str) -> NDArray[Any]:
+def _parse(text: list[str], kind: str) -> tuple[NDArray[Any], int | None]:
+    """Return the values of cells, and which is the first that is wrong; None without one."""
     if kind == "str":
-        return np.array(text, dtype=np.str_)
+        return np.array(text, dtype=np.str_), None
     if kind == "bool":
         words = {"0": False, "1": True, "false": False, "true": True}
-        good = [t.lower() in words for t in text]
-        values: NDArray[Any] = np.array([words.get(t.lower(), False) for t in text], dtype=bool)
-    else:
-        try:
-            values = _numbers(text, kind)
-            good = list(_is_possible(values))
-        except (ValueError, OverflowError):
-            values, good = np.zeros(0), [_parses(t, kind) for t in text]
-    if not all(good):
-        k = good.index(False)
-        raise LogError(f"{path}, line {line[k]}, field '{name}': '{text[k][:40]}', expected {_EXPECTED[kind]}")
-    return values
-
-
-def _numbers(text: list[str], kind: str) -> NDArray[Any]:
-    if not is_plain("".join(text)):
-        raise ValueError
-    return np.array(text, dtype=np.str_).astype(_DTYPE[kind])
-
-
-def _parses(text: str, kind: str) -> bool:
+        known = [words.get(t.lower()) for t in text]
+        return np.array(known, dtype=bool), known.index(None) if None in known else None
     try:
-        return bool(_is_possible(_numbers([text], kind))[0])
+        if not is_plain("".join(text)):
+            raise ValueError
+        values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
     except (ValueError, OverflowError):
-        return False
-
-
-def _is_possible(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which numbers are finite and, unless whole (stamps), at most `MAX_NUMBER`."""
-    return np.asarray(np.isfinite(values) & ((np.abs(values) <= MAX_NUMBER) | (values.dtype.kind == "i")))
+        # The first that cannot be parsed by itself, or is impossible.
+        good = [_parse([t], kind)[1] is None for t in text] if len(text) > 1 else [False]
+        return np.zeros(0), good.index(False)
+    # Numbers are finite and, unless whole (stamps), at most `MAX_NUMBER`.
+    possible = np.isfinite(values) & ((np.abs(values) <= MAX_NUMBER) | (values.dtype.kind == "i"))
+    return values, None if possible.all() else int(np.argmin(possible))
 
 
 SIZE_FIELDS = ("length_m", "width_m", "height_m")
@@ -190,31 +177,25 @@ BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
 def boxes_3d(table: CsvTable) -> Labels:
     """Labels of a table with `BOX_3D_COLUMNS` and, optionally, some of `BOX_3D_OPTIONAL`."""
     _check_categories(table)
-    size, occlusion = table.stack(*SIZE_FIELDS), table.columns.get("occlusion")
+    visible, kind, occlusion = (table.columns.get(name) for name in BOX_3D_OPTIONAL)
     for name in SIZE_FIELDS:
         table.refuse(table[name] <= 0, name, "VALUE, expected a size above 0")
     if occlusion is not None:
         table.refuse(~np.isin(occlusion, OCCLUSIONS), "occlusion", "VALUE, expected 0, 1, 2 or 3")
+    center, size = table.stack("x_m", "y_m", "z_m"), table.stack(*SIZE_FIELDS)
     return Labels(
-        table["t_ns"],
-        table["track_id"],
-        table["category"],
-        table.stack("x_m", "y_m", "z_m"),
-        size,
-        table["yaw_rad"],
-        table.columns.get("visible"),
-        kind=table.columns.get("kind"),
+        table["t_ns"], table["track_id"], table["category"], center, size, table["yaw_rad"], visible, kind=kind,
         occlusion=occlusion,
-    )
+    )  # fmt: skip
 
 
-def boxes_by_camera(table: CsvTable, cameras: set[str]) -> dict[str, tuple[NDArray[np.bool_], Array]]:
+def boxes_by_camera(table: CsvTable, cameras: Iterable[str]) -> dict[str, tuple[NDArray[np.bool_], Array]]:
     """Rows (N,) and boxes (L, 4), u0, v0, u1, v1 in px, of each camera that a table with `REGION_COLUMNS` has some of."""
     box, names = table.stack(*BOX_2D_FIELDS), sorted(cameras)
     empty = (box[:, 2] <= box[:, 0]) | (box[:, 3] <= box[:, 1])
     table.refuse(empty, "u1_px,v1_px", "the box is empty, expected u0 < u1 and v0 < v1")
     table.refuse(~np.isin(table["camera"], names), "camera", f"no camera 'VALUE'; there are: {', '.join(names)}")
-    rows = {name: table["camera"] == name for name in sorted(cameras)}
+    rows = {name: table["camera"] == name for name in names}
     return {n: (r, box[r]) for n, r in rows.items() if r.any()}
 
 
@@ -224,16 +205,6 @@ def _check_categories(table: CsvTable) -> None:
 
 
 OFFSET_STEP_M = 1000.0
-
-
-def offset_of(track: PoseTrack | None, sensors: list[Camera | Lidar], labels: Labels | None) -> Array:
-    """Choose the whole kilometers (3,), m, by which a log is shifted towards the map's origin."""
-    mounts = [s.mount_T_cam if isinstance(s, Camera) else s.mount_T_lidar for s in sensors if s.mount == "map"]
-    positions = [mount_T_sensor[:3, 3] for mount_T_sensor in (mounts if track is None else track.map_T_ego[:1])]
-    if not positions and labels is not None and len(labels.t_ns):
-        positions = [labels.center_m[0]]
-    first = positions[0] if positions else np.zeros(3)
-    return OFFSET_STEP_M * np.round(first / OFFSET_STEP_M) + 0.0
 
 
 MANIFEST = "log.json"
@@ -301,7 +272,11 @@ class _Folder:
         self._check_sensors(sensors)
         labels = self._labels()
         boxes, regions = self._label_table("boxes_2d", BOX_2D_COLUMNS), self._label_table("ignored_2d", REGION_COLUMNS)
-        offset = offset_of(track, sensors, labels)
+        # Whole kilometers (3,), m, by which the log is shifted towards the map's origin.
+        mounts = [s.mount_T_cam if isinstance(s, Camera) else s.mount_T_lidar for s in sensors if s.mount == "map"]
+        places = [mount_T_sensor[:3, 3] for mount_T_sensor in (mounts if track is None else track.map_T_ego[:1])]
+        places += [] if labels is None else list(labels.center_m[:1])
+        offset = OFFSET_STEP_M * np.round((places[0] if places else np.zeros(3)) / OFFSET_STEP_M) + 0.0
         cameras, lidars = dict[str, Camera](), dict[str, Lidar]()
         for sensor in sensors:
             shift = offset if sensor.mount == "map" else np.zeros(3)
@@ -312,16 +287,16 @@ class _Folder:
         image_labels, ignored = dict[str, ImageLabels](), dict[str, ImageRegions]()
         if boxes is not None:
             _check_categories(boxes)
-            for name, (rows, box) in boxes_by_camera(boxes, set(cameras)).items():
+            for name, (rows, box) in boxes_by_camera(boxes, cameras).items():
                 image_labels[name] = ImageLabels(boxes["t_ns"][rows], box, boxes["category"][rows])
         if regions is not None:
-            for name, (rows, box) in boxes_by_camera(regions, set(cameras)).items():
+            for name, (rows, box) in boxes_by_camera(regions, cameras).items():
                 ignored[name] = ImageRegions(regions["t_ns"][rows], box)
-        ego = m.get("ego", {})
+        ego, vehicle = m.get("ego", {}), EgoVehicle()
+        length, width, height = (float(v) for v in ego.get("size_m", vehicle.size_m))
+        axle_m = float(ego.get("rear_axle_offset_m", vehicle.rear_axle_offset_m))
         # Without an ego the height of the road is one of the map.
         roadside = track is None and all(sensor.mount == "map" for sensor in sensors)
-        default = EgoVehicle()
-        length, width, height = (float(v) for v in ego.get("size_m", default.size_m))
         return Log(
             name=m["name"],
             format=READER.name,
@@ -329,9 +304,7 @@ class _Folder:
             lidars=lidars,
             streams={e["name"]: self._stream(k, e, offset) for k, e in enumerate(m["sensors"])},
             ego=None if track is None else PoseTrack(track.t_ns, shift_poses(track.map_T_ego, offset)),
-            ego_vehicle=EgoVehicle(
-                (length, width, height), float(ego.get("rear_axle_offset_m", default.rear_axle_offset_m))
-            ),
+            ego_vehicle=EgoVehicle((length, width, height), axle_m),
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
             labels=None if labels is None else replace(labels, center_m=labels.center_m - offset),
             image_labels=image_labels,
@@ -369,10 +342,9 @@ class _Folder:
             table = self.table(ego["gnss"], "ego.gnss", GNSS_COLUMNS)
             for field, limit in (("latitude_deg", 90.0), ("longitude_deg", 360.0)):
                 table.refuse(np.abs(table[field]) > limit, field, f"VALUE, expected at most {limit:g} degrees")
-            map_frame = map_frame_of(map_frame, *(float(table[f][0]) for f in GNSS_FIELDS[:3]))
-            attitude = table.stack(*GNSS_FIELDS[3:])
-            where = f"{self.file}, field 'map.projection'"
-            poses = poses_from_geodetic(map_frame, table.stack(*GNSS_FIELDS[:3]), attitude, where=where)
+            place, attitude = table.stack(*GNSS_FIELDS[:3]), table.stack(*GNSS_FIELDS[3:])
+            map_frame = map_frame_of(map_frame, *place[0].tolist())
+            poses = poses_from_geodetic(map_frame, place, attitude, where=f"{self.file}, field 'map.projection'")
         keep = strictly_increasing(table["t_ns"], "ego", self.notes)
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
 
@@ -394,23 +366,18 @@ class _Folder:
         return replace(camera_of(entry["name"], i, entry["mount"], mount_T_sensor), rolling_shutter=shutter)
 
     def _check_sensors(self, sensors: list[Camera | Lidar]) -> None:
-        names: set[str] = set()
+        names = [sensor.name for sensor in sensors]
         for k, sensor in enumerate(sensors):
             where = f"{self.file}, sensors[{k}] '{sensor.name}'"
-            if sensor.name in names:
+            if sensor.name in names[:k]:
                 raise LogError(f"{where}: the name occurs twice; names must be unique")
             if sensor.mount == "ego" and "ego" not in self.manifest:
-                raise LogError(
-                    f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss; an empty 'ego' says "
-                    "that its poses are not known"
-                )
-            names.add(sensor.name)
-        reference = self.manifest.get("reference_camera")
-        cameras = [s.name for s in sensors if isinstance(s, Camera)]
+                advice = "an empty 'ego' says that its poses are not known"
+                raise LogError(f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss; {advice}")
+        reference, cameras = self.manifest.get("reference_camera"), [s.name for s in sensors if isinstance(s, Camera)]
         if reference is not None and reference not in cameras:
-            raise LogError(
-                f"{self.file}, field 'reference_camera': no camera '{reference}'; there are: {', '.join(cameras)}"
-            )
+            there = f"no camera '{reference}'; there are: {', '.join(cameras)}"
+            raise LogError(f"{self.file}, field 'reference_camera': {there}")
 
     def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> Stream:
         frame = entry.get("points_frame", "lidar")
@@ -442,16 +409,14 @@ class _Folder:
         table = self._label_table("boxes_3d", BOX_3D_COLUMNS, BOX_3D_OPTIONAL)
         if table is None:
             return None
-        names = [s["name"] for s in self.manifest["sensors"] if s["kind"] == "camera"]
+        names = sorted(s["name"] for s in self.manifest["sensors"] if s["kind"] == "camera")
         for name in entry.get("cameras", ()):
             if name not in names:
-                raise LogError(
-                    f"{self.file}, field 'labels.cameras': no camera '{name}'; there are: {', '.join(sorted(names))}"
-                )
-        labels = boxes_3d(table)
+                there = f"no camera '{name}'; there are: {', '.join(names)}"
+                raise LogError(f"{self.file}, field 'labels.cameras': {there}")
         labeled = self._label_table("labeled", LABELED_COLUMNS)
         return replace(
-            labels,
+            boxes_3d(table),
             cameras=tuple(entry["cameras"]) if "cameras" in entry else None,
             labeled_ns=None if labeled is None else np.unique(labeled["t_ns"]),
             never_labeled=tuple(entry.get("never_labeled", ())),

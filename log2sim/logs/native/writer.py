@@ -65,11 +65,10 @@ def write_log(
             stream = log.streams[entry["name"]]
             (root / stream.name).mkdir()
             rows, sweeps = list[tuple[Any, ...]](), list[tuple[str, int | None]]()
+            sweep_kind = sweep if entry["kind"] == "lidar" else ""
             for i, t_ns in enumerate(stream.t_ns.tolist()):
                 try:
-                    suffix, data, kind = _encode(
-                        stream, i, sweep if entry["kind"] == "lidar" else "", jpeg_quality, offset
-                    )
+                    suffix, data, kind = _encode(stream, i, sweep_kind, jpeg_quality, offset)
                 except RecordError as error:
                     if problems is None:
                         raise
@@ -85,19 +84,15 @@ def write_log(
             if not rows:
                 raise LogError(f"stream '{stream.name}': none of its {len(stream.t_ns)} records can be read")
             columns = list(tables.INDEX_COLUMNS)
-            frames = {frame for frame, _ in sweeps}
+            frames, compensated = {frame for frame, _ in sweeps}, [int(t) for _, t in sweeps if t is not None]
+            if len(frames) > 1 or 0 < len(compensated) < len(rows):
+                kinds = (
+                    "in the lidar and in the map frame" if len(frames) > 1 else "that are and that are not compensated"
+                )
+                raise ConfigError(f"stream '{stream.name}' mixes sweeps {kinds}; write one kind")
             if frames == {"map"}:
                 entry["points_frame"] = "map"
-            elif len(frames) > 1:
-                raise ConfigError(
-                    f"stream '{stream.name}' mixes sweeps in the lidar and in the map frame; write one kind"
-                )
-            compensated = [int(t_ns) for _, t_ns in sweeps if t_ns is not None]
             if compensated:
-                if len(compensated) < len(rows):
-                    raise ConfigError(
-                        f"stream '{stream.name}' mixes sweeps that are and that are not compensated; write one kind"
-                    )
                 rows = [(*row, t) for row, t in zip(rows, compensated)]
                 columns += tables.COMPENSATED
             _write_table(root / entry["index"], columns, rows)
@@ -115,12 +110,11 @@ def refuse_target(target: Path, *, overwrite: bool) -> None:
 
 
 def _sensor(sensor: Camera | Lidar, offset: Array) -> dict[str, Any]:
-    camera = isinstance(sensor, Camera)
     mount_T_sensor = sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar
     translation = mount_T_sensor[:3, 3] + (offset if sensor.mount == "map" else 0.0)
     entry: dict[str, Any] = {
         "name": sensor.name,
-        "kind": "camera" if camera else "lidar",
+        "kind": "camera" if isinstance(sensor, Camera) else "lidar",
         "mount": sensor.mount,
         "translation_m": translation.tolist(),
         "rotation_wxyz": quaternion_from_rotation(mount_T_sensor[:3, :3]).tolist(),
@@ -158,24 +152,18 @@ def _encode(
             offset_ns = record.t_ns - record.stamp_ns
             small = len(offset_ns) == 0 or np.abs(offset_ns).max() < 2**31
             columns["t_offset_ns"] = offset_ns.astype(np.int32 if small else np.int64)
-        if record.intensity is not None:
-            columns["intensity"] = _packed(record.intensity)
+        strength = record.intensity
+        if strength is not None:
+            # Bytes where they are whole numbers up to 255, as most LiDARs have them.
+            fits = len(strength) and np.isfinite(strength).all() and np.array_equal(strength.round(), strength)
+            columns["intensity"] = strength.astype(np.uint8) if fits and strength.max() <= 255 else strength
         np.savez_compressed(out, **columns)  # type: ignore[arg-type]
     elif kind == "npy":
         np.save(out, xyz)
     else:
-        strength = np.zeros(len(xyz), np.float32) if record.intensity is None else np.nan_to_num(record.intensity)
-        out.write(np.column_stack([xyz, strength]).astype("<f4").tobytes())
+        of_points = np.zeros(len(xyz), np.float32) if record.intensity is None else np.nan_to_num(record.intensity)
+        out.write(np.column_stack([xyz, of_points]).astype("<f4").tobytes())
     return kind, out.getvalue(), (record.frame, record.compensated_ns)
-
-
-def _packed(intensity: NDArray[np.float32]) -> NDArray[Any]:
-    """Return intensities as bytes where they are whole numbers up to 255, as most LiDARs have them."""
-    if len(intensity) and np.isfinite(intensity).all():
-        whole = intensity.round()
-        if np.array_equal(whole, intensity) and whole.max() <= 255:
-            return whole.astype(np.uint8)
-    return intensity
 
 
 def _write_ego(log: Log, root: Path, sensors: Sequence[Camera | Lidar], kind: str) -> dict[str, Any]:
@@ -195,9 +183,8 @@ def _write_ego(log: Log, root: Path, sensors: Sequence[Camera | Lidar], kind: st
     if kind == "poses":
         values = np.hstack([poses[:, :3, 3] + log.map.offset_m, quaternion_from_rotation(poses[:, :3, :3])])
     elif log.map.projection is None:
-        raise ConfigError(
-            f"log '{log.name}': its map has no projection, so its ego cannot be written as GNSS; write poses"
-        )
+        lacks = "its map has no projection, so its ego cannot be written as GNSS"
+        raise ConfigError(f"log '{log.name}': {lacks}; write poses")
     else:
         columns = tables.GNSS_COLUMNS
         latitude, longitude, altitude, convergence = geodetic_from_map(log.map, poses[:, :3, 3], f"log '{log.name}'")

@@ -45,9 +45,7 @@ class NuScenesReader(FolderReader):
     """Reader of nuScenes; the root holds folders of tables (v1.0-mini), or is one."""
 
     name = "nuscenes"
-    looks_for = (
-        "a folder of nuScenes tables with scene.json and sample_data.json (v1.0-mini), or the folder that holds it"
-    )
+    looks_for = "a folder of tables with scene.json and sample_data.json (v1.0-mini), or the folder that holds it"
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder holds tables, or is a folder of tables."""
@@ -91,12 +89,10 @@ def _open(scene: Scene) -> Log:
     map_T_ego = shift_poses(ego.map_T_ego, offset_m)
     track = PoseTrack(ego.t_ns, map_T_ego)
     cameras, lidars, streams, files = _sensors(scene, track)
-    climb = float(np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max()))
     if np.ptp(map_T_ego[:, 2, 3]) < MAX_FLAT_M:
-        notes.append(
-            f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees: "
-            "the map is as flat as the log states it"
-        )
+        climb = np.degrees(np.abs(np.arcsin(np.clip(map_T_ego[:, 2, 0], -1, 1))).max())
+        lacks = f"ego poses have no height (z is constant) though they pitch by up to {climb:.1f} degrees"
+        notes.append(f"{lacks}: the map is as flat as the log states it")
     # The records with files may last much shorter than the scene.
     of_scene = [c.t_ns for c in scene.channels.values() if c.modality in ("camera", "lidar")]
     there = [stream.t_ns for stream in streams.values()]
@@ -171,10 +167,8 @@ def _sensors(
             lidars[name] = Lidar(name, "ego", channel.ego_T_sensor)
             streams[name] = Stream(name, t_ns, partial(_read_sweep, channel, track, t_ns, files))
     if not streams:
-        raise LogError(
-            f"{root}: none of the {missing} images and sweeps of scene '{scene.record['name']}' "
-            "is there; unpack samples/ and sweeps/ next to the folder of the tables"
-        )
+        there = f"none of the {missing} images and sweeps of scene '{scene.record['name']}' is there"
+        raise LogError(f"{root}: {there}; unpack samples/ and sweeps/ next to the folder of the tables")
     if unused:
         scene.notes.append(f"not read, as log2sim makes no use of radar: {', '.join(unused)}")
     return cameras, lidars, streams, used
@@ -183,9 +177,8 @@ def _sensors(
 def _camera(channel: Channel, record: Record, files: list[Path], path: Path) -> Camera:
     K = numbers_of([channel.calibration], "camera_intrinsic", (3, 3), path)[0]
     if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
-        raise LogError(
-            f"{path}: {channel.name}: camera_intrinsic is {K.tolist()}, expected positive focal lengths and a last row 0 0 1"
-        )
+        expected = "expected positive focal lengths and a last row 0 0 1"
+        raise LogError(f"{path}: {channel.name}: camera_intrinsic is {K.tolist()}, {expected}")
     width, height = record.get("width"), record.get("height")
     stated = all(isinstance(v, int) and 0 < v <= MAX_IMAGE_PX for v in (width, height))
     width, height = (width, height) if stated else first_image_size(files)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -46,9 +46,7 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     points = len(data) // BYTES_PER_POINT
     if len(data) % BYTES_PER_POINT:
-        raise RecordError(
-            f"{path} (stamp {t_ns}): {len(data)} bytes, expected five float32 (x, y, z, intensity, ring) a point"
-        )
+        raise RecordError(f"{path} (stamp {t_ns}): {len(data)} bytes, not 5 float32 (x, y, z, intensity, ring) a point")
     if points > MAX_SWEEP_POINTS:
         raise RecordError(f"{path} (stamp {t_ns}): {points} points, more than {MAX_SWEEP_POINTS}")
     rows = np.frombuffer(data, "<f4").reshape(-1, 5)
@@ -70,9 +68,8 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
 def firing_offset_ns(ring: NDArray[np.float32]) -> NDArray[np.int64] | None:
     """Time (N,) ns of points relative to the end of the turn by their order; None when it is not that of firing."""
     firings = len(ring) // RINGS
-    if len(ring) % RINGS or not 0 < firings <= MAX_FIRINGS:
-        return None
-    if not np.array_equal(ring.reshape(firings, RINGS), np.broadcast_to(np.arange(RINGS), (firings, RINGS))):
+    in_turn = np.array_equal(ring, np.tile(np.arange(RINGS), firings))
+    if not 0 < firings <= MAX_FIRINGS or not in_turn:
         return None
     return np.repeat((np.arange(firings, dtype=np.int64) - (firings - 1)) * FIRING_NS, RINGS)
 
@@ -116,15 +113,12 @@ class Scene:
         if not samples:
             raise LogError(f"{path}: no sample of scene '{self.record.get('name')}'; expected its key frames")
         by_token = {text_of(sample, "token", path): sample for sample in samples}
-        if len(by_token) < len(samples):
-            self.notes.append(
-                f"sample.json: {len(samples) - len(by_token)} key frames are there twice; each counts once"
-            )
-        stated = self.record.get("nbr_samples")
+        twice, stated = len(samples) - len(by_token), self.record.get("nbr_samples")
+        if twice:
+            self.notes.append(f"sample.json: {twice} key frames are there twice; each counts once")
         if isinstance(stated, int) and len(by_token) < stated:
-            self.notes.append(
-                f"sample.json: {stated - len(by_token)} of the {stated} key frames of the scene are missing"
-            )
+            missing = f"{stated - len(by_token)} of the {stated} key frames of the scene"
+            self.notes.append(f"sample.json: {missing} are missing")
         return sorted(by_token.values(), key=lambda sample: stamp_ns_of(sample, path))
 
     @cached_property
@@ -139,7 +133,7 @@ class Scene:
     @cached_property
     def channels(self) -> dict[str, Channel]:
         """Sensors by name."""
-        path = self.tables.path("calibrated_sensor")
+        path, of_sensors = self.tables.path("calibrated_sensor"), self.tables.path("sensor")
         used = {text_of(record, "calibrated_sensor_token", self.tables.path(DATA)) for record in self.data}
         calibrated = self.tables.by_token("calibrated_sensor", used)
         sensors = self.tables.all_of("sensor")
@@ -148,15 +142,11 @@ class Scene:
             calibration = calibrated[record["calibrated_sensor_token"]]
             sensor = sensors.get(text_of(calibration, "sensor_token", path))
             if sensor is None:
-                raise LogError(
-                    f"{self.tables.path('sensor')}: no record with token '{calibration['sensor_token'][:40]}', "
-                    "which calibrated_sensor.json names"
-                )
-            name = text_of(sensor, "channel", self.tables.path("sensor"))
+                token = f"'{calibration['sensor_token'][:40]}', which calibrated_sensor.json names"
+                raise LogError(f"{of_sensors}: no record with token {token}")
+            name = text_of(sensor, "channel", of_sensors)
             if not CHANNEL.fullmatch(name):
-                raise LogError(
-                    f"{self.tables.path('sensor')}: channel {name[:40]!a}, expected letters, digits, _ and -"
-                )
+                raise LogError(f"{of_sensors}: channel {name[:40]!a}, expected letters, digits, _ and -")
             by_name.setdefault(name, []).append((record, calibration | {"modality": sensor.get("modality")}))
         return {name: self._channel(name, by_name[name]) for name in sorted(by_name)}
 
@@ -178,9 +168,8 @@ class Scene:
     def ego(self) -> PoseTrack:
         """Ego poses at the stamps of all sensors, without an offset; those of one stamp are the same."""
         path, where = self.tables.path("ego_pose"), self.tables.path(DATA)
-        records = list(
-            self.tables.by_token("ego_pose", {text_of(r, "ego_pose_token", where) for r in self.data}).values()
-        )
+        tokens = {text_of(record, "ego_pose_token", where) for record in self.data}
+        records = list(self.tables.by_token("ego_pose", tokens).values())
         stamps = np.array([stamp_ns_of(record, path) for record in records], dtype=np.int64)
         rotation = rotation_from_quaternion(quaternions_of(records, path))
         poses = transform(rotation, numbers_of(records, "translation", (3,), path))
@@ -233,8 +222,7 @@ class _Rows:
 
     def take(self, index: NDArray[Any], **changes: Any) -> _Rows:
         """Select rows; `changes` replace columns of the selection."""
-        columns = {name: column[index] for name, column in vars(self).items()}
-        return _Rows(**{**columns, **changes})
+        return _Rows(**{**{name: column[index] for name, column in vars(self).items()}, **changes})
 
 
 def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: list[str]) -> Labels | None:
@@ -257,12 +245,11 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
         return None
     stamps = np.array([stamp_ns_of(sample, sample_path) for sample in scene.samples], dtype=np.int64)
     rows = _rows_of(scene, annotations, samples, notes)
-    t_ns = scanned_ns(scene, lidar, stamps[rows.sample], rows.center_m)
-    rows = rows.take(np.arange(len(rows.t_ns)), t_ns=t_ns)
+    rows = replace(rows, t_ns=scanned_ns(scene, lidar, stamps[rows.sample], rows.center_m))
     ends_ns = turn_ends(stamps if lidar is None else np.union1d(stamps, lidar.t_ns))
     parts = [rows, _between(scene, lidar, rows, stamps, ends_ns)]
-    columns = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(rows)}
-    rows = _Rows(**columns).take(np.argsort(columns["t_ns"], kind="stable"))
+    rows = _Rows(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(rows)})
+    rows = rows.take(np.argsort(rows.t_ns, kind="stable"))
     return Labels(
         rows.t_ns, rows.track_id, rows.category, rows.center_m - offset_m, rows.size_m, rows.yaw_rad, rows.visible,
         kind=rows.kind, labeled_ns=np.unique(stamps - (0 if lidar is None else TURN_NS // 2)),
@@ -319,38 +306,39 @@ def _between(
 
 def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], notes: list[str]) -> _Rows:
     """Check annotations and return them as columns; stamps are still 0."""
-    path = scene.tables.path(ANNOTATIONS)
-    kinds = _kinds(scene, annotations, path)
+    path, of_categories = scene.tables.path(ANNOTATIONS), scene.tables.path("category")
+    tokens = [text_of(a, "instance_token", path) for a in annotations]
+    instances, categories = scene.tables.by_token("instance", tokens), scene.tables.all_of("category")
+    kind_of = {}
+    for token, instance in instances.items():
+        wanted = text_of(instance, "category_token", scene.tables.path("instance"))
+        if wanted not in categories:
+            raise LogError(f"{of_categories}: no record with token '{wanted[:40]}', which instance.json names")
+        kind_of[token] = text_of(categories[wanted], "name", of_categories)
+    kinds = [kind_of[token] for token in tokens]
     attributes = {token: str(r.get("name")) for token, r in scene.tables.all_of("attribute").items()}
-    ridden = []
-    for a in annotations:
-        tokens = a.get("attribute_tokens", [])
-        if not isinstance(tokens, list):
+    category, visible = list[str](), list[bool]()
+    for a, kind in zip(annotations, kinds):
+        named = a.get("attribute_tokens", [])
+        if not isinstance(named, list):
             raise LogError(f"{path}, token {str(a.get('token'))[:40]!a}: 'attribute_tokens' is no list")
-        ridden.append({attributes.get(str(token), "") for token in tokens})
-    category = [
-        "cyclist" if word == "bicycle" and WITH_RIDER in words else word
-        for word, words in zip((CATEGORY_OF.get(kind, "") for kind in kinds), ridden)
-    ]
+        word, ridden = CATEGORY_OF.get(kind, ""), WITH_RIDER in [attributes.get(str(token)) for token in named]
+        category.append("cyclist" if word == "bicycle" and ridden else word)
+        # The sensors hit it, and its visibility, where it is stated, is above 40 %.
+        hits = [a.get(key, 0) for key in ("num_lidar_pts", "num_radar_pts")]
+        is_hit = any(isinstance(n, int) and n > 0 for n in hits)
+        visible.append(is_hit and a.get("visibility_token") != HARDLY_VISIBLE)
     size = numbers_of(annotations, "size", (3,), path)[:, [1, 0, 2]]  # tables: width, length, height
     rows = _Rows(
         np.array([samples[a["sample_token"]] for a in annotations], dtype=np.int64),
         np.zeros(len(annotations), dtype=np.int64),
-        np.array([a["instance_token"] for a in annotations]),
+        np.array(tokens),
         np.array(kinds),
         np.array(category, dtype="<U16"),
         numbers_of(annotations, "translation", (3,), path),
         size,
         yaw_of(rotation_from_quaternion(quaternions_of(annotations, path))),
-        # The sensors hit an object, and its visibility, where it is stated, is above 40 %.
-        np.array(
-            [
-                any(isinstance(n := a.get(key, 0), int) and n > 0 for key in ("num_lidar_pts", "num_radar_pts"))
-                and a.get("visibility_token") != HARDLY_VISIBLE
-                for a in annotations
-            ],
-            dtype=bool,
-        ),
+        np.array(visible, dtype=bool),
     )
     note_left_out((kind for kind, word in zip(kinds, category) if not word), NO_ROAD_USERS, notes)
     flat = ~(size > 0).all(axis=1)
@@ -362,17 +350,3 @@ def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], n
     if same.any():
         notes.append(f"{int(same.sum())} labels repeat an instance in its sample; dropped")
     return rows.take(kept[np.r_[True, ~same][: len(kept)]])
-
-
-def _kinds(scene: Scene, annotations: list[Record], path: Path) -> list[str]:
-    """Names of the categories of annotations."""
-    tokens = [text_of(a, "instance_token", path) for a in annotations]
-    instances, categories = scene.tables.by_token("instance", tokens), scene.tables.all_of("category")
-    of_instances, of_categories = scene.tables.path("instance"), scene.tables.path("category")
-    words = {}
-    for token, instance in instances.items():
-        wanted = text_of(instance, "category_token", of_instances)
-        if wanted not in categories:
-            raise LogError(f"{of_categories}: no record with token '{wanted[:40]}', which instance.json names")
-        words[token] = text_of(categories[wanted], "name", of_categories)
-    return [words[token] for token in tokens]

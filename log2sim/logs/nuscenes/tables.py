@@ -99,8 +99,7 @@ def scan_records(path: Path, key: str, values: Collection[str], chunk_bytes: int
                 break
             if match[1] in plain or b"\\" in match[1]:
                 record = _record_around(data, match.start(), f"{path}, byte {offset + match.start()}")
-                found_value = record.get(key)
-                if isinstance(found_value, str) and found_value in wanted:
+                if isinstance(record.get(key), str) and record[key] in wanted:
                     yield record
 
 
@@ -129,9 +128,7 @@ def _windows(path: Path, chunk_bytes: int) -> Iterator[tuple[bytes, int, int, in
                 cut = max(end - MAX_RECORD_BYTES, 0)
                 data, begin, offset = data[cut:], end - cut, offset + cut
     except OSError as problem:
-        raise LogError(
-            f"{path}: cannot be read: {problem.strerror}; nuScenes stores it with the other tables"
-        ) from None
+        raise LogError(f"{path}: cannot be read: {problem.strerror}; it belongs to the other tables") from None
 
 
 def _record_around(data: bytes, at: int, where: str) -> Record:
@@ -142,8 +139,8 @@ def _record_around(data: bytes, at: int, where: str) -> Record:
         if start < 0:
             break
         text = data[start:last].decode("utf-8", errors="replace")
+        repeated: list[str] = []
         try:
-            repeated: list[str] = []
             record, length = unique_decoder(repeated).raw_decode(text)
         except (ValueError, RecursionError):
             continue
@@ -160,10 +157,7 @@ def text_of(record: Record, key: str, path: Path) -> str:
     """Return a text of a record; `LogError` when it has none or one that cannot be printed in a line."""
     value = record.get(key)
     if not isinstance(value, str) or not value.isprintable() or len(value) > MAX_TEXT_CHARACTERS:
-        raise LogError(
-            f"{_place(record, path)}: '{key}' is {_shown(value)}, expected a text in one line of at most "
-            f"{MAX_TEXT_CHARACTERS} characters"
-        )
+        raise _wrong(record, key, path, f"a text in one line of at most {MAX_TEXT_CHARACTERS} characters")
     return value
 
 
@@ -171,7 +165,7 @@ def stamp_ns_of(record: Record, path: Path) -> int:
     """Return the stamp of a record in ns; `LogError` when it is no whole number of microseconds."""
     value = record.get("timestamp")
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MAX_TIME_S * 10**6:
-        raise LogError(f"{_place(record, path)}: 'timestamp' is {_shown(value)}, expected whole microseconds")
+        raise _wrong(record, "timestamp", path, "whole microseconds")
     return value * 1000
 
 
@@ -179,16 +173,13 @@ def numbers_of(records: list[Record], key: str, shape: tuple[int, ...], path: Pa
     """Return the numbers of a key as (len(records), *shape) float64; `LogError` that names the first record without."""
     rows = np.zeros((len(records), *shape))
     for k, record in enumerate(records):
-        value = record.get(key)
         try:
-            row = np.asarray(value, dtype=np.float64)
+            row = np.asarray(record.get(key), dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             row = np.zeros(0)
         if row.shape != shape or not (np.abs(row) <= MAX_NUMBER).all():
             expected = " x ".join(str(n) for n in shape)
-            raise LogError(
-                f"{_place(record, path)}: '{key}' is {_shown(value)}, expected {expected} finite numbers up to {MAX_NUMBER:g}"
-            )
+            raise _wrong(record, key, path, f"{expected} finite numbers up to {MAX_NUMBER:g}")
         rows[k] = row
     return rows
 
@@ -196,18 +187,13 @@ def numbers_of(records: list[Record], key: str, shape: tuple[int, ...], path: Pa
 def quaternions_of(records: list[Record], path: Path) -> Array:
     """Return the rotations of records, unit quaternions (R, 4) scalar-first; `LogError` for one that is not."""
     q = numbers_of(records, "rotation", (4,), path)
-    bad = find_not_unit(q)
-    if len(bad):
-        raise LogError(
-            f"{_place(records[bad[0]], path)}: 'rotation' is {q[bad[0]].tolist()}, expected a unit quaternion"
-        )
+    for k in find_not_unit(q):
+        raise _wrong(records[k], "rotation", path, "a unit quaternion")
     return q
 
 
-def _place(record: Record, path: Path) -> str:
-    return f"{path}, token {str(record.get('token'))[:40]!a}"
-
-
-def _shown(value: Any) -> str:
-    text = ascii(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def _wrong(record: Record, key: str, path: Path, expected: str) -> LogError:
+    """Return the error for a value of a record, which it names by its token."""
+    text = ascii(record.get(key))
+    shown = text if len(text) <= 60 else f"{text[:57]}..."
+    return LogError(f"{path}, token {str(record.get('token'))[:40]!a}: '{key}' is {shown}, expected {expected}")

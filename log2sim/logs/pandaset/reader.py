@@ -41,33 +41,40 @@ from log2sim.logs.stamps import (
     MAX_TIME_S,
     compute_scan_offset_ns,
     defer_notes,
+    geodetic_from_map,
     note_left_out,
+    poses_from_geodetic,
     select_spaced,
     strictly_increasing,
+    transverse_mercator,
 )
 
 # Value of the column "d" by LiDAR.
 LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
 COLUMNS = ("x", "y", "z", "t", "d", "i")
-# Tables that are kept from the reading of the stamps until their sweeps are read, so that they are decompressed once.
 MAX_KEPT_BYTES = 256 * 1024**2
 READING_THREADS = 4
 
 
 class SweepFiles:
-    """Files of a sequence, each with the points of both LiDARs; stamps of the PandarGT are read when first used."""
+    """Files of a sequence, each with the points of both LiDARs; stamps of the PandarGT are read when first used.
+
+    Tables that are read for the stamps are kept, up to `MAX_KEPT_BYTES`, until the sweeps of both LiDARs are read.
+    """
 
     def __init__(self, files: dict[int, Path], t_ns: NDArray[np.int64], notes: list[str]) -> None:
         self.files, self._t_ns, self._notes = files, t_ns, notes
         self._indexes: dict[str, tuple[NDArray[np.int64], list[Path]]] = {}
-        self._lock, self._kept = Lock(), _KeptTables()
+        self._lock, self._kept_lock = Lock(), Lock()
+        self._kept: dict[Path, tuple[Columns, set[str]]] = {}  # with the LiDARs that have got them
+        self._kept_bytes = 0
 
     def stream(self, lidar: str) -> Stream:
         """Return the stream of one LiDAR."""
 
         def read(i: int) -> Sweep:
             t_ns, files = self.index(lidar)
-            return _read_sweep(self._kept.take(files[i], lidar), files[i], int(t_ns[i]), LIDARS[lidar])
+            return _read_sweep(self._take(files[i], lidar), files[i], int(t_ns[i]), LIDARS[lidar])
 
         def encoded(i: int) -> bytes:
             return read_file(self.index(lidar)[1][i], MAX_TABLE_BYTES, RecordError)
@@ -104,7 +111,12 @@ class SweepFiles:
             columns = read_pickled_table(path)
         except RecordError:
             return None
-        self._kept.add(path, columns)
+        needed = {name: columns[name] for name in COLUMNS if name in columns}
+        with self._kept_lock:
+            size = sum(column.nbytes for column in needed.values())
+            if self._kept_bytes + size <= MAX_KEPT_BYTES:
+                self._kept[path] = {name: column.copy() for name, column in needed.items()}, set()
+                self._kept_bytes += size
         try:
             t_s = columns["t"][columns["d"] == LIDARS["pandargt"]].astype(np.float64)
         except (KeyError, TypeError, ValueError, IndexError):
@@ -112,31 +124,14 @@ class SweepFiles:
         t_s = t_s[np.abs(t_s) < MAX_TIME_S]  # False for NaN
         return round((float(t_s.min()) + float(t_s.max())) / 2 * NS_PER_S) if len(t_s) else None
 
-
-class _KeptTables:
-    """Tables whose sweeps are still to be read, up to `MAX_KEPT_BYTES`; safe to share between threads."""
-
-    def __init__(self) -> None:
-        self._tables: dict[Path, tuple[Columns, set[str]]] = {}
-        self._bytes, self._lock = 0, Lock()
-
-    def add(self, path: Path, columns: Columns) -> None:
-        """Keep the columns of a table that a sweep needs, if there is room."""
-        needed = {name: columns[name] for name in COLUMNS if name in columns}
-        size = sum(column.nbytes for column in needed.values())
-        with self._lock:
-            if self._bytes + size <= MAX_KEPT_BYTES:
-                self._tables[path] = {name: column.copy() for name, column in needed.items()}, set()
-                self._bytes += size
-
-    def take(self, path: Path, lidar: str) -> Columns | None:
-        """Return a table for one LiDAR, None where it is not kept; forget it when all LiDARs have got it."""
-        with self._lock:
-            columns, read = self._tables.get(path, (None, set()))
+    def _take(self, path: Path, lidar: str) -> Columns | None:
+        """Return a kept table for one LiDAR, None where it is not kept."""
+        with self._kept_lock:
+            columns, read = self._kept.get(path, (None, set()))
             read.add(lidar)
             if columns is not None and len(read) == len(LIDARS):
-                del self._tables[path]
-                self._bytes -= sum(column.nbytes for column in columns.values())
+                del self._kept[path]
+                self._kept_bytes -= sum(column.nbytes for column in columns.values())
             return columns
 
 
@@ -204,8 +199,7 @@ def read_labels(
     0.5 +- 0.4 ms: the turn takes 0.1 s and ends at the rear, at the stamp of the sweep. Of an object with a cuboid for each LiDAR
     the Pandar64's is kept.
     """
-    parts = []
-    left_out: list[str] = []
+    parts, left_out = list[tuple[NDArray[Any], ...]](), list[str]()
     twice = flat = 0
     for number, path in files.items():
         if number < len(t_ns):
@@ -220,8 +214,8 @@ def read_labels(
     note_left_out(left_out, NO_ROAD_USERS, notes)
     missing = sorted(set(range(len(t_ns))) - set(files))
     if missing:
-        note = f"annotations/cuboids: {len(missing)} of {len(t_ns)} files are missing"
-        notes.append(f"{note}, first number {missing[0]:02d}")
+        count = f"{len(missing)} of {len(t_ns)} files"
+        notes.append(f"annotations/cuboids: {count} are missing, first number {missing[0]:02d}")
     if not parts:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
     columns = [np.concatenate(column) for column in zip(*parts)]
@@ -235,8 +229,8 @@ def read_labels(
         category[rows & (category == UNKNOWN_RIDER)] = words[np.argmax(counts)] if len(words) else "bicycle"
         alone += not len(words)
     if alone:
-        said = f"{alone} bicycle{'s' * (alone != 1)} taken as unridden"
-        notes.append(f"{said}: no sweep states whether somebody rides them")
+        taken = f"{alone} bicycle{'s' * (alone != 1)} taken as unridden"
+        notes.append(f"{taken}: no sweep states whether somebody rides them")
     return Labels(t_ns, track_id, category, center, size, yaw)
 
 
@@ -244,13 +238,10 @@ def _checked(table: Columns, path: Path) -> Columns:
     for name in LABEL_COLUMNS:
         if name not in table:
             raise LogError(f"{path}: no column '{name}'; expected cuboids with {', '.join(LABEL_COLUMNS)}")
-    count = len(table["uuid"])
-    table = {name: np.full(count, value) for name, value in OPTIONAL.items()} | table
-    numbers = [n for n in LABEL_COLUMNS if n.startswith(("yaw", "position", "dimensions"))]
-    for name in numbers:
-        if table[name].dtype.kind not in "fiu" or not (np.abs(table[name]) <= MAX_POSITION_M).all():
+        is_possible = table[name].dtype.kind in "fiu" and (np.abs(table[name]) <= MAX_POSITION_M).all()
+        if name not in ("uuid", "label") and not is_possible:
             raise LogError(f"{path}, column '{name}': expected finite numbers up to {MAX_POSITION_M:g}")
-    return table
+    return {name: np.full(len(table["uuid"]), value) for name, value in OPTIONAL.items()} | table
 
 
 def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: list[str]) -> tuple[NDArray[Any], ...]:
@@ -303,9 +294,8 @@ class PandaSetReader(FolderReader):
 
     def find(self, path: Path) -> dict[str, Path]:
         """Find the sequences at a folder by name."""
-        if _is_sequence(path):
-            return {path.resolve().name: path}
-        return {p.name: p for p in list_folders(path) if _is_sequence(p)}
+        places = [path] if _is_sequence(path) else [p for p in list_folders(path) if _is_sequence(p)]
+        return {p.resolve().name if p == path else p.name: p for p in places}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a sequence; no sweep and no cuboid is read."""
@@ -365,11 +355,9 @@ def _files(path: Path, folder: str, suffix: str, count: int, notes: list[str]) -
     """Find the records of a sensor by their number and note missing ones: they are gaps."""
     found = list_numbered_files(path / folder, (suffix,))
     files = {k: p for k, p in found.items() if k < count}
-    if len(files) < len(found):
-        notes.append(
-            f"{folder}: {len(found) - len(files)} of {len(found)} records left out: there are stamps for {count}"
-        )
-    missing = sorted(set(range(count)) - set(files))
+    beyond, missing = len(found) - len(files), sorted(set(range(count)) - set(files))
+    if beyond:
+        notes.append(f"{folder}: {beyond} of {len(found)} records left out: there are stamps for {count}")
     if missing:
         notes.append(f"{folder}: {len(missing)} of {count} records are missing, first number {missing[0]:02d}")
     return files
@@ -390,7 +378,15 @@ def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, 
             continue
         size_px = first_image_size(list(files.values()))
         mount = _mount(track, t_ns, map_T_cam, folder, notes)
-        cameras[name] = Camera(name, *size_px, _intrinsics(folder / "intrinsics.json"), "ego", mount)
+        path_K = folder / "intrinsics.json"
+        try:
+            fx, fy, cx, cy = (float(read_json(path_K)[k]) for k in ("fx", "fy", "cx", "cy"))
+        except (TypeError, KeyError, ValueError):
+            raise LogError(f"{path_K}: expected the numbers fx, fy, cx, cy") from None
+        if fx <= 0 or fy <= 0:
+            raise LogError(f"{path_K}: fx {fx:g}, fy {fy:g}, expected focal lengths above 0")
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        cameras[name] = Camera(name, *size_px, K, "ego", mount)
         numbers = np.array(list(files))
         numbers = numbers[strictly_increasing(t_ns[numbers], name, notes)]
         streams[name] = image_stream(name, t_ns[numbers], [files[int(n)] for n in numbers], size_px)
@@ -422,8 +418,6 @@ def georeference(geodetic: Array, xyz_map: Array, where: str) -> tuple[MapFrame,
 
     The map's axes count as east and north only if the track reaches 20 m and the best rotation is below 1 degree.
     """
-    from log2sim.logs.stamps import geodetic_from_map, poses_from_geodetic, transverse_mercator
-
     n = min(len(geodetic), len(xyz_map))
     latitude, longitude, altitude = (float(v) for v in geodetic[0])
     local = MapFrame(latitude, longitude, altitude)
@@ -450,26 +444,17 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
         q = np.array([[p["heading"][k] for k in "wxyz"] for p in poses], dtype=np.float64)
         position = np.array([[p["position"][k] for k in "xyz"] for p in poses], dtype=np.float64)
     except (TypeError, KeyError, ValueError) as problem:
-        raise LogError(
-            f"{folder}/poses.json: expected records of position x, y, z and heading w, x, y, z: {problem}"
-        ) from None
+        expected = "expected records of position x, y, z and heading w, x, y, z"
+        raise LogError(f"{folder}/poses.json: {expected}: {problem}") from None
     sensor_poses = checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
     for k, stamp in enumerate(stamps):
         if not isinstance(stamp, (int, float)) or isinstance(stamp, bool) or not abs(stamp) < MAX_TIME_S:
-            raise LogError(
-                f"{folder}/timestamps.json: record {k}: {str(stamp)[:40]!a}, expected a stamp in seconds below {MAX_TIME_S:g}"
+            where, expected = (
+                f"{folder}/timestamps.json: record {k}",
+                f"expected a stamp in seconds below {MAX_TIME_S:g}",
             )
+            raise LogError(f"{where}: {str(stamp)[:40]!a}, {expected}")
     return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64), sensor_poses
-
-
-def _intrinsics(path: Path) -> Array:
-    try:
-        fx, fy, cx, cy = (float(read_json(path)[k]) for k in ("fx", "fy", "cx", "cy"))
-    except (TypeError, KeyError, ValueError):
-        raise LogError(f"{path}: expected the numbers fx, fy, cx, cy") from None
-    if fx <= 0 or fy <= 0:
-        raise LogError(f"{path}: fx {fx:g}, fy {fy:g}, expected focal lengths above 0")
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: Path, notes: list[str]) -> Array:

@@ -199,40 +199,32 @@ def _kind_of(part: Any) -> str:
 def _columns(table: Any) -> Columns:
     if _kind_of(table) != "Frame" or not isinstance(table.state, dict):
         raise ValueError(f"holds a {_kind_of(table)}, expected a DataFrame")
-    manager = table.state.get("_mgr", table.state.get("_data"))
+    manager: Any = table.state.get("_mgr", table.state.get("_data"))
     if _kind_of(manager) != "Blocks":
         raise ValueError("its DataFrame has no blocks")
-    axes, blocks = _layout(manager)
+    # Values and column positions of each block, as written since and before pandas 1.3.
+    if manager.args:
+        blocks, axes = manager.args
+        parts = [(b.args[0], b.args[1]) for b in blocks]
+    else:
+        inner = manager.state[3]["0.14.1"]
+        axes, parts = inner["axes"], [(b["values"], b["mgr_locs"]) for b in inner["blocks"]]
     names = [str(n) for n in _values(axes[0]).tolist()]
     columns: Columns = {}
     texts = 0
-    for values, place in blocks:
+    for values, place in parts:
         rows = _values(values)
         texts += rows.size if rows.dtype == object else 0
         if texts > MAX_TEXT_CELLS:
             raise ValueError(f"more than the {MAX_TEXT_CELLS} texts that a table may have")
-        for k, column in enumerate(_column_indices(place, len(names))):
+        if isinstance(place, slice) and not all(isinstance(v, int) for v in (place.start, place.stop, place.step)):
+            raise ValueError("a block has no columns")
+        numbers = list(range(len(names)))[place] if isinstance(place, slice) else [int(p) for p in _values(place)]
+        for k, column in enumerate(numbers):
             columns[names[column]] = rows if rows.ndim == 1 else rows[k]
     if len(set(map(len, columns.values()))) > 1 or len(columns) != len(names):
         raise ValueError("its columns are incomplete")
     return columns
-
-
-def _layout(manager: Any) -> tuple[list[Any], list[tuple[Any, Any]]]:
-    """Axes, and values and column positions of each block, of managers as written before and since pandas 1.3."""
-    if manager.args:
-        blocks, axes = manager.args
-        return axes, [(b.args[0], b.args[1]) for b in blocks]
-    inner = manager.state[3]["0.14.1"]
-    return inner["axes"], [(b["values"], b["mgr_locs"]) for b in inner["blocks"]]
-
-
-def _column_indices(place: Any, count: int) -> list[int]:
-    if isinstance(place, slice):
-        if not all(isinstance(v, int) for v in (place.start, place.stop, place.step)):
-            raise ValueError("a block has no columns")
-        return list(range(count))[place]
-    return [int(p) for p in _values(place)]
 
 
 def _values(part: Any) -> NDArray[Any]:
@@ -262,17 +254,15 @@ def _arrow_values(part: Any) -> NDArray[Any]:
     if _kind_of(part) != "ArrowArray":
         raise ValueError(f"a {_kind_of(part)} where the text of an ArrowStringArray was expected")
     kind, length, _, start, buffers, *_ = part.args[0]
-    name = kind.args[0] if _kind_of(kind) == "ArrowType" else str(kind)
-    return decode_text(name, length, start, [_arrow_bytes(buffer) for buffer in buffers])
-
-
-def _arrow_bytes(part: Any) -> bytes | bytearray | None:
-    """Return the bytes of a buffer; a length, for which `bytearray` would make so many zeros, is refused."""
-    while _kind_of(part) == "Bytes":
-        (part,) = part.args
-    if part is not None and not isinstance(part, (bytes, bytearray)):
-        raise ValueError("a buffer of an ArrowStringArray has no data")
-    return part
+    found = list[bytes | bytearray | None]()
+    for buffer in buffers:
+        while _kind_of(buffer) == "Bytes":
+            (buffer,) = buffer.args
+        # A length, for which `bytearray` would make so many zeros, is refused.
+        if buffer is not None and not isinstance(buffer, (bytes, bytearray)):
+            raise ValueError("a buffer of an ArrowStringArray has no data")
+        found.append(buffer)
+    return decode_text(kind.args[0] if _kind_of(kind) == "ArrowType" else str(kind), length, start, found)
 
 
 def _from_bytes(data: Any, dtype: np.dtype[Any], shape: Any, order: Any) -> NDArray[Any]:

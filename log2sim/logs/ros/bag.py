@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from log2sim.errors import LogError, MissingExtra, RecordError
 from log2sim.files.inputs import open_regular, read_text, require_link_inside
 from log2sim.logs.records import PARSER_ERRORS
-from log2sim.logs.ros.containers import Container, one_line, printable
+from log2sim.logs.ros.containers import ChunkedFile, Rosbag1, one_line, printable
+from log2sim.logs.ros.rosbag2 import MAGIC, SQLITE_MAGIC, Mcap, SqliteBag
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
@@ -30,7 +31,6 @@ _SPLIT = re.compile(r"^(?P<name>.*?)(?:_?\d{4}-\d\d-\d\d-\d\d-\d\d-\d\d)?_(?P<pa
 class Recording:
     """One recording, found by names alone: its file or folder, its files in the order of the parts, and where settings may lie."""
 
-    name: str
     place: Path
     files: tuple[Path, ...]
     settings: tuple[Path, ...]  # TOML files; the first that exists counts
@@ -48,7 +48,22 @@ def find_recordings(path: Path) -> dict[str, Recording]:
             return {path.stem: _file_recording(path, path.parent)}
         if (path / METADATA).is_file() and _bags(path):
             return {path.name: _folder_recording(path, path)}
-        found = {r.name: r for r in _loose(path)}
+        groups: dict[tuple[str, str], list[Path]] = {}
+        for file in _bags(path):
+            match = _SPLIT.match(file.stem)
+            key = (match["name"] or path.name) if match else file.stem
+            groups.setdefault((key, file.suffix.lower()), []).append(file)
+        loose = list[tuple[str, Recording]]()
+        for (name, _), parts in groups.items():
+            numbers = [_part(p) for p in parts]
+            if len(parts) > 1 and numbers[0] == 0 and len(set(numbers)) == len(numbers):
+                settings = (path / f"{name}.{SETTINGS}", path / SETTINGS)
+                loose.append((name, Recording(path, tuple(parts), settings)))
+            else:
+                loose += [(p.stem, _file_recording(p, path)) for p in parts]
+        # Files of one name in two formats would hide each other.
+        names = [name for name, _ in loose]
+        found = {r.files[0].name if names.count(name) > 1 else name: r for name, r in loose}
         for folder in sorted(p for p in path.iterdir() if p.is_dir() and (p / METADATA).is_file()):
             if _bags(folder):
                 found[folder.name] = _folder_recording(folder, path)
@@ -97,38 +112,19 @@ def recorded_files(recording: Recording, notes: list[str]) -> tuple[list[Path], 
 
 
 def _bags(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+    """Return the bags in a folder by the numbers of their parts, then by their names."""
+    found = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+    return sorted(found, key=lambda path: (_part(path), path))
 
 
 def _file_recording(path: Path, root: Path) -> Recording:
     next_to = path.with_name(f"{path.stem}.{SETTINGS}")
-    return Recording(path.stem, path, (path,), (next_to, path.parent / SETTINGS, root / SETTINGS))
+    return Recording(path, (path,), (next_to, path.parent / SETTINGS, root / SETTINGS))
 
 
 def _folder_recording(folder: Path, root: Path) -> Recording:
     settings = (folder / SETTINGS, folder.parent / f"{folder.name}.{SETTINGS}", root / SETTINGS)
-    return Recording(folder.name, folder, tuple(sorted(_bags(folder), key=_part)), settings)
-
-
-def _loose(folder: Path) -> list[Recording]:
-    """Find the recordings among the bags that lie in a folder."""
-    groups: dict[tuple[str, str], list[Path]] = {}
-    for path in _bags(folder):
-        match = _SPLIT.match(path.stem)
-        key = (match["name"] or folder.name) if match else path.stem
-        groups.setdefault((key, path.suffix.lower()), []).append(path)
-    found = []
-    for (name, _), paths in groups.items():
-        parts = sorted(paths, key=_part)
-        numbers = [_part(p) for p in parts]
-        if len(parts) > 1 and numbers[0] == 0 and len(set(numbers)) == len(numbers):
-            settings = (folder / f"{name}.{SETTINGS}", folder / SETTINGS)
-            found.append(Recording(name, folder, tuple(parts), settings))
-        else:
-            found += [_file_recording(p, folder) for p in parts]
-    # Files of one name in two formats would hide each other.
-    stems = [r.name for r in found]
-    return [Recording(r.files[0].name, r.place, r.files, r.settings) if stems.count(r.name) > 1 else r for r in found]
+    return Recording(folder, tuple(_bags(folder)), settings)
 
 
 def _part(path: Path) -> int:
@@ -170,7 +166,7 @@ class Bag:
     def __init__(self, recording: Recording) -> None:
         self.place, self.notes = recording.place, list[str]()
         paths, compression = recorded_files(recording, self.notes)
-        self.files: list[Container] = []
+        self.files: list[ChunkedFile | SqliteBag] = []
         for path in paths:
             try:
                 self.files.append(open_container(path, compression))
@@ -233,9 +229,12 @@ class Bag:
         """Name of the frame in the header of the first message that can be read; "" without one."""
         for i in range(len(topic)):
             try:
-                return frame_of(self.read(topic, i, NAME_BYTES), topic.encoding)
+                head = self.read(topic, i, NAME_BYTES)
+                (size,) = struct.unpack_from(_order(head, topic.encoding) + "I", head, STAMP.stop)
             except (RecordError, struct.error, IndexError):
                 continue
+            name = head[STAMP.stop + 4 : STAMP.stop + 4 + size].rstrip(b"\0").decode("utf-8", "replace")
+            return printable(name).lstrip("/")
         return ""
 
     def _join(self) -> dict[str, Topic]:
@@ -266,20 +265,18 @@ class Bag:
         return topics
 
 
-def open_container(path: Path, compression: str = "") -> Container:
+def open_container(path: Path, compression: str = "") -> ChunkedFile | SqliteBag:
     """Open one file of a recording by its magic bytes; `LogError` for anything else."""
-    from log2sim.logs.ros import rosbag1, rosbag2
-
     with open_regular(path) as stream:
         head = stream.read(16)
     if not head:
         raise LogError(f"{path}: is empty; expected a ROS bag or an MCAP file")
     if head.startswith(b"#ROSBAG"):
-        return rosbag1.Rosbag1(path)
-    if head.startswith(rosbag2.MAGIC):
-        return rosbag2.Mcap(path)
-    if head == rosbag2.SQLITE_MAGIC:
-        return rosbag2.SqliteBag(path, compression)
+        return Rosbag1(path)
+    if head.startswith(MAGIC):
+        return Mcap(path)
+    if head == SQLITE_MAGIC:
+        return SqliteBag(path, compression)
     raise LogError(f"{path}: neither a ROS 1 bag nor MCAP nor an SQLite database by its first bytes")
 
 
@@ -287,13 +284,6 @@ def stamp_of(head: bytes, encoding: str) -> int:
     """Stamp in ns of a message that begins with a header."""
     seconds, nanoseconds = struct.unpack(_order(head, encoding) + "iI", head[STAMP])
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-def frame_of(head: bytes, encoding: str) -> str:
-    """Return the frame_id of a message that begins with a header."""
-    (size,) = struct.unpack_from(_order(head, encoding) + "I", head, STAMP.stop)
-    name = head[STAMP.stop + 4 : STAMP.stop + 4 + size].rstrip(b"\0").decode("utf-8", "replace")
-    return printable(name).lstrip("/")
 
 
 def _order(head: bytes, encoding: str) -> str:

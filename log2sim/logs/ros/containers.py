@@ -1,24 +1,29 @@
-"""Files of chunks with channels and messages: what ROS 1 bags, MCAP and SQLite recordings have in common."""
+"""Files of chunks with channels and messages, and the oldest of them: ROS 1 bags, format 2.0.
+
+Bags (http://wiki.ros.org/Bags/Format/2.0) are read by their index, or by all chunks where it is missing.
+"""
 
 from __future__ import annotations
 
 import bz2
 import importlib
 import os
+import struct
 import threading
 import weakref
 import zlib
+from array import array
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.errors import MissingExtra
+from log2sim.errors import LogError, MissingExtra
 from log2sim.files.inputs import open_regular
 from log2sim.logs.records import PARSER_ERRORS
 
@@ -47,56 +52,6 @@ class Entries:
     t_ns: NDArray[np.int64]  # (M,): when the recorder received the message
     chunk: NDArray[np.int32]  # (M,): index into the chunks; -1 for a message outside of chunks
     place: NDArray[np.int64]  # (M,): where it begins: a byte of its chunk or file, or a row of a database
-
-
-class Container(Protocol):
-    """One file of a recording; `message` may be called from several threads at once."""
-
-    path: Path
-    channels: list[Channel]
-    entries: Entries
-    notes: list[str]
-
-    def message(self, k: int, limit_bytes: int | None = None) -> bytes:
-        """Read message `k`, or its first `limit_bytes`; raise one of `sweeps.PARSER_ERRORS` where it is damaged.
-
-        With a limit, chunks are unpacked only as far as needed, and their checksums are not checked; reading messages in
-        their order is then fastest.
-        """
-
-
-class EntryList:
-    """Index under construction, in blocks of numpy arrays."""
-
-    def __init__(self) -> None:
-        self._blocks: list[tuple[NDArray[np.int64], ...]] = []
-        self._rows: list[tuple[int, int, int, int]] = []
-        self.count = 0
-
-    def add(self, channel: int, t_ns: int, chunk: int, place: int) -> None:
-        """Append one message."""
-        self._grow(1)
-        if not 0 <= t_ns < 1 << 63:
-            raise ValueError(f"the recorder's stamp is {t_ns}, no time in ns")
-        self._rows.append((channel, t_ns, chunk, place))
-
-    def add_block(self, channel: int, t_ns: NDArray[np.int64], chunk: int, place: NDArray[np.int64]) -> None:
-        """Append messages of one channel that lie in one chunk."""
-        self._grow(len(t_ns))
-        self._blocks.append((np.full(len(t_ns), channel), t_ns, np.full(len(t_ns), chunk), place))
-
-    def entries(self) -> Entries:
-        """Return the index, ordered by chunk and place."""
-        rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
-        columns = [np.concatenate([rows[:, c], *(b[c] for b in self._blocks)]) for c in range(4)]
-        order = np.lexsort((columns[3], columns[2]))
-        channel, t_ns, chunk, place = (column[order] for column in columns)
-        return Entries(channel.astype(np.int32), t_ns, chunk.astype(np.int32), place)
-
-    def _grow(self, count: int) -> None:
-        self.count += count
-        if self.count > MAX_MESSAGES:
-            raise ValueError(f"more than the {MAX_MESSAGES} messages that a file may have")
 
 
 @lru_cache(maxsize=4096)
@@ -143,7 +98,7 @@ class Chunk(NamedTuple):
 
 
 class ChunkedFile:
-    """Reads ranges of a file and of the unpacked chunks in it, from any thread."""
+    """Reads messages, ranges of a file, and the unpacked chunks in it, from any thread."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -170,16 +125,29 @@ class ChunkedFile:
             self._scan()
         if problem:
             self.notes.append(
-                f"{self.path.name}: its index is missing or damaged ({problem}); {self._list.count} messages were found by reading it "
-                "whole"
+                f"{self.path.name}: its index is missing or damaged ({problem}); {self._count()} messages were found by reading it whole"
             )
-        self.entries = self._list.entries()
+        rows = np.frombuffer(self._index, dtype=np.int64).reshape(-1, 4)
+        channel, t_ns, chunk, place = rows[np.lexsort((rows[:, 3], rows[:, 2]))].T
+        self.entries = Entries(channel.astype(np.int32), t_ns, chunk.astype(np.int32), place)
 
     def _begin(self) -> None:
         """Forget what was found."""
         self.channels: list[Channel] = []
         self._numbers: dict[int, int] = {}  # of the channels, by their number in the file
-        self._list, self.chunks = EntryList(), []
+        self._index, self.chunks = array("q"), []
+
+    def _add(self, channel: int, t_ns: Any, chunk: int, place: Any) -> None:
+        """Add messages of one channel in one chunk to the index, by their stamps and places (N,) or those of one."""
+        rows = np.empty((np.size(t_ns), 4), dtype=np.int64)
+        for column, value in enumerate((channel, t_ns, chunk, place)):
+            rows[:, column] = value
+        self._index.frombytes(rows.tobytes())
+        if self._count() > MAX_MESSAGES:
+            raise ValueError(f"more than the {MAX_MESSAGES} messages that a file may have")
+
+    def _count(self) -> int:
+        return len(self._index) // 4
 
     def _read_index(self) -> bool:
         """Read the index; return whether it leads to all messages."""
@@ -188,6 +156,28 @@ class ChunkedFile:
     def _scan(self) -> None:
         """Find all messages by walking the file, up to where it is cut."""
         raise NotImplementedError
+
+    def _locate(self, chunk: int, place: int, *, ahead: bool) -> tuple[int, int]:
+        """Return where the data of a message begin, and their size, by the head of its record at a place."""
+        raise NotImplementedError
+
+    def message(self, k: int, limit_bytes: int | None = None) -> bytes:
+        """Read message `k`, or its first `limit_bytes`; raise one of `PARSER_ERRORS` where it is damaged.
+
+        With a limit, chunks are unpacked only as far as needed, and their checksums are not checked; reading messages in
+        their order is then fastest. It may be called from several threads at once.
+        """
+        chunk, ahead = int(self.entries.chunk[k]), limit_bytes is not None
+        position, size = self._locate(chunk, int(self.entries.place[k]), ahead=ahead)
+        wanted = checked_size(size)
+        if limit_bytes is not None:
+            wanted = min(wanted, limit_bytes)
+        elif chunk >= 0 and self.chunks[chunk].crc and chunk not in self._intact:
+            self.unpacked(chunk)  # checks the CRC
+        data = self.within(chunk, position, wanted, ahead=ahead) if wanted else b""
+        if len(data) != wanted:
+            raise ValueError(f"{len(data)} of {wanted} bytes; the chunk is truncated")
+        return data
 
     def at(self, position: int, count: int) -> bytes:
         """Read `count` bytes; `ValueError` where the file ends before."""
@@ -278,11 +268,6 @@ class ChunkedFile:
                 f"a chunk of {chunk.stored_bytes} bytes that says to unpack to {chunk.size_bytes}, more than {MAX_RATIO} times as many"
             )
 
-    def check(self, chunk: int) -> None:
-        """Check the CRC of a chunk that has one, once; `ValueError` where it is wrong."""
-        if chunk >= 0 and self.chunks[chunk].crc and chunk not in self._intact:
-            self.unpacked(chunk)
-
 
 @dataclass
 class _PartialChunk:
@@ -294,16 +279,6 @@ class _PartialChunk:
     data: bytearray = field(default_factory=bytearray)
 
 
-def decompress_message(data: bytes, method: str, limit_bytes: int | None) -> bytes:
-    """Decompress a message that was compressed by itself, or its first `limit_bytes`."""
-    if not method:
-        return data
-    most = MAX_MESSAGE_BYTES + 1 if limit_bytes is None else limit_bytes
-    unpacked = unpack_part(decompressor_of(method), data, most)
-    checked_size(len(unpacked))
-    return unpacked
-
-
 def unpack_part(decompressor: Any, data: bytes, limit_bytes: int) -> bytes:
     """Unpack the next part of compressed data into at most `limit_bytes`; `ValueError` where it is damaged."""
     try:
@@ -313,7 +288,7 @@ def unpack_part(decompressor: Any, data: bytes, limit_bytes: int) -> bytes:
 
 
 def decompressor_of(method: str) -> Any:
-    """Decompressor of a method; `MissingExtra` where its library is not installed."""
+    """Return the decompressor of a method; `MissingExtra` where its library is not installed."""
     if method == "bz2":
         return bz2.BZ2Decompressor()
     # Python has zstd from 3.14 on.
@@ -325,3 +300,167 @@ def decompressor_of(method: str) -> Any:
     if names:
         raise MissingExtra(f"reading {method} compression of a bag", "ros")
     raise ValueError(f"unknown compression '{method[:20]}'; known: none, bz2, lz4, zstd")
+
+
+MAGIC = b"#ROSBAG V2.0\n"
+MAX_HEADER_BYTES = 1024 * 1024
+MAX_INDEX_BYTES = 256 * 1024 * 1024
+MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+# A record begins with its header; that of a message is about 40 bytes.
+FIRST_BYTES = 512
+
+
+class Record(NamedTuple):
+    """A record of a ROS 1 bag: fields of its header, and where its data lie."""
+
+    fields: dict[bytes, bytes]
+    position: int
+    size: int
+
+    @property
+    def op(self) -> int:
+        """Kind of the record."""
+        return self.fields[b"op"][0]
+
+    @property
+    def end(self) -> int:
+        """Where the next record begins."""
+        return self.position + self.size
+
+    def number(self, name: bytes, code: str = "<I") -> int:
+        """Return a number of the header."""
+        return int(struct.unpack(code, self.fields[name])[0])
+
+
+class Rosbag1(ChunkedFile):
+    """A ROS 1 bag."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        if self.size < len(MAGIC) or self.at(0, len(MAGIC)) != MAGIC:
+            raise LogError(f"{path}: does not begin with '#ROSBAG V2.0'; expected a ROS 1 bag of that version")
+        self.index()
+
+    def _locate(self, chunk: int, place: int, *, ahead: bool) -> tuple[int, int]:
+        record = parse_record(self.within(chunk, place, FIRST_BYTES, ahead=ahead), 0, place)
+        if record.op != MESSAGE:
+            raise ValueError("no message where the index says so")
+        return record.position, record.size
+
+    def _record(self, position: int) -> Record:
+        return parse_record(self.at(position, min(FIRST_BYTES, self.size - position)), 0, position, self)
+
+    def _read_index(self) -> bool:
+        header = self._record(len(MAGIC))
+        position = header.number(b"index_pos", "<Q")
+        if not position:
+            raise ValueError("the recording was not closed")
+        for _ in range(header.number(b"conn_count")):
+            record = self._record(position)
+            self._add_connection(record, self.at(record.position, record.size))
+            position = record.end
+        for _ in range(header.number(b"chunk_count")):
+            record = self._record(position)
+            if record.op != CHUNK_INFO:
+                raise ValueError(f"record of kind {record.op} in the index, expected {CHUNK_INFO}")
+            self._index_chunk(record.number(b"chunk_pos", "<Q"), record.number(b"count"))
+            position = record.end
+        return True
+
+    def _index_chunk(self, position: int, connections: int) -> None:
+        """Read the index of one chunk; a damaged one is left out with a note."""
+        try:
+            record = self._record(position)
+            number = self._add_chunk(record)
+            position = record.end
+            for _ in range(connections):
+                record = self._record(position)
+                if record.op != INDEX or record.size > MAX_INDEX_BYTES:
+                    raise ValueError("its index is damaged")
+                data = np.frombuffer(self.at(record.position, record.size), "<u4")
+                seconds, nanoseconds, offset = data.reshape(-1, 3).astype(np.int64).T
+                channel = self._numbers[record.number(b"conn")]
+                self._add(channel, seconds * 1_000_000_000 + nanoseconds, number, offset)
+                position = record.end
+        except PARSER_ERRORS as problem:
+            self.notes.append(f"{self.path.name}: the chunk at byte {position} cannot be read: {one_line(problem)}")
+
+    def _add_chunk(self, record: Record) -> int:
+        compression = record.fields[b"compression"].decode("ascii", "replace")
+        self.chunks.append(Chunk(record.position, record.size, record.number(b"size"), compression))
+        return len(self.chunks) - 1
+
+    def _add_connection(self, record: Record, data: bytes) -> None:
+        if record.op != CONNECTION:
+            raise ValueError(f"record of kind {record.op}, expected {CONNECTION}")
+        number, fields = record.number(b"conn"), parse_fields(data)
+        if number in self._numbers:
+            return
+        self._numbers[number] = len(self.channels)
+        # The topic in the record's header is the one that it was recorded under.
+        described = {**fields, **{k: v for k, v in record.fields.items() if k == b"topic"}}
+        topic, kind, definition = (
+            described.get(key, b"").decode("utf-8", "replace") for key in (b"topic", b"type", b"message_definition")
+        )
+        self.channels.append(Channel(printable(topic), normalized_type(kind), "ros1", definition))
+
+    def _scan(self) -> None:
+        position = len(MAGIC)
+        while position < self.size:
+            try:
+                record = self._record(position)
+                if record.op == CONNECTION:
+                    self._add_connection(record, self.at(record.position, record.size))
+                elif record.op == CHUNK:
+                    self._walk(self._add_chunk(record))
+            except PARSER_ERRORS as problem:
+                self.notes.append(f"{self.path.name}: unreadable from byte {position}: {one_line(problem)}")
+                return
+            position = record.end
+
+    def _walk(self, number: int) -> None:
+        chunk = self.chunks[number]
+        if chunk.compression == "none" and chunk.position + chunk.stored_bytes > self.size:
+            data = self.at(chunk.position, self.size - chunk.position)
+        else:
+            data = self.unpacked(number)
+        position = 0
+        while position < len(data):
+            record = parse_record(data, position, position)
+            if record.end > len(data):
+                raise ValueError("the last chunk is truncated")
+            if record.op == CONNECTION:
+                self._add_connection(record, data[record.position : record.end])
+            elif record.op == MESSAGE:
+                seconds, nanoseconds = struct.unpack("<II", record.fields[b"time"])
+                channel = self._numbers[record.number(b"conn")]
+                self._add(channel, seconds * 1_000_000_000 + nanoseconds, number, position)
+            position = record.end
+
+
+def parse_record(data: bytes, start: int, position: int, file: ChunkedFile | None = None) -> Record:
+    """Parse a record that begins at `start` of data and at `position` of its file or chunk; `file` has longer headers."""
+    (size,) = struct.unpack_from("<I", data, start)
+    if size > MAX_HEADER_BYTES:
+        raise ValueError(f"header of {size} bytes at byte {position}")
+    if start + 8 + size > len(data):
+        if file is None:
+            raise ValueError(f"header of {size} bytes at byte {position} is truncated")
+        data, start = file.at(position, 8 + size), 0
+    fields = parse_fields(data[start + 4 : start + 4 + size])
+    if len(fields.get(b"op", b"")) != 1:
+        raise ValueError(f"no record at byte {position}")
+    return Record(fields, position + 8 + size, int(struct.unpack_from("<I", data, start + 4 + size)[0]))
+
+
+def parse_fields(data: bytes) -> dict[bytes, bytes]:
+    """Parse fields "name=value", each after its length."""
+    fields, position = {}, 0
+    while position < len(data):
+        (size,) = struct.unpack_from("<I", data, position)
+        name, equals, value = data[position + 4 : position + 4 + size].partition(b"=")
+        if not equals or position + 4 + size > len(data):
+            raise ValueError("a header without 'name=value'")
+        fields[name] = value
+        position += 4 + size
+    return fields

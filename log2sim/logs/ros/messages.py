@@ -10,7 +10,7 @@ import re
 import struct
 import threading
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -64,9 +64,7 @@ class Intrinsics(Section):
         lengths = DISTORTION_LENGTHS[self.distortion_model]
         if len(self.distortion) not in lengths:
             expected = " or ".join(map(str, lengths))
-            raise ValueError(
-                f"distortion has {len(self.distortion)} values, '{self.distortion_model}' takes {expected}"
-            )
+            raise ValueError(f"distortion has {len(self.distortion)} values; '{self.distortion_model}': {expected}")
         return self
 
 
@@ -192,8 +190,6 @@ def read_settings(places: Iterable[Path]) -> tuple[TopicSettings, Path | None]:
         raise ConfigError(f"{path}: {first_problem(problem, TopicSettings)}") from None
 
 
-# Delays between sensor and recorder are seconds at most; a larger one is another clock.
-MAX_CLOCK_DIFFERENCE_S = 10.0
 MIN_POSES = 2
 # A topic of single goals or starting points is no trajectory.
 MIN_COVERED_SHARE = 0.5
@@ -245,21 +241,6 @@ def describe_uncovered(t_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> s
         return describe_gap(poses, sensors)
     seconds = f"{covered_ns / NS_PER_S:.1f} of {(end_ns - begin_ns) / NS_PER_S:.1f} s"
     return f"it gives {len(t_ns)} poses in {seconds} of the sensors"
-
-
-def note_other_clocks(delays_s: Mapping[str, float | None], notes: list[str]) -> None:
-    """Note topics whose header stamps are of another clock than most, by their delay to the recorder."""
-    known = {name: delay for name, delay in delays_s.items() if delay is not None}
-    if not known:
-        return
-    # The middle one by size: of two, that of the recorder's clock.
-    usual_s = sorted(known.values(), key=abs)[(len(known) - 1) // 2]
-    for name, delay_s in known.items():
-        if abs(delay_s - usual_s) > MAX_CLOCK_DIFFERENCE_S:
-            notes.append(
-                f"{name}: its header stamps are {delay_s - usual_s:.1f} s off those of the other topics, so its clock is "
-                'not synchronized; with stamps = "recorded" in the settings those of the recorder are used'
-            )
 
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")

@@ -26,10 +26,11 @@ from log2sim.logs.ros.containers import (
     ChunkedFile,
     Entries,
     checked_size,
-    decompress_message,
+    decompressor_of,
     normalized_type,
     one_line,
     printable,
+    unpack_part,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -50,22 +51,11 @@ class Mcap(ChunkedFile):
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self.index()
 
-    def message(self, k: int, limit_bytes: int | None = None) -> bytes:
-        """Read message `k`, or its first `limit_bytes`."""
-        chunk, place = int(self.entries.chunk[k]), int(self.entries.place[k])
-        ahead = limit_bytes is not None
+    def _locate(self, chunk: int, place: int, *, ahead: bool) -> tuple[int, int]:
         op, size, *_ = MESSAGE_HEAD.unpack(self.within(chunk, place, MESSAGE_HEAD.size, ahead=ahead))
         if op != MESSAGE or size < 22:
             raise ValueError("no message where the index says so")
-        wanted = checked_size(size - 22)
-        if limit_bytes is None:
-            self.check(chunk)
-        else:
-            wanted = min(wanted, limit_bytes)
-        data = self.within(chunk, place + MESSAGE_HEAD.size, wanted, ahead=ahead) if wanted else b""
-        if len(data) != wanted:
-            raise ValueError(f"{len(data)} of {wanted} bytes; the chunk is truncated")
-        return data
+        return place + MESSAGE_HEAD.size, size - 22
 
     def _read_index(self) -> bool:
         footer = self.at(self.size - FOOTER_BYTES, FOOTER_BYTES)
@@ -91,7 +81,7 @@ class Mcap(ChunkedFile):
         for data in chunks:
             self._index_chunk(data)
         # Messages may also lie between the chunks, where no index leads.
-        return expected in (None, self._list.count) or bool(self.notes)
+        return expected in (None, self._count()) or bool(self.notes)
 
     def _small(self, position: int, size: int) -> bytes:
         if size > MAX_RECORD_BYTES:
@@ -124,23 +114,20 @@ class Mcap(ChunkedFile):
         try:
             self._add_chunk(start)
             for offset in offsets:
-                self._index_messages(number, offset)
+                op, size = RECORD_HEAD.unpack(self.at(offset, RECORD_HEAD.size))
+                if op != MESSAGE_INDEX:
+                    raise ValueError("its index is damaged")
+                index = self._small(offset, size)
+                channel, length = struct.unpack_from("<HI", index)
+                pairs = np.frombuffer(index[6 : 6 + length], "<u8").reshape(-1, 2).astype(np.int64)
+                self._add(self._numbers[channel], pairs[:, 0], number, pairs[:, 1])
             if not offsets:
                 self._walk(number)
         except PARSER_ERRORS as problem:
             self.notes.append(f"{self.path.name}: the chunk at byte {start} cannot be read: {one_line(problem)}")
 
-    def _index_messages(self, chunk: int, position: int) -> None:
-        op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
-        if op != MESSAGE_INDEX:
-            raise ValueError("its index is damaged")
-        data = self._small(position, size)
-        channel, length = struct.unpack_from("<HI", data)
-        pairs = np.frombuffer(data[6 : 6 + length], "<u8").reshape(-1, 2).astype(np.int64)
-        self._list.add_block(self._numbers[channel], pairs[:, 0], chunk, pairs[:, 1])
-
-    def _add_chunk(self, position: int) -> int:
-        """Add the chunk whose record begins at a byte; return where that record ends."""
+    def _add_chunk(self, position: int) -> None:
+        """Add the chunk whose record begins at a byte."""
         op, size = RECORD_HEAD.unpack(self.at(position, RECORD_HEAD.size))
         if op != CHUNK:
             raise ValueError("no chunk where the index says so")
@@ -150,7 +137,6 @@ class Mcap(ChunkedFile):
         compression, offset = _text(head, CHUNK_HEAD.size)
         (stored,) = struct.unpack_from("<Q", head, offset)
         self.chunks.append(Chunk(start + offset + 8, stored, unpacked, compression, crc))
-        return int(start + size)
 
     def _scan(self) -> None:
         position = len(MAGIC)
@@ -174,7 +160,9 @@ class Mcap(ChunkedFile):
 
     def _add_message(self, head: bytes, chunk: int, place: int) -> None:
         _, _, channel, _, t_ns, _ = MESSAGE_HEAD.unpack(head)
-        self._list.add(self._numbers[channel], t_ns, chunk, place)
+        if t_ns >= 1 << 63:
+            raise ValueError(f"the recorder's stamp is {t_ns}, no time in ns")
+        self._add(self._numbers[channel], t_ns, chunk, place)
 
     def _walk(self, number: int) -> None:
         data, position = self.unpacked(number), 0
@@ -205,7 +193,7 @@ COMPRESSED_HEAD_BYTES = 129 * 1024
 
 
 class SqliteBag:
-    """A rosbag2 database; `compression` is that of each message ("" or "zstd")."""
+    """A rosbag2 database; `compression` is that of each message ("" or "zstd"). The rest is as of a `ChunkedFile`."""
 
     def __init__(self, path: Path, compression: str = "") -> None:
         self.path = path
@@ -241,7 +229,10 @@ class SqliteBag:
                 data = blob.read(size if wanted is None else min(size, wanted))
         except sqlite3.Error as problem:
             raise ValueError(f"the database cannot be read there: {one_line(problem)}") from None
-        return decompress_message(data, compression, limit_bytes)
+        if compression:
+            data = unpack_part(decompressor_of(compression), data, limit_bytes or MAX_MESSAGE_BYTES + 1)
+            checked_size(len(data))
+        return data
 
     def _open(self) -> None:
         self._process = os.getpid()
@@ -270,13 +261,9 @@ class SqliteBag:
         rows = list(database.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id"))
         self.channels = [
             Channel(
-                printable(str(topic)),
-                normalized_type(str(kind)),
-                printable(str(encoding)),
-                definitions.get(str(kind), ""),
-                compression,
+                printable(topic), normalized_type(kind), printable(encoding), definitions.get(kind, ""), compression
             )
-            for _, topic, kind, encoding in rows
+            for topic, kind, encoding in ((str(text) for text in row[1:]) for row in rows)
         ]
         table: NDArray[np.int64] = np.fromiter(chain.from_iterable(self._rows()), dtype=np.int64).reshape(-1, 3)
         numbers = {int(row[0]): k for k, row in enumerate(rows)}
@@ -305,5 +292,5 @@ class SqliteBag:
             self.notes.append(f"{self.path.name}: damaged after {count} messages: {one_line(problem)}")
         if odd:
             self.notes.append(
-                f"{self.path.name}: {odd} of {count} messages have no whole number as topic or stamp; left out"
+                f"{self.path.name}: {odd} of {count} messages without whole numbers as topic and stamp; left out"
             )

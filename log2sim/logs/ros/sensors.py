@@ -17,8 +17,8 @@ from log2sim.logs.ros import messages
 from log2sim.logs.ros.bag import Bag
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.messages import CameraTopic, LidarTopic, Stamped, decode
-from log2sim.logs.ros.roles import COMPRESSED
 
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 BROWN, FISHEYE = ("plumb_bob", "rational_polynomial", "radtan", ""), ("equidistant", "fisheye", "kannala_brandt4")
 ROTATION_TOLERANCE = 1e-3
 
@@ -67,7 +67,7 @@ def camera_from_info(
 
 
 def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
-    values = np.asarray(_field(info, "D"), dtype=np.float64).ravel()
+    values = _values(info, "D")
     kind = printable(info.distortion_model).strip().lower()
     if not values.any():
         return "none", ()
@@ -75,26 +75,23 @@ def _lens(info: Any) -> tuple[str, tuple[float, ...]]:
         raise CalibrationProblem("its distortion is not finite")
     limit = 8 if kind in BROWN else 4
     if kind not in BROWN + FISHEYE or values[limit:].any():
-        raise CalibrationProblem(
-            f"its distortion model '{kind}' with {len(values)} values is not read; known: {', '.join((*BROWN[:2], FISHEYE[0]))}"
-        )
-    values = values[:limit]
-    if kind in FISHEYE:
-        return "fisheye", tuple(np.append(values, np.zeros(4 - len(values))).tolist())
-    length = next(n for n in (4, 5, 8) if n >= len(values))
-    return "brown", tuple(np.append(values, np.zeros(length - len(values))).tolist())
+        known = ", ".join((*BROWN[:2], FISHEYE[0]))
+        raise CalibrationProblem(f"its distortion model '{kind}' with {len(values)} values is not read; known: {known}")
+    length = 4 if kind in FISHEYE else next(n for n in (4, 5, 8) if n >= len(values[:limit]))
+    padded = (*values[:limit].tolist(), *[0.0] * length)
+    return "fisheye" if kind in FISHEYE else "brown", padded[:length]
 
 
 def _matrix(info: Any, name: str, shape: tuple[int, int]) -> Array:
-    values = np.asarray(_field(info, name), dtype=np.float64)
+    values = _values(info, name)
     if values.size != shape[0] * shape[1]:
         raise CalibrationProblem(f"{name} has {values.size} values, expected {shape[0] * shape[1]}")
     return values.reshape(shape)
 
 
-def _field(info: Any, name: str) -> Any:
-    """Return D, K, R or P, which ROS 2 writes in lower case."""
-    return getattr(info, name if hasattr(info, name) else name.lower())
+def _values(info: Any, name: str) -> Array:
+    """Return the numbers of D, K, R or P, which ROS 2 writes in lower case."""
+    return np.asarray(getattr(info, name if hasattr(info, name) else name.lower()), dtype=np.float64).ravel()
 
 
 # Encodings of sensor_msgs/image_encodings.hpp: channels, bytes of each, conversion of OpenCV to BGR.
@@ -140,16 +137,6 @@ def image_from(message: Any, where: str, size_px: tuple[int, int]) -> NDArray[np
     return np.asarray(image, dtype=np.uint8)
 
 
-def encoded_from(message: Any, where: str) -> bytes:
-    """Return the JPEG or PNG file in a CompressedImage; `RecordError` for anything else."""
-    data: bytes = np.asarray(message.data, dtype=np.uint8).tobytes()
-    try:
-        image_size(data, where)
-    except RecordError as error:
-        raise RecordError(f"{error} (its format states '{printable(message.format)}')") from None
-    return data
-
-
 # sensor_msgs/PointField: datatypes 1 to 8.
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 TIME_FIELDS = (
@@ -192,7 +179,18 @@ def point_table(message: Any, where: str) -> NDArray[Any]:
     data = np.asarray(message.data, dtype=np.uint8)
     if height * width > MAX_SWEEP_POINTS:
         raise RecordError(f"{where}: {height * width} points, more than the {MAX_SWEEP_POINTS} that a sweep may have")
-    dtype = _dtype(message, step, where)
+    order = ">" if message.is_bigendian else "<"
+    layout: dict[str, tuple[str, int]] = {}
+    for point_field in message.fields:
+        code = DATATYPES.get(int(point_field.datatype))
+        count, name = max(1, int(point_field.count)), printable(point_field.name)
+        if code is not None and count <= step and name and name not in layout:
+            layout[name] = order + code if count == 1 else f"({count},){order}{code}", int(point_field.offset)
+    formats, offsets = zip(*layout.values()) if layout else ((), ())
+    try:
+        dtype = np.dtype({"names": [*layout], "formats": formats, "offsets": offsets, "itemsize": step})
+    except (ValueError, TypeError) as problem:
+        raise RecordError(f"{where}: the fields of the points do not fit into {step} bytes: {problem}") from None
     needed = (height - 1) * row_step + width * step if height and width else 0
     if row_step < width * step or len(data) < needed or (needed and not step):
         raise RecordError(
@@ -205,23 +203,6 @@ def point_table(message: Any, where: str) -> NDArray[Any]:
         return np.frombuffer(data[:needed], dtype)
     rows = np.lib.stride_tricks.as_strided(data, (height, width * step), (row_step, 1))
     return np.frombuffer(np.ascontiguousarray(rows), dtype)
-
-
-def _dtype(message: Any, step: int, where: str) -> np.dtype[Any]:
-    order = ">" if message.is_bigendian else "<"
-    names, formats, offsets = [], [], []
-    for point_field in message.fields:
-        code = DATATYPES.get(int(point_field.datatype))
-        count, name = max(1, int(point_field.count)), printable(point_field.name)
-        if code is None or count > step or not name or name in names:
-            continue
-        names.append(name)
-        formats.append(order + code if count == 1 else f"({count},){order}{code}")
-        offsets.append(int(point_field.offset))
-    try:
-        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
-    except (ValueError, TypeError) as problem:
-        raise RecordError(f"{where}: the fields of the points do not fit into {step} bytes: {problem}") from None
 
 
 def offsets_ns(values: NDArray[Any], t_ns: int, period_ns: float, settings: LidarTopic) -> NDArray[np.int64] | None:
@@ -261,18 +242,21 @@ def camera_stream(bag: Bag, chosen: CameraTopic, stamped: Stamped, camera: Camer
     compressed = topic.msgtype == COMPRESSED
 
     def encoded(i: int) -> bytes:
-        row = int(stamped.row[i])
-        return encoded_from(decode(bag, topic, row), bag.where(topic, row))
+        where = bag.where(topic, int(stamped.row[i]))
+        message = decode(bag, topic, int(stamped.row[i]))
+        data: bytes = np.asarray(message.data, dtype=np.uint8).tobytes()
+        try:
+            # The first bytes decide what it is, as drivers write any text as its format.
+            image_size(data, where)
+        except RecordError as error:
+            raise RecordError(f"{error} (its format states '{printable(message.format)}')") from None
+        return data
 
     def read(i: int) -> NDArray[np.uint8]:
         row = int(stamped.row[i])
-        where = bag.where(topic, row)
-        # The first bytes decide what a compressed one is, as drivers write any text as its format.
-        return (
-            decode_image(encoded(i), where, size_px)
-            if compressed
-            else image_from(decode(bag, topic, row), where, size_px)
-        )
+        if compressed:
+            return decode_image(encoded(i), bag.where(topic, row), size_px)
+        return image_from(decode(bag, topic, row), bag.where(topic, row), size_px)
 
     return Stream(camera.name, stamped.t_ns, read, encoded if compressed else None)
 

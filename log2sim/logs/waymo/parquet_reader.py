@@ -9,6 +9,7 @@ images are read row by row.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,6 @@ from log2sim.logs.waymo.segment import (
     LaserCalibration,
     RangeImages,
     Segment,
-    are_usable,
     rigid,
 )
 
@@ -84,15 +84,14 @@ def read_camera_calibration(path: Path) -> dict[int, CameraCalibration]:
         path, {CAMERA: "text", extrinsic: "floats", **dict.fromkeys(INTRINSICS, "float"), **dict.fromkeys(whole, "int")}
     )
     out = {}
-    for row, number in enumerate(numbers_of(columns[CAMERA], CAMERAS)):
+    for row, number in enumerate(numbers_of(columns[CAMERA], CAMERAS).tolist()):
         intrinsic = np.array([columns[name][row] for name in INTRINSICS], dtype=np.float64)
-        pose = matrix(columns[extrinsic][row])
-        width, height, direction = (int(columns[name][row]) for name in whole)
-        if pose is None or not are_usable(intrinsic, width, height):
-            raise LogError(
-                f"{path}, row {row}: expected finite intrinsics, a rigid extrinsic, width and height of camera {number}"
-            )
-        out[int(number)] = CameraCalibration(intrinsic, pose, width, height, direction)
+        pose, sizes = matrix(columns[extrinsic][row]), (int(columns[name][row]) for name in whole)
+        camera = None if pose is None else CameraCalibration(intrinsic, pose, *sizes)
+        if camera is None or not camera.is_usable:
+            expected = f"expected finite intrinsics, a rigid extrinsic, width and height of camera {number}"
+            raise LogError(f"{path}, row {row}: {expected}")
+        out[number] = camera
     return out
 
 
@@ -100,13 +99,10 @@ def read_laser_calibration(path: Path) -> dict[int, LaserCalibration]:
     """Read the calibration of the LiDARs by number."""
     extrinsic, values = f"{LASER_PREFIX}.extrinsic.transform", f"{LASER_PREFIX}.beam_inclination.values"
     limits = [f"{LASER_PREFIX}.beam_inclination.{name}" for name in ("min", "max")]
-    columns = read_columns(
-        path,
-        {LASER: "text", extrinsic: "floats", values: "floats", **dict.fromkeys(limits, "float")},
-        optional=(values,),
-    )
+    wanted: dict[str, Kind] = {LASER: "text", extrinsic: "floats", values: "floats", **dict.fromkeys(limits, "float")}
+    columns = read_columns(path, wanted, optional=(values,))
     out = {}
-    for row, number in enumerate(numbers_of(columns[LASER], LASERS)):
+    for row, number in enumerate(numbers_of(columns[LASER], LASERS).tolist()):
         pose = matrix(columns[extrinsic][row])
         cell = columns[values][row] if values in columns else None
         beams = np.zeros(0) if cell is None else np.asarray(cell, dtype=np.float64)
@@ -114,48 +110,24 @@ def read_laser_calibration(path: Path) -> dict[int, LaserCalibration]:
         known = np.isfinite(beams).all() if len(beams) else np.isfinite([low, high]).all()
         if pose is None or not known or len(beams) > MAX_BEAMS:
             raise LogError(f"{path}, row {row}: expected a rigid extrinsic and finite inclinations of LiDAR {number}")
-        out[int(number)] = LaserCalibration(pose, beams, (low, high))
+        out[number] = LaserCalibration(pose, beams, (low, high))
     return out
 
 
-def image_times(columns: Columns, row: int) -> ImageTimes:
-    """Return when the image of a row of the component "camera_image" was taken; NaN counts as unknown."""
-    pose, *times = (columns[name][row] for name in IMAGE_COLUMNS if name not in (STAMP, CAMERA))
-    return ImageTimes(matrix(pose), *(float(s) if np.isfinite(s) else 0.0 for s in times))
-
-
-def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int]) -> BoxTable:
-    """Read 3D labels; `frame_of` gives the index of the frame of a stamp."""
-    center, size = ([f"{prefix}.box.{part}.{axis}" for axis in "xyz"] for part in ("center", "size"))
-    numbers = [*center, *size, f"{prefix}.box.heading"]
-    columns = read_columns(
-        path, {STAMP: "int", "key.laser_object_id": "text", f"{prefix}.type": "int", **dict.fromkeys(numbers, "float")}
-    )
-    return _table(columns, "key.laser_object_id", f"{prefix}.type", numbers, frame_of)
-
-
-def read_image_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int) -> BoxTable:
-    """Read the 2D labels of a camera; `frame_of` gives the index of the frame of a stamp."""
-    numbers = [f"{prefix}.box.{part}.{axis}" for part in ("center", "size") for axis in "xy"]
-    columns = read_columns(
-        path, {STAMP: "int", CAMERA: "text", f"{prefix}.type": "int", **dict.fromkeys(numbers, "float")}
-    )
-    of_camera = numbers_of(columns[CAMERA], CAMERAS) == camera
-    columns = {name: values[of_camera] for name, values in columns.items()}
-    return _table(columns, CAMERA, f"{prefix}.type", numbers, frame_of)
-
-
-def _table(columns: Columns, track: str, kind: str, numbers: list[str], frame_of: Mapping[int, int]) -> BoxTable:
+def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int | None = None) -> BoxTable:
+    """Read 3D labels, or the 2D labels of a camera by number; `frame_of` gives the index of the frame of a stamp."""
+    axes, track = ("xyz", "key.laser_object_id") if camera is None else ("xy", CAMERA)
+    numbers = [f"{prefix}.box.{part}.{axis}" for part in ("center", "size") for axis in axes]
+    numbers += [f"{prefix}.box.heading"] if camera is None else []
+    kind = f"{prefix}.type"
+    columns = read_columns(path, {STAMP: "int", track: "text", kind: "int", **dict.fromkeys(numbers, "float")})
+    if camera is not None:
+        rows = numbers_of(columns[CAMERA], CAMERAS) == camera
+        columns = {name: values[rows] for name, values in columns.items()}
     frame = np.array([frame_of.get(int(t), -1) for t in columns[STAMP]], dtype=np.int64)
-    known = np.flatnonzero(frame >= 0)
     box = np.stack([columns[name].astype(np.float64) for name in numbers], axis=1)
-    dimensions = len(numbers) // 2
-    heading = box[:, -1] if len(numbers) % 2 else np.zeros(len(box))
-    track_id = np.array([str(word) for word in columns[track]], dtype=np.str_)
-    size = box[:, dimensions : 2 * dimensions]
-    lost = len(box) - len(known)
-    table = BoxTable(frame, track_id, columns[kind], box[:, :dimensions], size, heading, lost)
-    return table.take(known)
+    tracks = [str(word) for word in columns[track]]
+    return BoxTable.of(frame, tracks, columns[kind], box, int((frame < 0).sum())).take(np.flatnonzero(frame >= 0))
 
 
 def numbers_of(words: NDArray[Any], names: Mapping[int, str]) -> NDArray[np.int64]:
@@ -170,7 +142,7 @@ def matrix(cell: Any) -> Any:
 
 
 class SensorRows:
-    """A component with one row for each frame and sensor; without any where its file is absent.
+    """A component with one row for each frame and sensor, of which there are none where its file is absent.
 
     `index`: columns to read at once, with the stamp and the sensor. `names`: sensors by number. `frame_of`: index of the frame of a
     stamp in us. `kinds`: what columns hold that are large and read row by row; `optional` of them may be absent.
@@ -193,9 +165,8 @@ class SensorRows:
         frame = np.array([frame_of.get(int(t), -1) for t in self.columns[STAMP]], dtype=np.int64)
         known = np.flatnonzero((frame >= 0) & (sensor > 0))
         self.rows = {(int(frame[row]), int(sensor[row])): int(row) for row in known}
-        if len(self.rows) < len(frame):
-            lost = len(frame) - len(self.rows)
-            self.note = f"{path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out"
+        lost = len(frame) - len(self.rows)
+        self.note = f"{path.parent.name}: {lost} of {len(frame)} rows of no frame and sensor left out" if lost else ""
         # Rows can only be read on: a file with one sensor after the other is read from several places at once.
         by_sensor = bool(np.any(np.diff(frame[known]) < 0))
         shared = ParquetRows(path, kinds, optional=optional)
@@ -206,13 +177,6 @@ class SensorRows:
         """Return the record of a frame and sensor; None where there is no row, `RecordError` for one that cannot be read."""
         row = self.rows.get((frame, sensor))
         return None if row is None else self._files[sensor].read(row)
-
-    def by_frame(self, count: int) -> list[list[int]]:
-        """Return the numbers of the sensors of each of `count` frames."""
-        out: list[list[int]] = [[] for _ in range(count)]
-        for frame, sensor in self.rows:
-            out[frame].append(sensor)
-        return out
 
 
 POSES = "vehicle_pose"
@@ -253,50 +217,50 @@ class _SegmentFolder:
         self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, {f"{IMAGE}.image": "bytes"})
 
     def log(self) -> Log:
-        boxes = self._path_of(LIDAR_BOXES[0])
-        projected, drawn = (self._path_of(c[0]) for c in (PROJECTED_BOXES, CAMERA_BOXES))
         # Boxes projected from 3D labels go before boxes drawn in the images.
-        kind, in_images = (PROJECTED_BOXES if projected else CAMERA_BOXES), projected or drawn
+        boxes, projected, drawn = (
+            partial(read_boxes, self._file(component), prefix, self.frame_of)
+            if is_present(self._file(component))
+            else None
+            for component, prefix in (LIDAR_BOXES, PROJECTED_BOXES, CAMERA_BOXES)
+        )
+        in_images = projected or drawn
+        frames = [FrameRow(t * 1000, pose, {}, ()) for t, pose in zip(self.stamps_us, self.poses)]
+        for (k, number), row in self.images.rows.items():
+            # NaN counts as unknown.
+            pose, *times = (self.images.columns[name][row] for name in IMAGE_COLUMNS if name not in (STAMP, CAMERA))
+            seconds = (float(s) if np.isfinite(s) else 0.0 for s in times)
+            frames[k].images[number] = ImageTimes(matrix(pose), *seconds)
+        for k, number in self.sweeps.rows:
+            frames[k] = replace(frames[k], lasers=(*frames[k].lasers, number))
+        statistics, stats = {}, self._file("stats")
+        if is_present(stats):
+            names: dict[str, Kind] = {f"[StatsComponent].{word}": "text" for word in STATISTICS}
+            columns = read_columns(stats, names, optional=tuple(names))
+            statistics = {name.rpartition(".")[2]: str(values[0]) for name, values in columns.items() if len(values)}
+        files = sorted(self.root.glob(f"*/{self.name}.parquet"))
+        sizes = [f"{file.parent.name} {file.stat().st_size}" for file in files]
         segment = Segment(
             name=self.name,
             path=self.root,
             cameras=read_camera_calibration(self._file("camera_calibration")) if self.images.rows else {},
             lasers=read_laser_calibration(self._file("lidar_calibration")) if self.sweeps.rows else {},
-            frames=self._frames(),
+            frames=frames,
             image=self._image,
             ranges=self._ranges,
-            boxes=partial(read_boxes, boxes, LIDAR_BOXES[1], self.frame_of) if boxes else None,
-            image_boxes=partial(read_image_boxes, in_images, kind[1], self.frame_of) if in_images else None,
+            boxes=boxes,
+            image_boxes=in_images and (lambda camera: in_images(camera=camera)),
             image_boxes_are_projected=projected is not None,
             pixel_poses_are_missing=not self.pixel_poses.rows,
             where=lambda frame: f"{self.root}: segment {self.name}, frame {self.stamps_us[frame]}",
-            details={**self._statistics(), "frames": len(self.poses)},
+            details={**statistics, "frames": len(self.poses)},
             notes=self.notes,
         )
-        return SegmentLog(segment).log(READER.name, self._digest())
-
-    def _frames(self) -> list[FrameRow]:
-        """Return the frames in the order of the poses."""
-        times = {key: image_times(self.images.columns, row) for key, row in self.images.rows.items()}
-        count = len(self.poses)
-        rows = zip(self.stamps_us, self.poses, self.images.by_frame(count), self.sweeps.by_frame(count))
-        return [
-            FrameRow(stamp * 1000, pose, {number: times[k, number] for number in cameras}, tuple(lidars))
-            for k, (stamp, pose, cameras, lidars) in enumerate(rows)
-        ]
-
-    def _digest(self) -> str:
-        files = sorted(self.root.glob(f"*/{self.name}.parquet"))
-        sizes = [f"{file.parent.name} {file.stat().st_size}" for file in files]
-        return digest_of([self.name, repr(self.stamps_us), np.stack(self.poses).tobytes().hex(), *sizes], [])
+        digest = digest_of([self.name, repr(self.stamps_us), np.stack(self.poses).tobytes().hex(), *sizes], [])
+        return SegmentLog(segment).log(READER.name, digest)
 
     def _file(self, component: str) -> Path:
         return self.root / component / f"{self.name}.parquet"
-
-    def _path_of(self, component: str) -> Path | None:
-        """Path of a component; None where it was not downloaded."""
-        path = self._file(component)
-        return path if is_present(path) else None
 
     def _rows(
         self, component: str, index: Any, names: dict[int, str], kinds: Any, optional: Collection[str] = ()
@@ -316,14 +280,6 @@ class _SegmentFolder:
         except WireError as error:
             row_number = self.sweeps.rows.get((frame, laser), "none")
             raise RecordError(f"{self.sweeps.path}, row {row_number}: {error}") from None
-
-    def _statistics(self) -> dict[str, str]:
-        path = self._path_of("stats")
-        if path is None:
-            return {}
-        names: dict[str, Kind] = {f"[StatsComponent].{word}": "text" for word in STATISTICS}
-        columns = read_columns(path, names, optional=tuple(names))
-        return {name.rpartition(".")[2]: str(values[0]) for name, values in columns.items() if len(values)}
 
 
 def _matrices(*names: str) -> dict[str, Kind]:

@@ -7,8 +7,7 @@ rear, so that the TOP LiDAR, which turns clockwise, measures them from the first
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping
 from threading import Lock
 from typing import Any
 
@@ -101,7 +100,10 @@ def points_of(
     which defines the vehicle's frame. Range images without such poses are made of points in the vehicle's frame already.
     """
     height, width = images.returns[0].shape[:2]
-    inclination, azimuth = row_inclinations(laser, height), column_azimuths(laser, width)
+    # Columns are even in the vehicle's frame, azimuths in the lidar's.
+    yaw = np.arctan2(laser.vehicle_T_lidar[1, 0], laser.vehicle_T_lidar[0, 0])
+    azimuth = np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width - yaw
+    inclination = row_inclinations(laser, height)
     parts, turns = [], []
     for image in images.returns:
         row, column = _pixels_with_return(image)
@@ -139,10 +141,7 @@ def _pixels_with_return(image: NDArray[np.float32]) -> tuple[NDArray[np.intp], N
 
 
 def row_inclinations(laser: LaserCalibration, height: int) -> Array:
-    """Inclination (H,) rad of each row.
-
-    Raises `WireError` when the number of beams is another than that of rows.
-    """
+    """Inclination (H,) rad of each row; `WireError` when the number of beams is another than that of rows."""
     beams = laser.inclinations_rad
     if not len(beams):
         low, high = laser.limits_rad
@@ -150,12 +149,6 @@ def row_inclinations(laser: LaserCalibration, height: int) -> Array:
     if len(beams) != height:
         raise WireError(f"a range image has {height} rows, the calibration {len(beams)} beams")
     return beams[::-1]
-
-
-def column_azimuths(laser: LaserCalibration, width: int) -> Array:
-    """Azimuth (W,) rad of each column in the lidar's frame: columns are even in the vehicle's."""
-    yaw = np.arctan2(laser.vehicle_T_lidar[1, 0], laser.vehicle_T_lidar[0, 0])
-    return np.asarray(np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width - yaw)
 
 
 def turn_of(xyz_vehicle: Array, laser: LaserCalibration) -> Array:
@@ -183,7 +176,15 @@ def labels_of(
     """
     if table.lost:
         notes.append(f"{table.lost} labels are damaged or of no frame, and left out")
-    table, kind = _road_users(table, notes)
+    kind = _kinds(table)
+    usable = (table.size > 0).all(axis=1) & np.isfinite(table.size).all(axis=1) & np.isfinite(table.heading_rad)
+    usable &= (np.abs(table.center) < MAX_COORDINATE_M).all(axis=1)
+    road_user = np.isin(kind, list(CATEGORY_OF))
+    if (road_user & ~usable).any():
+        notes.append(f"{np.sum(road_user & ~usable)} labels without a position or size left out")
+    note_left_out(kind[~road_user].tolist(), NO_ROAD_USERS, notes)
+    rows = np.flatnonzero(usable & road_user)
+    table, kind = table.take(rows), kind[rows]
     turn = None if top is None else turn_of(table.center, top)
     t_ns = times.pose_ns[table.frame] if turn is None else times.at_turn(table.frame, turn)
     order = np.argsort(t_ns, kind="stable")
@@ -197,25 +198,12 @@ def labels_of(
     )  # fmt: skip
 
 
-def _road_users(table: BoxTable, notes: list[str]) -> tuple[BoxTable, NDArray[np.str_]]:
-    """Select the usable boxes of road users; return them with the words for their kinds."""
-    kind = np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
-    usable = (table.size > 0).all(axis=1) & np.isfinite(table.size).all(axis=1) & np.isfinite(table.heading_rad)
-    usable &= (np.abs(table.center) < MAX_COORDINATE_M).all(axis=1)
-    road_user = np.isin(kind, list(CATEGORY_OF))
-    if (road_user & ~usable).any():
-        notes.append(f"{np.sum(road_user & ~usable)} labels without a position or size left out")
-    note_left_out(kind[~road_user].tolist(), NO_ROAD_USERS, notes)
-    rows = np.flatnonzero(usable & road_user)
-    return table.take(rows), kind[rows]
-
-
 def image_labels_of(table: BoxTable, stamps_ns: NDArray[np.int64], size_px: tuple[int, int]) -> ImageLabels:
     """Turn boxes of one camera's images into labels, cut at the border of the image.
 
     `stamps_ns` (F,): of the camera's image in each frame; negative where there is none.
     """
-    kind = np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
+    kind = _kinds(table)
     box = np.concatenate([table.center - table.size / 2, table.center + table.size / 2], axis=1)
     box = np.clip(box, 0, np.tile(np.asarray(size_px, dtype=np.float64), 2))
     t_ns = stamps_ns[table.frame]
@@ -225,31 +213,34 @@ def image_labels_of(table: BoxTable, stamps_ns: NDArray[np.int64], size_px: tupl
     return ImageLabels(t_ns[rows], box[rows], _categories(kind[rows]))
 
 
-@dataclass(frozen=True, eq=False)
 class LabelsOnRequest(Mapping[str, ImageLabels]):
-    """Image labels by camera that are read when one camera's are first used."""
+    """Image labels by camera that `read` reads when one camera's are first used."""
 
-    cameras: tuple[str, ...]
-    read: Callable[[str], ImageLabels]  # reads the labels of a camera
-    _found: dict[str, ImageLabels] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
+    def __init__(self, cameras: Collection[str], read: Callable[[str], ImageLabels]) -> None:
+        self._cameras, self._read = tuple(cameras), read
+        self._found: dict[str, ImageLabels] = {}
+        self._lock = Lock()
 
     def __getitem__(self, camera: str) -> ImageLabels:
         """Return the labels of a camera."""
-        if camera not in self.cameras:
+        if camera not in self._cameras:
             raise KeyError(camera)
         with self._lock:
             if camera not in self._found:
-                self._found[camera] = self.read(camera)
+                self._found[camera] = self._read(camera)
             return self._found[camera]
 
     def __iter__(self) -> Iterator[str]:
         """Return the cameras."""
-        return iter(self.cameras)
+        return iter(self._cameras)
 
     def __len__(self) -> int:
         """Return the number of cameras."""
-        return len(self.cameras)
+        return len(self._cameras)
+
+
+def _kinds(table: BoxTable) -> NDArray[np.str_]:
+    return np.array([TYPES.get(int(k), "unknown") for k in table.kind], dtype=np.str_)
 
 
 def _categories(kind: NDArray[np.str_]) -> NDArray[np.str_]:

@@ -28,6 +28,7 @@ from log2sim.logs.records import sweep_of
 from log2sim.logs.stamps import MAX_TIME_S, defer_notes, strictly_increasing
 from log2sim.logs.waymo.messages import (
     FrameIndex,
+    RecordFile,
     Span,
     WireError,
     read_box,
@@ -35,6 +36,7 @@ from log2sim.logs.waymo.messages import (
     read_camera_labels,
     read_index,
     segment_name,
+    starts_like_tfrecord,
     take_index,
 )
 from log2sim.logs.waymo.range_images import (
@@ -49,7 +51,6 @@ from log2sim.logs.waymo.segment import (
     CAMERAS,
     LASERS,
     TOP,
-    BoxRow,
     BoxTable,
     CameraCalibration,
     FrameRow,
@@ -59,7 +60,6 @@ from log2sim.logs.waymo.segment import (
     Segment,
     plausible_stamp,
 )
-from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
 
 # From OpenCV's axes to x forward, y left, z up.
 CAMERA_T_OPENCV = transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -98,7 +98,15 @@ class SegmentLog:
                 f"{self.segment.path}: {len(self.frames)} frames with neither images nor range images that have a calibration"
             )
         self._note_limits(lidars)
-        labels, image_labels = cache(self._labels), self._image_labels(cameras, image_ns)
+
+        @cache
+        def labels() -> Labels | None:
+            if self.segment.boxes is None:
+                return None
+            table, top = self._in_order(self.segment.boxes()), self.segment.lasers.get(TOP)
+            return labels_of(table, self.times, self.map_T_vehicle, top, self.notes)
+
+        image_labels = self._image_labels(cameras, image_ns)
         return Log(
             name=f"waymo-{self.segment.name}",
             format=format,
@@ -135,18 +143,16 @@ class SegmentLog:
                 self.notes.append(
                     f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
                 )
-            t_ns = np.array([self._image_ns(k, number) for k in rows], dtype=np.int64)
+            stamped = [
+                (plausible_stamp(self.frames[k].images[number].middle_ns(), self.frames[k].stamp_ns), k) for k in rows
+            ]
+            t_ns = np.array([self.times.pose_ns[k] if stamp is None else stamp for stamp, k in stamped], dtype=np.int64)
             keep = strictly_increasing(t_ns, name, self.notes)
             rows, t_ns = rows[keep], t_ns[keep]
             cameras[name], image_ns[number] = camera, np.full(len(self.frames), -1, dtype=np.int64)
             image_ns[number][rows] = t_ns
             streams[name] = self._image_stream(camera, number, rows, t_ns)
         return cameras, streams, image_ns
-
-    def _image_ns(self, k: int, number: int) -> int:
-        frame = self.frames[k]
-        stamp = plausible_stamp(frame.images[number].middle_ns(), frame.stamp_ns)
-        return int(self.times.pose_ns[k]) if stamp is None else stamp
 
     def _image_stream(self, camera: Camera, number: int, rows: NDArray[np.intp], t_ns: Stamps) -> Stream:
         def encoded(i: int) -> bytes:
@@ -215,12 +221,6 @@ class SegmentLog:
         t_ns, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
         return PoseTrack(t_ns, np.stack(poses)[first])
 
-    def _labels(self) -> Labels | None:
-        if self.segment.boxes is None:
-            return None
-        table = self._in_order(self.segment.boxes())
-        return labels_of(table, self.times, self.map_T_vehicle, self.segment.lasers.get(TOP), self.notes)
-
     def _image_labels(self, cameras: dict[str, Camera], image_ns: dict[int, Stamps]) -> Mapping[str, ImageLabels]:
         boxes = self.segment.image_boxes
         if boxes is None:
@@ -247,35 +247,27 @@ class SegmentLog:
 
     def _note_limits(self, lidars: dict[str, Lidar]) -> None:
         """Note what the format lacks."""
-        notes = self.notes
-        if f"LIDAR_{LASERS[TOP]}" in lidars:
+        segment, notes, top = self.segment, self.notes, f"LIDAR_{LASERS[TOP]}"
+        if top in lidars:
             notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
-            if not len(self.segment.lasers[TOP].inclinations_rad):  # only the short-range LiDARs have even beams
-                notes.append(
-                    "the calibration lacks the inclinations of the TOP LiDAR's beams: they are taken to be even between "
-                    "the lowest and the highest"
-                )
-            if self.segment.pixel_poses_are_missing:
-                notes.append(
-                    "the poses of the pixels are missing: points of the TOP LiDAR are as measured, not compensated"
-                )
-        if set(lidars) - {f"LIDAR_{LASERS[TOP]}"}:
+            if not len(segment.lasers[TOP].inclinations_rad):  # only the short-range LiDARs have even beams
+                lacks = "the calibration lacks the inclinations of the TOP LiDAR's beams"
+                notes.append(f"{lacks}: they are taken to be even between the lowest and the highest")
+            if segment.pixel_poses_are_missing:
+                lacks = "the poses of the pixels are missing"
+                notes.append(f"{lacks}: points of the TOP LiDAR are as measured, not compensated")
+        if set(lidars) - {top}:
             notes.append("no times of points of the short-range LiDARs")
-        if self.segment.boxes is not None:
-            notes.append(
-                "labels do not distinguish cars from trucks, buses and motorcycles: all vehicles are read as cars"
-            )
-        if self.segment.image_boxes is not None:
-            projected = (
-                "3D labels projected into them" if self.segment.image_boxes_are_projected else "boxes drawn in them"
-            )
-            notes.append(f"labels of images are the {projected}")
-        if ego_vehicle_of(self.segment.lasers) is PACIFICA:
-            notes.append("the size of the ego vehicle is not in the log: that of a Chrysler Pacifica is assumed")
-        else:
-            notes.append(
-                "the size of the ego vehicle is not in the log: length by the LiDARs at its bumpers, the rest as a Pacifica's"
-            )
+        if segment.boxes is not None:
+            lacks = "labels do not distinguish cars from trucks, buses and motorcycles"
+            notes.append(f"{lacks}: all vehicles are read as cars")
+        if segment.image_boxes is not None:
+            how = "3D labels projected into them" if segment.image_boxes_are_projected else "boxes drawn in them"
+            notes.append(f"labels of images are the {how}")
+        size = "that of a Chrysler Pacifica is assumed"
+        if ego_vehicle_of(segment.lasers) is not PACIFICA:
+            size = "length by the LiDARs at its bumpers, the rest as a Pacifica's"
+        notes.append(f"the size of the ego vehicle is not in the log: {size}")
 
 
 def camera_of(name: str, calibration: CameraCalibration, frames: list[FrameRow], number: int) -> Camera:
@@ -313,7 +305,14 @@ class WaymoReader:
 
     def matches(self, path: Path) -> bool:
         """Return whether the file is a TFRecord file, or the folder holds some."""
-        return any(_may_be_segment(file, path) for file in _files(path))
+        for file in _files(path):
+            try:
+                require_link_inside(file, path if path.is_dir() else file)
+            except LogError:  # a link that must not be read, which opening it reports
+                return True
+            if starts_like_tfrecord(file):
+                return True
+        return False
 
     def sequences(self, path: Path) -> list[str]:
         """Return the names of the files without their suffix, sorted."""
@@ -321,10 +320,9 @@ class WaymoReader:
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a segment; no picture, range image or label is read."""
-        if path.is_file():
-            return _SegmentFile(path).log()
-        require_link_inside(path / f"{sequence}{SUFFIX}", path)
-        return _SegmentFile(path / f"{sequence}{SUFFIX}").log()
+        file = path if path.is_file() else path / f"{sequence}{SUFFIX}"
+        require_link_inside(file, file if path.is_file() else path)
+        return _SegmentFile(file).log()
 
 
 READER = WaymoReader()
@@ -337,21 +335,12 @@ def _files(path: Path) -> list[Path]:
         return []
 
 
-def _may_be_segment(file: Path, root: Path) -> bool:
-    """Whether a file is a TFRecord file; also where it is a link that must not be read, which opening it reports."""
-    try:
-        require_link_inside(file, root if root.is_dir() else file)
-    except LogError:
-        return True
-    return starts_like_tfrecord(file)
-
-
 class _SegmentFile:
     def __init__(self, path: Path) -> None:
         self.path, self.file = path, RecordFile(path)
         # Usable frames: number of the record and index of each.
-        self.record, self.index = list[int](), list[FrameIndex]()
-        self.boxes_by_camera: dict[int, list[BoxRow]] | None = None
+        self.record, self.index, self.frames = list[int](), list[FrameIndex](), list[FrameRow]()
+        self.boxes_by_camera: dict[int, list[tuple[int, str, int, list[float]]]] | None = None
 
     def log(self) -> Log:
         """Read the index of every frame of the segment to which the first one belongs, and make a log of them."""
@@ -373,10 +362,11 @@ class _SegmentFile:
             elif index.pose is None:
                 left_out.append(f"record {k}: no rigid pose")
             elif own != name:
-                left_out.append(
-                    f"record {k}: of segment '{own}', the file's first frame is of '{name}'; expected one segment a file"
-                )
+                expected = f"the file's first frame is of '{name}'; expected one segment a file"
+                left_out.append(f"record {k}: of segment '{own}', {expected}")
             else:
+                images = {number: times for number, (times, _) in index.images.items() if number in CAMERAS}
+                self.frames.append(FrameRow(index.stamp_us * 1000, index.pose, images, tuple(index.lasers)))
                 self.record.append(k)
                 self.index.append(index)
         notes, index_of = [*self.file.notes], self.index
@@ -388,18 +378,12 @@ class _SegmentFile:
         zones = sum(f.no_label_zones > 0 for f in index_of)
         if zones:
             notes.append(f"{zones} of {len(index_of)} frames have zones in which objects are not labeled")
-        frames = []
-        for f in index_of:
-            assert f.stamp_us is not None
-            assert f.pose is not None
-            images = {number: times for number, (times, _) in f.images.items() if number in CAMERAS}
-            frames.append(FrameRow(f.stamp_us * 1000, f.pose, images, tuple(f.lasers)))
         segment = Segment(
             name=name,
             path=self.path,
             cameras=cameras,
             lasers=lasers,
-            frames=frames,
+            frames=self.frames,
             image=self._image,
             ranges=self._ranges,
             boxes=self._boxes if any(f.labels for f in index_of) else None,
@@ -431,7 +415,7 @@ class _SegmentFile:
 
     def _boxes(self) -> BoxTable:
         found, lost = self._read_all(lambda index: index.labels, lambda data: read_box(data, 3))
-        return BoxTable.of([(frame, *box) for frame, box in found if box is not None], 3, lost)
+        return _table([(frame, *box) for frame, box in found if box is not None], 3, lost)
 
     def _image_boxes(self, camera: int) -> BoxTable:
         if self.boxes_by_camera is None:
@@ -442,7 +426,7 @@ class _SegmentFile:
                 self.boxes_by_camera.setdefault(number, []).extend((frame, *box) for box in boxes)
         # To which camera a message belonged that cannot be read is not known: all of them report the first one.
         lost, self.lost_boxes = self.lost_boxes, 0
-        return BoxTable.of(self.boxes_by_camera.get(camera, []), 2, lost)
+        return _table(self.boxes_by_camera.get(camera, []), 2, lost)
 
     def _read_all(
         self, spans: Callable[[FrameIndex], list[Span]], parse: Callable[[bytes], Any]
@@ -457,3 +441,9 @@ class _SegmentFile:
                     except WireError:
                         lost += 1
         return out, lost
+
+
+def _table(rows: list[tuple[int, str, int, list[float]]], dimensions: int, lost: int) -> BoxTable:
+    """Make a table of rows: frame, id, type, and the numbers of a box."""
+    frame, track_id, kind, box = zip(*rows) if rows else ((), (), (), ())
+    return BoxTable.of(frame, track_id, kind, np.array(box, dtype=np.float64).reshape(-1, 2 * dimensions + 1), lost)

@@ -1,6 +1,6 @@
 """What both versions of the data set hold of a segment, and the stamps of its frames.
 
-Letters in shapes: F frames, I images, B boxes, H rows and W columns of a range image.
+Letters in shapes: F frames, B boxes, H rows and W columns of a range image.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from log2sim.geometry import NS_PER_S, Array, nearest_rotation
 from log2sim.logs.stamps import MAX_TIME_S
@@ -40,22 +40,29 @@ class CameraCalibration:
     height_px: int
     direction: int  # RollingShutterReadOutDirection
 
+    @property
+    def is_usable(self) -> bool:
+        """Whether these are the intrinsics, finite and with focal lengths above 0, and the size of a camera."""
+        usable = self.intrinsic.shape == (9,) and np.isfinite(self.intrinsic).all() and min(self.intrinsic[:2]) > 0
+        low, high = sorted((self.width_px, self.height_px))
+        return bool(usable) and 0 < low <= high <= MAX_SIDE_PX
+
 
 @dataclass(frozen=True, eq=False)
 class LaserCalibration:
     """Calibration of a LiDAR."""
 
     vehicle_T_lidar: Array  # (4, 4)
-    # (n,) float64: of the beams from the lowest to the highest; empty where they are spread evenly between the limits
+    # (n,): of the beams from the lowest to the highest; empty where they are spread evenly between the limits
     inclinations_rad: Array
-    limits_rad: tuple[float, float]  # (2,) tuple of float: lowest and highest inclination
+    limits_rad: tuple[float, float]  # lowest and highest inclination
 
 
 @dataclass(frozen=True, eq=False)
 class ImageTimes:
     """When an image was taken, and from where."""
 
-    world_T_vehicle: Array | None  # (4, 4) float64 or None: pose of the vehicle at `pose_s`
+    world_T_vehicle: Array | None  # (4, 4): pose of the vehicle at `pose_s`
     # Unix times, and the duration of the exposure of one line; 0 where the data set has none
     pose_s: float
     shutter_s: float
@@ -92,9 +99,8 @@ class FrameRow:
     """One frame: a turn of the TOP LiDAR with the images taken during it."""
 
     stamp_ns: int  # of the first column of the TOP LiDAR's turn
-    # (4, 4) float64: pose that defines the frame of points and labels, about the middle of the turn
-    world_T_vehicle: Array
-    images: Mapping[int, ImageTimes]
+    world_T_vehicle: Array  # (4, 4): defines the frame of points and labels, about the middle of the turn
+    images: dict[int, ImageTimes]
     lasers: tuple[int, ...]  # numbers of the LiDARs with points
 
 
@@ -102,14 +108,11 @@ class FrameRow:
 class RangeImages:
     """Range images of one LiDAR in one frame."""
 
-    # Tuple of (H, W, C) float32: first channel: range in m, not positive where nothing returned
-    returns: tuple[NDArray[np.float32], ...]
-    # (H, W, 6) float32 or None: roll, pitch, yaw, x, y, z of the vehicle in the world at the time of each pixel
+    returns: tuple[
+        NDArray[np.float32], ...
+    ]  # (H, W, C) each: first the range in m, not positive where nothing returned
+    # (H, W, 6): roll, pitch, yaw, x, y, z of the vehicle in the world at the time of each pixel
     poses: NDArray[np.float32] | None
-
-
-BoxRow = tuple[int, str, int, list[float]]
-"""Frame, id, type, and the numbers of a box: center, size, heading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,24 +122,18 @@ class BoxTable:
     frame: NDArray[np.int64]  # (B,): index of the frame
     track_id: NDArray[np.str_]  # (B,)
     kind: NDArray[np.int64]  # (B,): type by its number in label.proto
-    center: Array  # (B, 3) or (B, 2) float64: m, or px
-    size: Array  # (B, 3) or (B, 2) float64: length, width, height in m, or length (along u) and width (along v) in px
+    center: Array  # (B, 3) or (B, 2): m, or px
+    size: Array  # (B, 3) or (B, 2): length, width, height in m, or length (along u) and width (along v) in px
     heading_rad: Array  # (B,)
     lost: int = 0  # further boxes, which cannot be read or are of no frame
 
     @classmethod
-    def of(cls, rows: list[BoxRow], dimensions: int, lost: int) -> BoxTable:
-        """Build the table of rows."""
-        box = np.array([row[3] for row in rows], dtype=np.float64).reshape(-1, 2 * dimensions + 1)
-        return cls(
-            np.array([row[0] for row in rows], dtype=np.int64),
-            np.array([row[1] for row in rows], dtype=np.str_),
-            np.array([row[2] for row in rows], dtype=np.int64),
-            box[:, :dimensions],
-            box[:, dimensions : 2 * dimensions],
-            box[:, -1],
-            lost,
-        )
+    def of(cls, frame: ArrayLike, track_id: ArrayLike, kind: ArrayLike, box: Array, lost: int) -> BoxTable:
+        """Build the table of columns (B,) and boxes (B, 4 to 7): center, size and, if it is stated, heading."""
+        n = box.shape[1] // 2
+        heading = box[:, -1] if box.shape[1] % 2 else np.zeros(len(box))
+        frames, kinds = np.asarray(frame, dtype=np.int64), np.asarray(kind, dtype=np.int64)
+        return cls(frames, np.asarray(track_id, dtype=np.str_), kinds, box[:, :n], box[:, n : 2 * n], heading, lost)
 
     def take(self, rows: NDArray[Any]) -> BoxTable:
         """Return some of the rows."""
@@ -145,33 +142,23 @@ class BoxTable:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """One segment of either version, with functions that read its records."""
+    """One segment of either version, with functions that read its records by index of the frame and number of the sensor."""
 
     name: str
     path: Path  # its file or folder, for errors
     cameras: Mapping[int, CameraCalibration]
     lasers: Mapping[int, LaserCalibration]
     frames: list[FrameRow]  # at least one; not yet in order
-    # Returns the JPEG of a frame by index and camera by number; raises `RecordError`
-    image: Callable[[int, int], bytes]
-    # Returns the range images of a frame by index and LiDAR by number; raises `RecordError`
-    ranges: Callable[[int, int], RangeImages]
+    image: Callable[[int, int], bytes]  # returns a JPEG; raises `RecordError`
+    ranges: Callable[[int, int], RangeImages]  # raises `RecordError`
     boxes: Callable[[], BoxTable] | None  # reads the 3D labels; None for a segment without any
-    # Reads the 2D labels of a camera by number; None for a segment without any
-    image_boxes: Callable[[int], BoxTable] | None
-    # Whether `image_boxes` are the 3D labels projected into the images, not drawn in them
-    image_boxes_are_projected: bool
+    image_boxes: Callable[[int], BoxTable] | None  # reads the 2D labels of a camera by number; None without any
+    image_boxes_are_projected: bool  # whether they are the 3D labels projected into the images, not drawn in them
     where: Callable[[int], str]  # names a frame by index in errors
     # Whether range images of the TOP LiDAR come without the poses that belong to them
     pixel_poses_are_missing: bool = False
     details: Mapping[str, Any] = field(default_factory=dict)  # for `log2sim inspect`
     notes: list[str] = field(default_factory=list)
-
-
-def are_usable(intrinsic: Array, width_px: int, height_px: int) -> bool:
-    """Return whether these are the 9 intrinsics, finite and with focal lengths above 0, and the size of a camera."""
-    usable = intrinsic.shape == (9,) and bool(np.isfinite(intrinsic).all()) and min(intrinsic[:2]) > 0
-    return usable and 0 < min(width_px, height_px) <= max(width_px, height_px) <= MAX_SIDE_PX
 
 
 def rigid(numbers: Array) -> Array | None:
@@ -200,9 +187,9 @@ MAX_LAG_NS = 1_000_000_000
 class FrameTimes:
     """Stamps of F frames in order."""
 
-    start_ns: Stamps  # (F,) int64: of the first column of the TOP LiDAR's turn
-    period_ns: Stamps  # (F,) int64: duration of the turn, to the start of the next one
-    pose_ns: Stamps  # (F,) int64: of the pose that defines the vehicle's frame, to which points are compensated
+    start_ns: Stamps  # (F,): of the first column of the TOP LiDAR's turn
+    period_ns: Stamps  # (F,): duration of the turn, to the start of the next one
+    pose_ns: Stamps  # (F,): of the pose that defines the vehicle's frame, to which points are compensated
 
     @classmethod
     def of(cls, frames: list[FrameRow], notes: list[str]) -> FrameTimes:
@@ -213,8 +200,7 @@ class FrameTimes:
         usual = round(float(np.median(step[whole]))) if whole.any() else NOMINAL_PERIOD_NS
         period = np.append(np.where(whole, step, usual), usual)
         # Comments of Frame in dataset.proto: the pose is about the one in the middle of the frame.
-        pose = start + period // 2
-        unknown = 0
+        pose, unknown = start + period // 2, 0
         for k, frame in enumerate(frames):
             front = frame.images.get(FRONT_CAMERA)
             stamp = plausible_stamp(None if front is None else front.pose_ns(), frame.stamp_ns)

@@ -91,7 +91,6 @@ def _columns(points_m: Array) -> dict[str, list[int]]:
 # A page shows a new prediction five times a second, which looks steady and takes half as much room as one at every
 # tick.
 EVERY_TICKS = 2
-
 MAX_PREDICTIONS = 1_000_000  # of all agents together: 30 MB of a page for 3 s each
 
 
@@ -199,15 +198,12 @@ def page_document(
     """
     layers = {"scenario": list(_scenario(scenario))}
     if truth is not None:
-        layers["truth"] = [
-            _entry(a, a.waypoints, stationary=not is_moving(a), static=a.static)
-            for a in truth.aligned_to(scenario).agents
-        ]
+        true = truth.aligned_to(scenario).agents
+        layers["truth"] = [_entry(a, a.waypoints, stationary=not is_moving(a), static=a.static) for a in true]
     if replay is not None:
         static = {a.id: a.driver == "static" for a in replay.agents}
-        layers["replay"] = [
-            _entry(a, a, stationary=static[a.id], static=static[a.id]) for a in replay.agents if len(a.t_s)
-        ]
+        there = [(a, static[a.id]) for a in replay.agents if len(a.t_s)]
+        layers["replay"] = [_entry(a, a, stationary=stands, static=stands) for a, stands in there]
     if predict_s is not None:
         predicted = predicted_columns(scenario, predict_s)
         for entry in layers["scenario"]:

@@ -74,9 +74,8 @@ def write_page(
     refuse_existing(out_path, overwrite=overwrite)
     if isinstance(recorded, Log):
         recorded = Recorded(localize_like(recorded, scenario.provenance))
-    document = page_document(
-        scenario, truth=truth, replay=replay, predict_s=predict_s, background=background, metrics=metrics
-    )
+    shown: dict[str, Any] = {"truth": truth, "replay": replay, "background": background, "metrics": metrics}
+    document = page_document(scenario, predict_s=predict_s, **shown)
     page = make_page(document, scenario, recorded)
     with replaced(out_path) as temporary:
         temporary.write_bytes(page)

@@ -29,14 +29,12 @@ QUALITY: dict[str, dict[str, str]] = {
     H264: {"crf": "20", "preset": "medium", "x264-params": "mbtree=0"},
     VP9: {"crf": "32", "b": "0", "deadline": "good", "cpu-used": "4"},
 }
-
 # The same frames give the same bytes; and the index stands at the start of an .mp4, so that browsers play it while it
 # loads.
 CONTAINER: dict[str, dict[str, str]] = {
     H264: {"fflags": "+bitexact", "movflags": "+faststart"},
     VP9: {"fflags": "+bitexact"},
 }
-
 MAX_DENOMINATOR = 1001  # of frame rates as fractions; broadcast rates such as 29.97 have it
 CLEAR = 255  # palette index of transparent pixels in a .gif; the lower ones are colors
 SWATCH_PX = 100  # width of the swatches of agent colors that the palette is chosen with
@@ -76,9 +74,8 @@ def write_with_av(frames: Iterator[Image], path: Path, fps: float, codec: str, c
     first = next(frames)
     height, width = (n // 2 * 2 for n in first.shape[:2])  # the codecs require even sides
     with av.open(str(path), "w", format=container, container_options=CONTAINER[codec]) as file:
-        stream: Any = file.add_stream(
-            codec, rate=Fraction(fps).limit_denominator(MAX_DENOMINATOR), options=QUALITY[codec]
-        )
+        rate = Fraction(fps).limit_denominator(MAX_DENOMINATOR)
+        stream: Any = file.add_stream(codec, rate=rate, options=QUALITY[codec])
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         context = stream.codec_context
         context.thread_count = 1  # the bytes depend on it
@@ -86,9 +83,8 @@ def write_with_av(frames: Iterator[Image], path: Path, fps: float, codec: str, c
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         for frame in itertools.chain([first], frames):
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame[:height, :width]), format="rgb24")
-            picture = picture.reformat(
-                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
-            )
+            to: Any = {"dst_colorspace": Colorspace.ITU709, "dst_color_range": ColorRange.MPEG}
+            picture = picture.reformat(format="yuv420p", **to)
             file.mux(stream.encode(picture))
         file.mux(stream.encode(None))
 
@@ -114,7 +110,14 @@ def write_with_opencv(frames: Iterator[Image], path: Path, fps: float) -> None:
             writer.write(np.ascontiguousarray(frame[:height, :width, ::-1]))
     finally:
         writer.release()
-    _replace_track_number(path)
+    # The random number by which a Matroska file names its track is replaced, so that the same frames give the same bytes. RFC 9559:
+    # TrackUID has the id 73 C5 and TagTrackUID 63 C5, both followed here by 88, a length of 8 bytes. They are written before the
+    # first cluster (1F 43 B6 75), so nothing of the film itself can be mistaken for them.
+    with path.open("r+b") as file:
+        head = file.read(4096).split(b"\x1f\x43\xb6\x75")[0]
+        for found in re.finditer(rb"[\x73\x63]\xc5\x88.{8}", head, re.DOTALL):
+            file.seek(found.end() - 8)
+            file.write((1).to_bytes(8, "big"))
 
 
 def write_gif(frames: Iterator[Image], path: Path, fps: float, colors: Sequence[str]) -> None:
@@ -176,16 +179,3 @@ def _silent_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
-
-
-def _replace_track_number(path: Path) -> None:
-    """Replace the random number by which a Matroska file names its track, so that the same frames give the same bytes.
-
-    RFC 9559: TrackUID has the id 73 C5 and TagTrackUID 63 C5, both followed here by 88, a length of 8 bytes. They are written
-    before the first cluster (1F 43 B6 75), so nothing of the film itself can be mistaken for them.
-    """
-    with path.open("r+b") as file:
-        head = file.read(4096).split(b"\x1f\x43\xb6\x75")[0]
-        for found in re.finditer(rb"[\x73\x63]\xc5\x88.{8}", head, re.DOTALL):
-            file.seek(found.end() - 8)
-            file.write((1).to_bytes(8, "big"))

@@ -1,9 +1,9 @@
-"""What a picture shows besides agents: lanes, doubts, predictions, warnings, collisions, observers."""
+"""What a picture shows: tracks, boxes, lanes, doubts, predictions, warnings, collisions, observers; a few collections stay fast."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,17 +30,18 @@ from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
 from log2sim.visualization.plot import viewport
-from log2sim.visualization.plot.drawing import BACKGROUND, LABEL, MARK, TRACK, add_lines, add_polygons
 from log2sim.visualization.plot.selection import NO_OPTIONS, PlotOptions, TimeRange
 from log2sim.visualization.plot.style import (
     BORDER_COLOR,
-    END_COLOR,
+    COLLISION_MARK,
     FONT,
+    INK,
     LANE_ARROW,
     LANE_FACE,
     MARKING_COLOR,
     MUTED,
     PAPER,
+    PARKED_EDGE,
     PARKED_FACE,
     SENSOR_COLOR,
     SENSOR_PT,
@@ -49,18 +50,144 @@ from log2sim.visualization.plot.style import (
     halo,
     printable_label,
 )
-from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy
+from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, is_moving, paint_of
+
+BACKGROUND, STATIONARY, TRUTH, TRACK, MARK, DRIVEN, BOX, LABEL = range(1, 9)  # z-order, from the bottom up
+
+
+def add_polygons(ax: Axes, corners: Iterable[Array], **style: Any) -> None:
+    """Add polygons, each (K, 2), in one collection, which does not change the limits of the axes."""
+    ax.add_collection(PolyCollection(list(corners), **style), autolim=False)
+
+
+def add_lines(ax: Axes, lines: Iterable[Array], **style: Any) -> None:
+    """Add lines, each (K, 2), in one collection, which does not change the limits of the axes."""
+    ax.add_collection(LineCollection(list(lines), **style), autolim=False)
+
+
+def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
+    """Draw stationary agents as gray boxes; as a dot where the box would be too small to see."""
+    if not agents:
+        return
+    middle = [len(a.waypoints) // 2 for a in agents]
+    xy = np.array([centers_xy(a)[k] for a, k in zip(agents, middle)])
+    corners = np.concatenate([viewport.footprints(a, p, a.waypoints.yaw_rad[k]) for a, p, k in zip(agents, xy, middle)])
+    edge: dict[str, Any] = {"edgecolors": PARKED_EDGE, "zorder": STATIONARY}
+    add_polygons(ax, corners, facecolors=PARKED_FACE, linewidths=0.6, **edge)
+    paints = [paint_of(a, PARKED_EDGE) for a in agents]
+    add_polygons(ax, viewport.heading_triangles(corners), facecolors=paints, linewidths=0.3, **edge)
+    small = np.array([max(a.size_m[:2]) < 5 * view.m_per_pt for a in agents])
+    if small.any():
+        ax.plot(xy[small, 0], xy[small, 1], "o", ms=3, mfc=PARKED_FACE, mec=PARKED_EDGE, mew=0.6, zorder=STATIONARY)
+
+
+def draw_tracks(
+    ax: Axes, roles: AgentRoles, view: Viewport, step_s: float, *, alpha: float = 1.0, faint: bool = False
+) -> None:
+    """Draw tracks as lines with arrowheads, filled gaps dashed, and time marks.
+
+    `alpha`: below 1 lines become pale ribbons under overlays. `faint`: lines only, as the background of an animation.
+    """
+    for leading in (False, True):
+        same_rank = [r for r in roles.movers if r.leading is leading]
+        _lines(ax, same_rank, alpha if leading else alpha * 0.5, leading)
+    shown = [role for role in roles.movers if role.leading]
+    heads = [(head, role.color) for role in shown for head in viewport.arrows(centers_xy(role.agent), view)]
+    if faint:
+        return
+    if heads:
+        faces = [color for _, color in heads]
+        add_polygons(ax, [h for h, _ in heads], facecolors=faces, edgecolors=PAPER, linewidths=0.5, zorder=MARK)
+    for role in shown:
+        t, xy = viewport.time_marks(role.agent, step_s)
+        apart = np.append(True, np.hypot(*np.diff(xy, axis=0).T) > 4 * view.m_per_pt)[: len(t)]
+        ax.plot(*xy[apart].T, "o", ms=2.7, mfc=PAPER, mec=role.color, mew=0.8, zorder=MARK + 0.1, ls="none")
+
+
+def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: float | None) -> None:
+    """Draw boxes at real size: hollow at the start, filled at the end, pale every `ghosts_step_s` unless None."""
+    for rank, role in enumerate(reversed(roles.movers)):
+        agent, w, xy = role.agent, role.agent.waypoints, centers_xy(role.agent)
+        alpha = 1.0 if role.leading else 0.55
+        z = BOX + rank / (len(roles.movers) + 1) * 0.5
+        if ghosts_step_s is not None and role.leading:
+            t, at = viewport.time_marks(agent, ghosts_step_s)
+            apart = viewport.spaced_apart(at, xy[[0, -1]], 1.15 * agent.size_m[0])
+            if apart.any():
+                ghost = viewport.footprints(agent, at[apart], agent.at(t[apart]).yaw_rad)
+                faint = {"facecolors": to_rgba(role.color, 0.10), "edgecolors": to_rgba(role.color, 0.4)}
+                add_polygons(ax, ghost, linewidths=0.8, zorder=TRACK - 0.5, **faint)
+        first, last = (viewport.footprints(agent, xy[k], w.yaw_rad[k]) for k in (0, -1))
+        paint = paint_of(agent, to_rgba(PAPER, 0.85))
+        rim = "none" if agent.color is None else to_rgba(PAPER, 0.85)
+        for corners, face, edge, level in (
+            (first, to_rgba(PAPER, 0.75), to_rgba(role.color, 0.9 * alpha), z - 0.6),
+            (last, to_rgba(role.color, 0.92 * alpha), PAPER, z),
+            (viewport.heading_triangles(last), paint, rim, z),
+        ):
+            add_polygons(ax, corners, facecolors=face, edgecolors=edge, linewidths=0.8, zorder=level)
+        if max(agent.size_m[:2]) < 9 * view.m_per_pt:
+            face = to_rgba(role.color, alpha)
+            ax.plot(*xy[-1], role.marker, ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
+
+
+def draw_truth(ax: Axes, truth: Scenario) -> None:
+    """Draw the truth as thin dark dashed lines and hollow dashed boxes."""
+    tracks, corners = [], []
+    for agent in truth.agents:
+        xy = centers_xy(agent)
+        if is_moving(agent):
+            tracks.append(xy)
+        corners.append(viewport.footprints(agent, xy[-1], agent.waypoints.yaw_rad[-1])[0])
+    style: dict[str, Any] = {"linewidths": 0.8, "linestyles": [(0, (3, 2))], "zorder": BOX + 0.8}
+    add_lines(ax, tracks, colors=to_rgba(INK, 0.9), **style)
+    add_polygons(ax, corners, facecolors="none", edgecolors=to_rgba(INK, 0.9), **style)
+
+
+def draw_replay(ax: Axes, replay: Any, roles: AgentRoles) -> None:
+    """Draw replayed trajectories as dotted lines with a dotted box at the end, in the color of the track."""
+    role_of = {role.agent.id: role for role in roles.movers}
+    tracks, colors, ends = [], [], []
+    for driven in replay.agents:
+        role = role_of.get(driven.id)
+        if role is not None and len(driven.t_s):
+            xy = np.column_stack([driven.x_m, driven.y_m])
+            tracks.append(xy)
+            colors.append(to_rgba(role.color))
+            ends.append(viewport.footprints(role.agent, xy[-1], np.asarray(driven.yaw_rad)[-1])[0])
+    dots: dict[str, Any] = {"linestyles": [(0, (0.1, 2.0))], "linewidths": 1.6, "capstyle": "round"}
+    add_lines(ax, tracks, colors=colors, zorder=DRIVEN, **dots)
+    dotted: dict[str, Any] = {"linestyles": [(0, (1, 1.2))], "linewidths": 1.1}
+    add_polygons(ax, ends, facecolors="none", edgecolors=colors, zorder=BOX + 0.7, **dotted)
+
+
+def draw_collisions(ax: Axes, xy_m: Array, **style: Any) -> Line2D:
+    """Mark collisions that belong to the replay."""
+    return ax.plot(*xy_m.T, ls="none", zorder=LABEL - 0.1, **COLLISION_MARK, **style)[0]
+
+
+def _lines(ax: Axes, roles: list[AgentRole], alpha: float, leading: bool) -> None:
+    observed: list[tuple[Array, str]] = []
+    filled: list[tuple[Array, str]] = []
+    for role in reversed(roles):
+        xy, known = centers_xy(role.agent), role.agent.waypoints.observed
+        both = known[:-1] & known[1:]
+        for kind, keep in ((observed, both), (filled, ~both)):
+            edges = np.flatnonzero(np.diff(keep.astype(np.int8), prepend=0, append=0))
+            kind.extend((xy[start : stop + 1], role.color) for start, stop in zip(edges[::2], edges[1::2]))
+    ribbon = 1.5 if alpha < 1.0 else 1.0
+    width = [ribbon * (2.4 if c == INK else 1.7) for _, c in observed] if leading else [1.0] * len(observed)
+    parts, colors = [p for p, _ in observed], [to_rgba(c, alpha) for _, c in observed]
+    if leading and alpha == 1.0:
+        rim = {"colors": to_rgba(PAPER, 0.85), "linewidths": [w + 1.6 for w in width]}
+        add_lines(ax, parts, zorder=TRACK - 0.2, capstyle="round", **rim)
+    add_lines(ax, parts, colors=colors, linewidths=width, zorder=TRACK, capstyle="round")
+    gaps, colors = [p for p, _ in filled], [to_rgba(c, alpha) for _, c in filled]
+    add_lines(ax, gaps, colors=colors, linewidths=1.3, zorder=TRACK, linestyle=(0, (2.2, 1.8)))
+
 
 STEP_S = 0.1  # between the points of a line: ends observe at the rate of their LiDARs
 WIDTH_PT, BESIDE_PT = 1.3, 3.4  # width of a line, and how far to the right of the track it is
-
-
-def draw_observers(ax: Axes, roles: AgentRoles, view: Viewport) -> None:
-    """Draw a line beside the tracks of movers where one end alone observed them."""
-    aside_m = BESIDE_PT * view.m_per_pt
-    for end in ENDS:
-        lines = [line for role in roles.movers for line in lines_of(role.agent, end, aside_m)]
-        add_lines(ax, lines, colors=END_COLOR[end], linewidths=WIDTH_PT, capstyle="butt", zorder=TRACK - 0.2)
 
 
 def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
@@ -82,7 +209,6 @@ def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
 
 
 LINE: dict[str, Any] = {"color": WARNING, "lw": 1.2, "ls": (0, (4.0, 2.5)), "marker": "o", "ms": 3.5, "mfc": "none"}
-
 TEXT_PT = -9.0  # how far above the middle of the line its text is
 
 
@@ -210,8 +336,6 @@ class Overlays:
 
 
 NO_OVERLAYS = Overlays()
-
-
 MAX_NAMED = 5  # doubtful agents whose reasons are in the legend
 LINE_LETTERS, MAX_LINES = 34, 3  # letters that fit into a line of the legend, and lines of one reason
 # Spacing at which the doubtful part of a track is followed.
@@ -237,20 +361,13 @@ def is_doubted_at(agent: Agent, t_s: float) -> bool:
     return any(start <= t_s <= end for start, end in shown_spans(agent))
 
 
-def hatch_stationary(ax: Axes, roles: AgentRoles, view: Viewport, z: float) -> None:
-    """Hatch the boxes of doubtful stationary agents, whenever the doubt holds."""
-    for agent in roles.stationary:
-        if agent.is_doubtful:
-            _hatch(ax, agent, len(agent.waypoints) // 2, view, stripe=MUTED, edge=MUTED, z=z)
-
-
 def hatch_movers(ax: Axes, roles: AgentRoles, view: Viewport, z_track: float, z_box: float) -> None:
     """Stripe the tracks of movers where they are doubtful, and hatch their last boxes if they are so at the end."""
     tracks: list[Array] = []
     for role in roles.movers:
         tracks += doubtful_parts(role.agent)
         if is_doubted_at(role.agent, float(role.agent.waypoints.t_s[-1])):
-            _hatch(ax, role.agent, -1, view, stripe=PAPER, edge=role.color, z=z_box)
+            hatch(ax, role.agent, -1, view, stripe=PAPER, edge=role.color, z=z_box)
     dashes: dict[str, Any] = {"linestyles": [(0, (1.1, 1.4))], "linewidths": 1.3, "colors": PAPER, "zorder": z_track}
     add_lines(ax, tracks, **dashes)
 
@@ -291,7 +408,7 @@ def _hatched_patch(color: str) -> Patch:
     return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
 
 
-def _hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
+def hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
     """Draw stripes and outline of the box at waypoint `k`."""
     xy_m, yaw_rad = centers_xy(agent)[k], float(agent.waypoints.yaw_rad[k])
     add_lines(ax, box_stripes(agent, xy_m, yaw_rad, view), colors=stripe, linewidths=STRIPE_PT, zorder=z)
@@ -303,8 +420,6 @@ LANES, LINES = BACKGROUND + 0.2, BACKGROUND + 0.4  # z-order: above a picture of
 MIN_LINE_PT, BORDER_PT = 0.9, 0.8
 DASHES = (0, (4.0, 3.0))
 ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)  # arrows along lanes: distance from one to the next, length and half width
-
-
 SENSOR: dict[str, Any] = {"marker": "^", "ms": SENSOR_PT, "mfc": SENSOR_COLOR, "mec": PAPER, "mew": 0.8, "ls": "none"}
 
 
@@ -341,13 +456,6 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
         style = {"linestyles": [DASHES]} if dashed else {"capstyle": "butt"}
         points, colors = [m.points_m[:, :2] for m in lines], [_shade(m, 1.0) for m in lines]
         add_lines(ax, points, colors=colors, linewidths=widths, zorder=LINES, **style)
-
-
-def draw_signals(ax: Axes, signals: Sequence[Signal], t_s: float) -> None:
-    """Draw traffic lights in the color of their state at a time, s."""
-    for signal in signals:
-        color = SIGNAL_COLOR[str(signal.at(t_s)[0])]
-        ax.plot(*signal.position_m[:2], "o", ms=5.0, mfc=color, mec=PAPER, mew=0.9, zorder=LABEL - 0.3)
 
 
 class SignalLights:

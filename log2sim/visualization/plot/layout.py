@@ -37,17 +37,14 @@ from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport,
 LABEL_Z = 8.0
 # Mean width of a bold letter of the font and half the height of a line, of its size.
 LETTER_WIDTH, LETTER_HALF_HEIGHT = 0.68, 0.55
-
 # Where a label may be beside its box, the best first.
 SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0))
-
 RINGS_PT = (0.0, 6.0)  # how far from the box it may be
 FAR_RINGS_PT = (0.0, 6.0, 14.0)  # the same for a short label that has no room closer to its track than to any other
 ALONG_TRACK = (0.75, 0.5, 0.25, 0.0)  # shares of a track at which a label may be when there is no room at its end
 MAX_TRACK_POINTS = 40  # points of a track that labels keep clear of; for 500 agents more would take seconds
 MOVER_PT, DETAIL_PT = 7.0, 6.0
 MAX_ID_LETTERS, MAX_REASON_LETTERS = 20, 44
-
 Bounds = tuple[float, float, float, float]  # of a rectangle: least x and y, greatest x and y, m
 Anchor = tuple[Array, Array]  # what a label is beside: its place (2,) and half its extents (2,), m
 
@@ -179,11 +176,7 @@ class LabelRoom:
         self.view, self.taken = view, taken
 
     def place(
-        self,
-        text: str,
-        size_pt: float,
-        anchors: Iterable[Anchor],
-        fits: Callable[[Array, Array], bool] | None = None,
+        self, text: str, size_pt: float, anchors: Iterable[Anchor], fits: Callable[[Array, Array], bool] | None = None
     ) -> Array | None:
         """Reserve room for a text beside the first anchor that has it, and return its middle (2,), m; None without.
 
@@ -240,10 +233,8 @@ def _bounds(agent: Agent, k: int) -> Bounds:
 
 # With more leading movers their speeds are in the legend: longer labels would cover the boxes of others.
 MAX_NAMED = 8
-
 # Where a label may be beside its box, the best first.
 MOVING_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
-
 GAP_PT = 2.0
 
 

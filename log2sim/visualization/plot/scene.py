@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from log2sim.datatypes import ENDS, Scenario
 from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.expected_motion import ends_of
-from log2sim.visualization.plot import drawing, layers
+from log2sim.visualization.plot import layers
 from log2sim.visualization.plot.layout import (
     SIDE_IN,
     TOP_IN,
@@ -27,7 +27,7 @@ from log2sim.visualization.plot.layout import (
     write_title,
 )
 from log2sim.visualization.plot.selection import PlotOptions, TimeRange
-from log2sim.visualization.plot.style import END_COLOR, FONT, MUTED, style_axes
+from log2sim.visualization.plot.style import END_COLOR, FONT, MUTED, PAPER, SIGNAL_COLOR, style_axes
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
 from log2sim.visualization.plot.viewport import (
     MAX_UNCROWDED_MOVERS,
@@ -95,13 +95,20 @@ def draw_standing(
     ax: Axes, scenario: Scenario, roles: AgentRoles, view: Viewport, background: Any, *, signals_s: float | None
 ) -> None:
     """Draw what stands: the ground, the road with its traffic lights at a time, if any, and the agents that never move."""
-    if background is not None:
-        drawing.draw_background(ax, background)
+    if background is not None:  # lightened so that tracks stand out
+        pale = 0.62 * background.image_bgr[..., ::-1].astype(np.float32) + 0.38 * 255
+        rgba = np.dstack([np.rint(pale).astype(np.uint8), (background.alpha * 0.95).astype(np.uint8)])
+        how: dict[str, Any] = {"origin": "upper", "interpolation": "antialiased", "aspect": "auto"}
+        ax.imshow(rgba, extent=background.extent_m, zorder=layers.BACKGROUND, **how)
     layers.draw_road(ax, scenario, view, over_picture=background is not None)
     if signals_s is not None:
-        layers.draw_signals(ax, scenario.signals, signals_s)
-    drawing.draw_stationary(ax, roles.stationary, view)
-    layers.hatch_stationary(ax, roles, view, drawing.STATIONARY + 0.1)
+        for signal in scenario.signals:
+            color, z = SIGNAL_COLOR[str(signal.at(signals_s)[0])], layers.LABEL - 0.3
+            ax.plot(*signal.position_m[:2], "o", ms=5.0, mfc=color, mec=PAPER, mew=0.9, zorder=z)
+    layers.draw_stationary(ax, roles.stationary, view)
+    for agent in (agent for agent in roles.stationary if agent.is_doubtful):
+        middle, z = len(agent.waypoints) // 2, layers.STATIONARY + 0.1
+        layers.hatch(ax, agent, middle, view, stripe=MUTED, edge=MUTED, z=z)
 
 
 def draw_moving(
@@ -116,15 +123,15 @@ def draw_moving(
 ) -> None:
     """Draw the tracks of agents, pale where truth or replay lie over them; with `ghosts` also boxes along those."""
     overlaid = truth is not None or replay is not None
-    drawing.draw_tracks(ax, roles, view, step_s, alpha=0.45 if overlaid else 1.0)
+    layers.draw_tracks(ax, roles, view, step_s, alpha=0.45 if overlaid else 1.0)
     crowded = overlaid or not ghosts or len(roles.movers) > MAX_UNCROWDED_MOVERS
-    drawing.draw_ends(ax, roles, view, ghosts_step_s=None if crowded else step_s)
-    layers.hatch_movers(ax, roles, view, drawing.TRACK + 0.5, drawing.BOX + 0.6)
+    layers.draw_ends(ax, roles, view, ghosts_step_s=None if crowded else step_s)
+    layers.hatch_movers(ax, roles, view, layers.TRACK + 0.5, layers.BOX + 0.6)
     if truth is not None:
-        drawing.draw_truth(ax, truth)
+        layers.draw_truth(ax, truth)
     if replay is not None:
-        drawing.draw_replay(ax, replay, roles)
-        drawing.draw_collisions(ax, layers.new_collisions(replay)[1])
+        layers.draw_replay(ax, replay, roles)
+        layers.draw_collisions(ax, layers.new_collisions(replay)[1])
 
 
 def _view_of(roles: AgentRoles, options: PlotOptions) -> Viewport:

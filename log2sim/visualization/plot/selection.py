@@ -16,14 +16,11 @@ STILL, MOVING = (".png", ".svg", ".pdf"), (".gif", ".mp4", ".webm")
 IN_PIXELS = (".png", *MOVING)  # kinds of pictures that have pixels
 # A .gif of more frames is large; films at the rate of the logs would jerk, and states between waypoints are known.
 FPS = {".gif": 10.0, ".mp4": 25.0, ".webm": 25.0}
-
 MIN_FPS = 1.0
 # A .gif states the time of a frame in hundredths of a second, and browsers slow down those of one hundredth.
 MAX_FPS = {".gif": 50.0, ".mp4": 120.0, ".webm": 120.0}
-
 # What lasts longer is shown faster than real time unless the speed is given, and the picture says so.
 MAX_REAL_TIME_S = {".gif": 30.0, ".mp4": 60.0, ".webm": 60.0}
-
 MIN_SIDE_PX, MAX_SIDE_PX = 240, 7680
 MAX_SPEED = 1000.0
 MIN_EXTENT_M = 1.0

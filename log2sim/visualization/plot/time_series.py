@@ -26,8 +26,6 @@ from log2sim.visualization.plot.style import ALARM, FONT, FRAME, INK, MUTED, PAP
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles
 
 KMH = 3.6
-
-
 # A curve of a chart: label, times and values (T,), and "thin", "muted" where it is secondary, or "ribbon" where it is the reference
 # of the thin line over it.
 Curve = tuple[str, Array, Array, str]
@@ -63,31 +61,21 @@ def timeline_of(replay: Any, roles: AgentRoles) -> AgentTimeline | None:
     agent = max(driven, key=lambda a: (a.id == "ego", float(np.max(np.abs(a.cross_track_m)))))
     role = role_of[agent.id]
     events = [e for e in replay.metrics.get("collisions", ()) if agent.id in e["agents"] and e["belongs_to"] == REPLAY]
-    return AgentTimeline(role, agent.driver, _strips(agent, role), tuple(e["t_s"] for e in events))
-
-
-def _strips(agent: Any, role: AgentRole) -> tuple[Chart, ...]:
-    t, w = agent.t_s, role.agent.waypoints
-    out = [
-        Chart(
-            "speed", "km/h", 4.0,
-            (("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), ("replay", t, agent.speed_mps * KMH, "thin")),
-        )
-    ]  # fmt: skip
-    if agent.commands is not None:
-        commands = agent.commands
+    t, w, commands = agent.t_s, role.agent.waypoints, agent.commands
+    speeds: tuple[Curve, ...] = (
+        ("scenario", w.t_s, w.speed_mps * KMH, "ribbon"), ("replay", t, agent.speed_mps * KMH, "thin"),
+    )  # fmt: skip
+    charts = [Chart("speed", "km/h", 4.0, speeds)]
+    if commands is not None:
         # The pedal acts along the gear's direction, which in reverse is against the heading.
-        response = agent.accel_mps2 * commands.gear
-        out += [
-            Chart("pedal", "m/s²", 1.0, (("command", t, commands.pedal_mps2, "ribbon"), ("response", t, response, "thin"))),
-            Chart(
-                "steering", "°", 2.0,
-                (("command", t, np.degrees(commands.steer_rad), "ribbon"), ("response", t, np.degrees(agent.steer_rad), "thin")),
-            ),
-        ]  # fmt: skip
+        response, steer = agent.accel_mps2 * commands.gear, np.degrees(commands.steer_rad)
+        wheel = ("command", t, steer, "ribbon"), ("response", t, np.degrees(agent.steer_rad), "thin")
+        pedal = ("command", t, commands.pedal_mps2, "ribbon"), ("response", t, response, "thin")
+        charts += [Chart("pedal", "m/s²", 1.0, pedal), Chart("steering", "°", 2.0, wheel)]
     along, across = agent.along_track_m, agent.cross_track_m
-    lines = (("along (+ ahead)", t, along, "muted"), ("across (+ left)", t, across, "thin"))
-    return (*out, Chart("tracking error", "m", 0.1, lines))
+    errors = ("along (+ ahead)", t, along, "muted"), ("across (+ left)", t, across, "thin")
+    charts.append(Chart("tracking error", "m", 0.1, errors))
+    return AgentTimeline(role, agent.driver, tuple(charts), tuple(e["t_s"] for e in events))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +124,8 @@ def draw_charts(
     axes: list[Axes] = []
     for k, chart in enumerate(timeline.charts):
         bottom = top - (k + 1) * (CHART_IN + CHART_GAP_IN) + CHART_GAP_IN
-        ax = layout.figure.add_axes(
-            (LEFT_IN / layout.width_in, bottom / height, width / layout.width_in, CHART_IN / height)
-        )
+        place = LEFT_IN / layout.width_in, bottom / height, width / layout.width_in, CHART_IN / height
+        ax = layout.figure.add_axes(place)
         _draw_strip(ax, chart, timeline, span_s, last=k == count - 1, moving=moving)
         axes.append(ax)
     role, spoken = timeline.role, {"pid": "PID", "policy": "a policy", "reactive": "what is ahead"}

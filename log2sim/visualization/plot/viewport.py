@@ -193,9 +193,8 @@ def heading_triangles(corners: Array) -> Array:
     front_left, rear_left, rear_right, front_right = np.moveaxis(corners, 1, 0)
     left, right = front_left + depth * (rear_left - front_left), front_right + depth * (rear_right - front_right)
     inset = 0.2  # narrower than deep, so that it cannot be read as pointing sideways
-    return np.stack(
-        [left + inset * (right - left), right + inset * (left - right), (front_left + front_right) / 2], axis=1
-    )
+    tip = (front_left + front_right) / 2
+    return np.stack([left + inset * (right - left), right + inset * (left - right), tip], axis=1)
 
 
 def stripes(corners: Array, spacing_m: float) -> Array:
