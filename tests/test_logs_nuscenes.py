@@ -21,7 +21,7 @@ from log2sim import Config, reconstruct
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, apply, inverse
-from log2sim.logs.nuscenes import scene
+from log2sim.logs.nuscenes import scene as tables
 from log2sim.logs.nuscenes.scene import FIRING_NS
 from log2sim.logs.opening import open_log
 from log2sim.logs.stamps import compute_scan_offset_ns
@@ -81,7 +81,7 @@ def test_scanning_finds_what_parsing_the_whole_table_finds(
     longest = max((len(json.dumps(row, **form).encode()) for row in rows), default=0)
     with patch.object(tables, "MAX_RECORD_BYTES", longest + 64):
         for key in ("token", "sample_token"):
-            found = list(scene.scan_records(path, key, wanted, chunk_bytes=data.draw(st.integers(1, 400))))
+            found = list(tables.scan_records(path, key, wanted, chunk_bytes=data.draw(st.integers(1, 400))))
             assert found == [row for row in rows if row.get(key) in wanted]
 
 
