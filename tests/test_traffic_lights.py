@@ -10,7 +10,7 @@ import pytest
 
 from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import box_corners, inverse, project
-from log2sim.perception.traffic_light_boxes import LightBox, add_ranges, crop_lights
+from log2sim.perception.frames import LightBox, add_ranges, crop_lights
 from log2sim.road.signals import STATES, find_signals, lamp_evidence, place_lights
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize

@@ -1,6 +1,7 @@
 """Oriented boxes of LiDAR points: yaw, extents, and the completion of partly observed ones.
 
-All functions work in the length and width axes of the boxes; leading dimensions (...) are boxes.
+All functions work in the length and width axes of the boxes; leading dimensions (...) are boxes. Points of several clusters are
+rows (N, ...), those of the first cluster, then those of the next; `count` (R,) is the number of each, at least 1.
 """
 
 from __future__ import annotations
@@ -31,12 +32,9 @@ MAX_OFFSETS = 1 << 18
 
 
 def fit_yaws(xy_m: Array, count: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Find the yaw of the rectangle whose sides are nearest to the points of each of M clusters, up to quarter turns.
+    """Find the yaw of the rectangle whose sides are nearest to the points (N, 2), m, of each of R clusters, up to quarter turns.
 
-    `xy_m`: (N, 2), m: points of the first cluster, then those of the next. `count`: (M,): number of points of each cluster,
-    at least 1.
-
-    Returns `yaw_rad`: (M,): in [0, pi/2); `contrast`: (M,): score of the best direction over the median score, less 1: 0
+    Returns `yaw_rad`: (R,): in [0, pi/2); `contrast`: (R,): score of the best direction over the median score, less 1: 0
     for a round or shapeless cluster; below about `MIN_CONTRAST` the yaw carries no information.
 
     Closeness criterion of Zhang, Xu, Dong & Dolan, "Efficient L-Shape Fitting for Vehicle Detection Using Laser
@@ -50,10 +48,7 @@ def fit_yaws(xy_m: Array, count: NDArray[np.intp]) -> tuple[Array, Array]:
 
 
 def correct_yaws(xy_m: Array, count: NDArray[np.intp], yaw_rad: Array) -> Array:
-    """Correct yaws (M,) that are known roughly by the direction of the sides of M clusters, where these show it.
-
-    Parameters are those of `fit_yaws`.
-    """
+    """Correct yaws (R,) that are known roughly by the direction of the sides of R clusters, where these show it."""
     out = yaw_rad.copy()
     enough = np.flatnonzero(count >= MIN_YAW_POINTS)
     if len(enough):
@@ -155,10 +150,7 @@ def fit_extents_of_clusters(
 ) -> tuple[Array, Array, Array]:
     """Fit the length axes and the extents of several clusters, as `fit_extents` does for one.
 
-    `xy_m`: (N, 2), m: points of the first cluster, then those of the next, relative to the viewpoint. `count`: (R,): number
-    of points of each cluster, at least 1. `typical`: (R, 3), m. `known_yaw_rad`: (R,): NaN where it is not known.
-
-    Returns `yaw_rad`: (R,); `low`, `high`: (R, 2), m.
+    `known_yaw_rad`: (R,): NaN where it is not known. Returns `yaw_rad`: (R,); `low`, `high`: (R, 2), m.
     """
     known = np.isfinite(known_yaw_rad)
     yaw, of_known = known_yaw_rad.copy(), np.repeat(known, count)
@@ -175,10 +167,7 @@ def fit_extents_of_clusters(
 
 
 def extents_of_clusters(xy_m: Array, count: NDArray[np.intp], yaw_rad: Array) -> tuple[Array, Array]:
-    """Measure the lower and upper ends (R, 2), (R, 2) of clusters along the length and width axes of their yaws (R,).
-
-    `xy_m`: (N, 2), m: points of the first cluster, then those of the next. `count`: (R,): number of points of each cluster, at
-    least 1.
+    """Measure the lower and upper ends (R, 2), (R, 2), m, of clusters along the length and width axes of their yaws (R,).
 
     The ends are quantiles, so that a few stray points do not stretch a box, but at most `MAX_TRIM_M` inside the third outermost
     point: the far ends of a long object close by hold few of its points.
@@ -246,10 +235,7 @@ def azimuth_step_rad(xy: Array) -> float:
 
 
 def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    """Return the indices of at most so many points of each cluster, evenly spread over its surface.
-
-    `range_m`: (N,), m: distances from the sensor of the points of the first cluster, then those of the next. `count`: (R,):
-    number of points of each cluster, at least 1.
+    """Return the indices of at most so many points of each cluster, at distances (N,), m, evenly spread over its surface.
 
     A ray stands for a surface that grows with the square of the distance. Of every n-th point hardly one would be on
     the far end of a long vehicle beside the sensor.

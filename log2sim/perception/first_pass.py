@@ -36,7 +36,7 @@ from log2sim.files.stages import StageClock
 from log2sim.geometry import Array, inverse, line_stamps_ns
 from log2sim.perception.cooperative import align_parts
 from log2sim.perception.detect3d.detectors import LidarDetector
-from log2sim.perception.frames import FrameDetector
+from log2sim.perception.frames import MAX_CROPS, FrameDetector, LightBox, add_ranges
 from log2sim.perception.homography.correspondences import (
     Correspondences,
     feet_of_boxes,
@@ -57,7 +57,6 @@ from log2sim.perception.lidar.projection import View, project_points, view_of
 from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import Schedule
-from log2sim.perception.traffic_light_boxes import MAX_CROPS, LightBox, add_ranges
 from log2sim.plan import FusionLevel, Plan, Stage
 
 
@@ -371,7 +370,7 @@ class FirstPass:
                 skipped.append(camera)
                 if plan.picture_stride > 1:
                     continue
-            boxes, thumbnail, shown = (Detections.empty(), None, ()) if found is None else vars(found).values()
+            boxes, thumbnail, shown = (Detections.empty(), None, ()) if found is None else found
             searched += found is not None
             index = int(self.schedule.frames[camera][tick])
             if not plan.keeps(Stage.IMAGE_DECODING) or records.is_live(camera, index, thumbnail, found=len(boxes) > 0):

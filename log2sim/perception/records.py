@@ -227,20 +227,6 @@ def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
     return SweepSketch(len(sweep.xyz_m), len(xyz), smallest)
 
 
-def common_share(a: SweepSketch, b: SweepSketch) -> float:
-    """Estimate the share of the obstacle points of two sweeps that both have; 0 without any.
-
-    The smallest hashes are a sample of all cells, the same for both (Broder, "On the resemblance and containment of
-    documents", 1997). With the Jaccard index J of two sets of one size the share is 2 J / (1 + J).
-    """
-    either = np.union1d(a.hashes, b.hashes)[: max(len(a.hashes), len(b.hashes))]
-    if len(either) == 0:
-        return 0.0
-    both = np.isin(either, a.hashes, assume_unique=True) & np.isin(either, b.hashes, assume_unique=True)
-    jaccard = float(both.mean())
-    return 2 * jaccard / (1 + jaccard)
-
-
 PictureState = Literal["live", "black", "frozen"]
 
 # A copy that was compressed again differs by less than a gray level; motion that should change a picture by five
@@ -347,7 +333,15 @@ class LidarWatch:
         since_ns, copy = t_ns, False
         if self._last is not None and min(sketch.obstacles, self._last[0].obstacles) >= MIN_OBSTACLES:
             before, last_since_ns = self._last
-            share, motion = common_share(before, sketch), motion_of(self.log, self.name, last_since_ns, t_ns)
+            # The share of the obstacle points that both have. The smallest hashes are a sample of all cells, the same for both
+            # (Broder, "On the resemblance and containment of documents", 1997). With the Jaccard index J of two sets of one size the
+            # share is 2 J / (1 + J).
+            either = np.union1d(before.hashes, sketch.hashes)[: max(len(before.hashes), len(sketch.hashes))]
+            both = np.isin(either, before.hashes, assume_unique=True) & np.isin(
+                either, sketch.hashes, assume_unique=True
+            )
+            jaccard = float(both.mean()) if len(either) else 0.0
+            share, motion = 2 * jaccard / (1 + jaccard), motion_of(self.log, self.name, last_since_ns, t_ns)
             if motion == "drives":  # only where all points of structures are in other cells
                 poses, _ = self.log.map_T_sensor(self.name, np.array([last_since_ns, t_ns]))
                 moved_m = np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3])

@@ -61,7 +61,9 @@ class StageCache:
             return make()
         with self._clock.stage("recall"):
             software = software_key(STAGE_SOURCES).encode()
-            key = [_sensors(self.log), _sensors(log), _stamps(log), of]
+            stamps = [log.streams[name].t_ns for name in (*log.cameras, *log.lidars)]
+            about = [log.ground_z_ego_m, log.reference_camera, *stamps]
+            key = [_sensors(self.log), _sensors(log), about, of]
             name = f"{stage}.{_digest(software).hex()[:8]}.{_digest(software, stage.encode(), pack(key)).hex()}"
             try:
                 whose, records, content, value = unpack(self._store.get(name) or b"", classes)
@@ -129,10 +131,6 @@ class StageCache:
 def _sensors(log: Log) -> list[Any]:
     """Return where the sensors of a log are at any time."""
     return [log.cameras, log.lidars, log.ego, log.ego_vehicle]
-
-
-def _stamps(log: Log) -> list[Any]:
-    return [log.ground_z_ego_m, log.reference_camera, *(log.streams[name].t_ns for name in (*log.cameras, *log.lidars))]
 
 
 class FirstPassCache:

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from log2sim.datatypes import Log, Scenario, Signal
 from log2sim.geometry import NS_PER_S, Array, undistort
-from log2sim.perception.traffic_light_boxes import LightBox
+from log2sim.perception.frames import LightBox
 
 STATES = ("red", "red_yellow", "yellow", "green", "off")
 # Hues of lamps in degrees (HSV), from EN 12368's chromaticities and what cameras make of them: the bounds lie between red (0 to

@@ -135,10 +135,11 @@ def stitch(
     return current
 
 
-def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of tracks of one group or related ones of which the second starts after the first ends: soon, or where it stood."""
+def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Return the pairs (P,), (P,) of tracks of which the second may continue the first, and the cost (P,) of each."""
     from scipy.spatial import cKDTree
 
+    # The second of two tracks of related groups starts after the first ends: soon, or where it stood.
     order = np.argsort(ends.first_ns, kind="stable")
     starts = ends.first_ns[order]
     # A margin of a microsecond for the comparison in seconds that follows.
@@ -147,12 +148,13 @@ def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], ND
     count = np.maximum(until - after, 0)
     a = np.repeat(np.arange(len(starts)), count)
     b = order[np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(after, count)]
-    slow_end, slow_start = (
-        np.flatnonzero(np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS) for state in (ends.last, ends.first)
+    ends_stationary, starts_stationary = (
+        np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last, ends.first)
     )
+    slow_end, slow_start = np.flatnonzero(ends_stationary), np.flatnonzero(starts_stationary)
     if len(slow_end) and len(slow_start):
-        near = cKDTree(ends.first[slow_start, :2])
-        found = near.query_ball_point(ends.last[slow_end, :2], MAX_STATIONARY_OFFSET_M)
+        places = cKDTree(ends.first[slow_start, :2])
+        found = places.query_ball_point(ends.last[slow_end, :2], MAX_STATIONARY_OFFSET_M)
         a = np.concatenate([a, np.repeat(slow_end, [len(k) for k in found])])
         b = np.concatenate([b, slow_start[np.concatenate([*found, []]).astype(np.intp)]])
     pairs = np.unique(a * len(starts) + b)
@@ -160,16 +162,8 @@ def _possible_pairs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], ND
     related = np.isin(ends.group, RELATED_GROUPS)
     alike = (ends.group[a] == ends.group[b]) | related[a] & related[b]
     possible = alike & (ends.first_ns[b] > ends.last_ns[a])
-    return a[possible], b[possible]
-
-
-def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return the pairs (P,), (P,) of tracks of which the second may continue the first, and the cost (P,) of each."""
-    a, b = _possible_pairs(ends, max_gap_s)
+    a, b = a[possible], b[possible]
     gap_s = (ends.first_ns[b] - ends.last_ns[a]) / NS_PER_S
-    ends_stationary, starts_stationary = (
-        np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last, ends.first)
-    )
     stationary = ends_stationary[a] & starts_stationary[b]
     last, first = ends.last[a], ends.first[b]
     offset_m = np.hypot(*(last - first)[:, :2].T)

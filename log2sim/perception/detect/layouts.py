@@ -262,10 +262,6 @@ def cell_count(size: tuple[int, int]) -> int:
 # YOLOX before decoding: (1, cells, 5 + C), offsets in cells, logarithms of sizes, objectness, class scores.
 
 
-def _is_undecoded(outputs: Outputs) -> bool:
-    return bool(np.median(np.abs(largest_output(outputs)[0, :, :2])) < MAX_OFFSET_CELLS)
-
-
 def _from_yolox(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
     raw = largest_output(outputs)[0]
     if len(raw) != cell_count(size):
@@ -385,7 +381,8 @@ LAYOUTS: Mapping[str, Layout] = {
         ),
         Layout(
             "yolox", _CORNER,
-            lambda outputs, shape, cells: shape[0] == cells and shape[1] > 5 and _is_undecoded(outputs),
+            lambda outputs, shape, cells: shape[0] == cells and shape[1] > 5
+            and bool(np.median(np.abs(largest_output(outputs)[0, :, :2])) < MAX_OFFSET_CELLS),
             _count_in_rows, _from_yolox,
         ),
         Layout(

@@ -137,13 +137,15 @@ class Tile:
 def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, input_px: int | None) -> list[Tile]:
     """Plan the whole image and one row of tiles from left to right, vertically centered, no higher than wide.
 
-    `tiles`: 1: only the whole image; N: also N tiles; "auto": see `auto_tile_count`. `input_px`: width of the model's
-    input, None where it takes any size.
+    `tiles`: 1: only the whole image; N: also N tiles; "auto": so many that none is downscaled by more than `MAX_DOWNSCALING`.
+    `input_px`: width of the model's input, None where it takes any size.
 
     The sky and the road right in front of the car are seen in the whole image only: no far objects are there.
     """
     whole = Tile(0, 0, width_px, height_px)
-    count = auto_tile_count(width_px, input_px) if tiles == "auto" else tiles
+    count = 1 if tiles == "auto" else tiles
+    if tiles == "auto" and input_px is not None and width_px > MAX_DOWNSCALING * input_px:
+        count = min(math.ceil((width_px / (MAX_DOWNSCALING * input_px) - OVERLAP) / (1 - OVERLAP)), MAX_AUTO_TILES)
     if count < 2:
         return [whole]
     tile_width = math.ceil(width_px / (count - (count - 1) * OVERLAP))
@@ -151,14 +153,6 @@ def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, inpu
     v0 = (height_px - tile_height) // 2
     starts = np.rint(np.linspace(0, width_px - tile_width, count)).astype(int).tolist()
     return [whole, *(Tile(u, v0, u + tile_width, v0 + tile_height) for u in starts)]
-
-
-def auto_tile_count(width_px: int, input_px: int | None) -> int:
-    """Count the tiles in a row so that none is downscaled by more than `MAX_DOWNSCALING`; 1 if the image is not."""
-    if input_px is None or width_px <= MAX_DOWNSCALING * input_px:
-        return 1
-    needed = (width_px / (MAX_DOWNSCALING * input_px) - OVERLAP) / (1 - OVERLAP)
-    return min(math.ceil(needed), MAX_AUTO_TILES)
 
 
 def merge(found: list[tuple[Tile, Detections]], width_px: int, height_px: int, max_overlap: float) -> Detections:
@@ -339,7 +333,28 @@ def open_onnx(
     if layout_name is not None and layout_name not in LAYOUTS:
         raise ConfigError(f"unknown layout '{layout_name}'; known: {', '.join(LAYOUTS)}")
     model = load_model(path)
-    layout, outputs = recognize_layout(model, None if layout_name is None else LAYOUTS[layout_name])
+    # Declared shapes are not enough: many exports leave them open, and decoded boxes look like undecoded ones.
+    tried: dict[tuple[int, ...], Outputs] = {}
+    outputs: Outputs = {}
+    failure: ConfigError | None = None
+    for layout in LAYOUTS.values() if layout_name is None else [LAYOUTS[layout_name]]:
+        probe, placement = layout.preprocessing(PROBE, model.spec)
+        if probe.shape not in tried:
+            try:
+                tried[probe.shape] = model.run(probe)
+            except ConfigError as error:  # many models of any size want multiples of 32, which not every layout gives
+                tried[probe.shape], failure = {}, failure or error
+        outputs = tried[probe.shape] or outputs
+        shape, cells = single_output_shape(outputs), cell_count(placement.input_px)
+        if tried[probe.shape] and (layout_name is not None or layout.matches(outputs, shape, cells)):
+            break
+    else:
+        if failure is not None and not outputs:
+            raise failure
+        raise ConfigError(
+            f"{path}: outputs {describe_outputs(outputs)} are of no layout that is recognized by itself; name one with "
+            f"layout=: {', '.join(LAYOUTS)}"
+        )
     spec, side = model.spec, layout.preprocessing.default_px or PROBE_PX
     try:
         count = layout.class_count(outputs)
@@ -361,33 +376,4 @@ def open_onnx(
     weak = WEAK_SHARE * score if min_score is None else score
     return OnnxDetector(
         name or path.name, model, layout, classes, score, weak, max_overlap, tiles, layout.default_min_score
-    )
-
-
-def recognize_layout(model: OnnxModel, chosen: Layout | None) -> tuple[Layout, Outputs]:
-    """Recognize the layout of a model by its outputs for a gray image; returns both.
-
-    The declared shapes are not enough: many exports leave them open, and decoded boxes look like undecoded ones.
-    """
-    tried: dict[tuple[int, ...], Outputs] = {}
-    outputs: Outputs = {}
-    failure: ConfigError | None = None
-    for layout in [chosen] if chosen is not None else LAYOUTS.values():
-        probe, placement = layout.preprocessing(PROBE, model.spec)
-        if probe.shape not in tried:
-            try:
-                tried[probe.shape] = model.run(probe)
-            except ConfigError as error:  # many models of any size want multiples of 32, which not every layout gives
-                failure = failure or error
-                tried[probe.shape] = {}
-        if not tried[probe.shape]:
-            continue
-        outputs = tried[probe.shape]
-        if chosen is not None or layout.matches(outputs, single_output_shape(outputs), cell_count(placement.input_px)):
-            return layout, outputs
-    if failure is not None and not outputs:
-        raise failure
-    raise ConfigError(
-        f"{model.path}: outputs {describe_outputs(outputs)} are of no layout that is recognized by itself; "
-        f"name one with layout=: {', '.join(LAYOUTS)}"
     )

@@ -402,7 +402,20 @@ def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
         encoded, logits = converter.translate(ENCODED_BOXES), converter.translate(CLASS_LOGITS)
     except KeyError as error:
         raise ValueError(f"the graph has no node {error}") from None
-    anchors = anchor_boxes()
+    # Anchors (1917, 4) center v, u, height, width in 0-1: by layer, cell row by row, then shape. SSD (Liu et al., 2016) with the
+    # object detection API's reduced lowest layer: three shapes there, six elsewhere.
+    scales = [*np.linspace(MIN_SCALE, MAX_SCALE, len(FEATURE_CELLS)), 1.0]
+    layers = []
+    for layer, cells in enumerate(FEATURE_CELLS):
+        scale = scales[layer]
+        shapes = [(scale, ratio) for ratio in (1.0, 2.0, 0.5, 3.0, 1 / 3)] + [(np.sqrt(scale * scales[layer + 1]), 1.0)]
+        if layer == 0:
+            shapes = [(0.1, 1.0), (scale, 2.0), (scale, 0.5)]
+        size = np.array([(s / np.sqrt(ratio), s * np.sqrt(ratio)) for s, ratio in shapes])
+        v, u = np.mgrid[:cells, :cells]
+        middle = (np.stack([v.ravel(), u.ravel()], axis=1) + 0.5) / cells
+        layers.append(np.concatenate([np.repeat(middle, len(size), axis=0), np.tile(size, (len(middle), 1))], axis=1))
+    anchors = np.concatenate(layers).astype(np.float32)
     # Decoding: center = c * 0.1 * anchor size + anchor center, size = exp(s * 0.2) * anchor size.
     store, add = converter.store, converter.add
     axes = store("decode/axes", np.array([2], dtype=np.int64))
@@ -425,26 +438,6 @@ def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
     entry = model.metadata_props.add()
     entry.key, entry.value = "names", repr(dict(enumerate(CLASS_NAMES.values())))
     return model
-
-
-def anchor_boxes() -> NDArray[np.float32]:
-    """Build the anchors (1917, 4) center v, u, height, width in 0-1: by layer, cell row by row, then shape.
-
-    SSD (Liu et al., 2016) with the object detection API's reduced lowest layer: three shapes there, six elsewhere.
-    """
-    scales = [*np.linspace(MIN_SCALE, MAX_SCALE, len(FEATURE_CELLS)), 1.0]
-    layers = []
-    for layer, cells in enumerate(FEATURE_CELLS):
-        scale = scales[layer]
-        shapes = [(scale, ratio) for ratio in (1.0, 2.0, 0.5, 3.0, 1 / 3)] + [(np.sqrt(scale * scales[layer + 1]), 1.0)]
-        if layer == 0:
-            shapes = [(0.1, 1.0), (scale, 2.0), (scale, 0.5)]
-        size = np.array([(s / np.sqrt(ratio), s * np.sqrt(ratio)) for s, ratio in shapes])
-        v, u = np.mgrid[:cells, :cells]
-        center = (np.stack([v.ravel(), u.ravel()], axis=1) + 0.5) / cells
-        pairs = [np.repeat(center, len(size), axis=0), np.tile(size, (len(center), 1))]
-        layers.append(np.concatenate(pairs, axis=1))
-    return np.concatenate(layers).astype(np.float32)
 
 
 NAME = "ssd-mobilenet-v2"

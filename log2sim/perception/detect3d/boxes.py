@@ -172,13 +172,18 @@ def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: 
     height = np.clip(box[2:3].T, MIN_CENTER_HEIGHT_M, MAX_CENTER_HEIGHT_M)
     size = np.exp(np.clip(box[3:6].T, np.log(MIN_SIDE_M), np.log(MAX_SIDE_M)))
     yaw, heading_score = headings(values[channels.axis], values[channels.direction])
+    # The most probable category within the group.
+    category, places = np.empty(len(group), dtype="<U16"), channels.category
+    for k, name in enumerate(info.groups):
+        rows, names = np.flatnonzero(group == k), np.array(info.categories[name], dtype="<U16")
+        category[rows] = names[values[places[name]][:, rows].argmax(axis=0)] if name in places else names[0]
     found = LevelBoxes(
         np.concatenate([cells.middle_m + offset, height], axis=1),
         size,
         yaw,
         heading_score,
         group,
-        categories_of(values, group, info),
+        category,
         np.clip(heat, -MAX_LOGIT, MAX_LOGIT),
         np.clip(values[channels.quality], -MAX_LOGIT, MAX_LOGIT),
     )
@@ -199,15 +204,6 @@ def headings(axis: Array, direction: Array) -> tuple[Array, Array]:
     along = direction[0] * np.sin(yaw) + direction[1] * np.cos(yaw)
     turned = np.asarray(wrap_angle(np.where(along < 0, yaw + np.pi, yaw)), dtype=np.float64)
     return turned, (1 + np.minimum(np.abs(along), 1.0)) / 2
-
-
-def categories_of(values: Array, group: NDArray[np.intp], info: NetworkInfo) -> NDArray[np.str_]:
-    """Choose the most probable category (K,) within the group (K,) of each box, by the logits among values (C, K)."""
-    out, places = np.empty(len(group), dtype="<U16"), info.channels.category
-    for k, name in enumerate(info.groups):
-        rows, names = np.flatnonzero(group == k), np.array(info.categories[name], dtype="<U16")
-        out[rows] = names[values[places[name]][:, rows].argmax(axis=0)] if name in places else names[0]
-    return out
 
 
 def sigmoid(logit: Array) -> Array:

@@ -21,7 +21,6 @@ from log2sim.perception.homography.fit import (
     RANSAC_SCHEDULE_OF_A_FRAME,
     HomographyFit,
     PitchRoll,
-    RansacRound,
     RansacSchedule,
     ground_covariances,
     ransac,
@@ -32,12 +31,10 @@ from log2sim.perception.homography.normalized import NormalizedCorrespondences, 
 from log2sim.perception.homography.pitch_roll import (
     PITCH_SIGMA_PX,
     HeldOutErrors,
-    angle_sigmas_deg,
     fit_pitch_roll,
     held_out_errors,
     stabilized,
     stabilizing_warps,
-    two_folds,
 )
 
 STREAM_METHODS = ("time-aware", "calibrated")
@@ -66,7 +63,7 @@ class EstimationOptions:
         """Return the RANSAC schedule: the default one, or a single round of `hypotheses` samples."""
         if self.hypotheses is None:
             return default
-        return (RansacRound(self.hypotheses, max(self.hypotheses // 8, 8), 0.0),)
+        return ((self.hypotheses, max(self.hypotheses // 8, 8), 0.0),)
 
 
 def estimate_homography(
@@ -82,7 +79,7 @@ def estimate_homography(
     "time-aware" draws one half of its samples from single frames, where correspondences share the camera's momentary
     pose, and one half from all frames. It scores each hypothesis over all frames and obstacles with a bounded loss of
     the whitened error, and refines the best over all of its inliers. "calibrated" does the same over the six parameters
-    of the pose of a camera with known intrinsics. The others are baselines, see `baselines`.
+    of the pose of a camera with known intrinsics. The others are baselines, see `correspondences`.
     """
     options = options or EstimationOptions()
     method, of_stream = options.method, options.method in STREAM_METHODS
@@ -162,6 +159,8 @@ MIN_FEET = 80
 MAX_FEET_CONDITION = 30.0
 # Image homographies nearer to the identity are rounding: the camera does not move.
 MIN_WARP = 1e-9
+# Distance in the image, as a share of the focal length, at which the roll of a warp is read.
+ROLL_ARM = 0.2
 # Fewer foot points do not tell whether pitch and roll from ground points place obstacles better.
 MIN_TESTED_FEET = 40
 
@@ -251,8 +250,11 @@ def _test_feet(
         return None
     fixed_options = replace(options, sigma_px=FOOT_SIGMA_PX, sigma_m=FOOT_SIGMA_M)
     moving_options = replace(fixed_options, pitch_roll=True)
-    errors = []
-    for training, test in two_folds(feet):
+    # One half of every tick's correspondences in turn is fitted to, and held against the other half.
+    order = np.argsort(feet.tick, kind="stable")
+    rank = np.arange(len(feet)) - np.searchsorted(feet.tick[order], feet.tick[order])
+    halves, errors = [feet.take(order[rank % 2 == k]) for k in range(2)], []
+    for training, test in (halves, halves[::-1]):
         moving = estimate_homography(training, moving_options, rng=rng)
         if not moving.ok:
             return None
@@ -268,8 +270,17 @@ def _test_feet(
 def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: EstimationOptions) -> PitchRoll:
     """Accept or refuse the angles by the held-out errors."""
     pitches = bool(np.abs(stabilizing_warps(moving) - np.eye(3)).max() > MIN_WARP)
-    sigmas_deg = (float("nan"), float("nan")) if options.K is None else angle_sigmas_deg(moving, options.K)
-    return errors.decide(source, sigmas_deg, moves=pitches)
+    pitch_deg = roll_deg = float("nan")
+    if options.K is not None:  # how they vary over the ticks
+        K, center = options.K, options.K[:2, 2]
+        q = np.linalg.inv(stabilizing_warps(moving)) @ np.column_stack(
+            [[*center, 1.0], [*(center + np.array([ROLL_ARM * K[0, 0], 0.0])), 1.0]]
+        )
+        uv = q[:, :2] / q[:, 2:]
+        du, dv = (uv[:, :, 1] - uv[:, :, 0]).T
+        pitch_deg = float(np.degrees(np.arctan((uv[:, 1, 0] - center[1]) / K[1, 1]).std()))
+        roll_deg = float(np.degrees(np.arctan2(dv, du).std()))
+    return errors.decide(source, (pitch_deg, roll_deg), moves=pitches)
 
 
 # Beyond this range one pixel of a camera at car height is several meters.

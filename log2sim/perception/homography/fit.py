@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,17 +87,10 @@ def _triangle_areas(points: Array) -> Array:
     return np.stack([ab - ac + bc, -bc, ac, ab])
 
 
-class RansacRound(NamedTuple):
-    """One round of drawing, scoring and local optimization."""
-
-    samples: int  # samples of four correspondences to draw
-    scored: int  # how many of them are solved and scored
-    min_inlier_share: float  # share of inliers below which the next round of a schedule runs
-
-
-RansacSchedule = tuple[RansacRound, ...]
-RANSAC_SCHEDULE: RansacSchedule = (RansacRound(500, 64, 0.35), RansacRound(3000, 256, 0.0))
-RANSAC_SCHEDULE_OF_A_FRAME: RansacSchedule = (RansacRound(120, 48, 0.5), RansacRound(500, 96, 0.0))
+# Rounds: samples of four to draw, how many of them are solved and scored, and the share of inliers below which the next one runs.
+RansacSchedule = tuple[tuple[int, int, float], ...]
+RANSAC_SCHEDULE: RansacSchedule = ((500, 64, 0.35), (3000, 256, 0.0))
+RANSAC_SCHEDULE_OF_A_FRAME: RansacSchedule = ((120, 48, 0.5), (500, 96, 0.0))
 # Local optimization of the best hypotheses, on some rows, with gates that narrow from step to step.
 OPTIMIZED_HYPOTHESES, OPTIMIZED_POSES = 3, 2
 OPTIMIZATION_ROWS = 160

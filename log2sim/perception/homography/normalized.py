@@ -185,11 +185,6 @@ def pose_tangent(image_K: Array, h: Array) -> Array:
     return np.asarray((image_K @ change).reshape(6, 9).T)
 
 
-def nearest_unit_pose(image_K: Array, h: Array) -> Array:
-    """Project a homography (3, 3) onto those of a camera `image_K`, scaled so that the ground axes have length 1."""
-    return np.asarray(nearest_poses(image_K, h[None])[0])
-
-
 # The assumed noise counts as a prior worth this many correspondences; an estimate departs from it by this factor at most.
 NOISE_PRIOR_ROWS = 20.0
 MAX_NOISE_FACTOR = 4.0
@@ -316,7 +311,7 @@ def newton_step(
     moved = h - (basis @ along).reshape(3, 3)
     if np.count_nonzero(use) < 4 or not np.isfinite(moved).all():
         return h
-    return np.asarray(moved / np.linalg.norm(moved)) if image_K is None else nearest_unit_pose(image_K, moved)
+    return np.asarray(moved / np.linalg.norm(moved)) if image_K is None else nearest_poses(image_K, moved[None])[0]
 
 
 def scale_free_basis(h: Array) -> Array:

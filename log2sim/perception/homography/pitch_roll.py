@@ -23,7 +23,7 @@ from log2sim.perception.homography.normalized import (
     Linearization,
     NormalizedCorrespondences,
     linearize,
-    nearest_unit_pose,
+    nearest_poses,
     noise_factors,
     pose_tangent,
     scale_free_basis,
@@ -76,7 +76,23 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     noisy = data
     for k in range(ROUNDS):
         if k < 2:  # again in the second round, with the homography and the standard deviation fitted in the first
-            shift = _consensus_shift(data, h, angles.sigma[0])
+            linear = linearize(data, h[None])
+            (wu, wv, shear), (eu, ev) = linear.whiten[:, 0], linear.projected[0] - data.image
+            # In ticks with very many correspondences an even selection votes.
+            count = data.count[data.tick]
+            slots = np.minimum(count, MAX_VOTERS)
+            column = (np.arange(len(count)) - data.start[data.tick]) * slots // count
+            table = np.full((3, len(data.start), int(slots.max())), np.nan)
+            table[:, data.tick, column] = np.stack([-(ev - shear * eu), wv, (eu * wu) ** 2])
+            asked, weight, squared_u = table
+            some = asked[:, :: max(asked.shape[1] // MAX_CANDIDATES, 1)]
+            candidates = np.concatenate([np.zeros((len(asked), 1)), some], axis=1)
+            residual = (asked[:, None, :] - candidates[:, :, None]) * weight[:, None, :]
+            bounded = np.fmin(residual * residual + squared_u[:, None, :], CHI2_2DOF_99)
+            bounded[np.broadcast_to(np.isnan(asked)[:, None, :], bounded.shape)] = 0.0
+            loss = bounded.sum(axis=2) + (candidates / angles.sigma[0]) ** 2
+            loss[np.isnan(candidates)] = np.inf
+            shift = candidates[np.arange(len(asked)), np.argmin(loss, axis=1)]
             angles = replace(angles, value=np.column_stack([shift, angles.value[:, 1]]))
         linear = linearize(noisy, h[None], angles.warps()[noisy.tick])
         h, angles, information = _step(noisy, h, linear, angles, image_K)
@@ -99,29 +115,6 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     of_rows, parameters = warps[noisy.tick], float((angles.significant * information * variance).sum())
     tick_sigmas = (np.sqrt(variance) * angles.significant)[:, :, None, None] * angles.generators
     return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps, tick_sigmas
-
-
-def _consensus_shift(data: NormalizedCorrespondences, h: Array, sigma: float) -> Array:
-    """Find the shift along v (T,) of least bounded loss in each tick, among those that its correspondences ask for."""
-    linear = linearize(data, h[None])
-    wu, wv, shear = linear.whiten[:, 0]
-    eu, ev = linear.projected[0] - data.image
-    # In ticks with very many correspondences an even selection votes.
-    count = data.count[data.tick]
-    slots = np.minimum(count, MAX_VOTERS)
-    column = (np.arange(len(count)) - data.start[data.tick]) * slots // count
-    width = int(slots.max())
-    table = np.full((3, len(data.start), width), np.nan)
-    table[:, data.tick, column] = np.stack([-(ev - shear * eu), wv, (eu * wu) ** 2])
-    asked, weight, squared_u = table
-    some = asked[:, :: max(width // MAX_CANDIDATES, 1)]
-    candidates = np.concatenate([np.zeros((len(asked), 1)), some], axis=1)
-    residual = (asked[:, None, :] - candidates[:, :, None]) * weight[:, None, :]
-    bounded = np.fmin(residual * residual + squared_u[:, None, :], CHI2_2DOF_99)
-    bounded[np.broadcast_to(np.isnan(asked)[:, None, :], bounded.shape)] = 0.0
-    loss = bounded.sum(axis=2) + (candidates / sigma) ** 2
-    loss[np.isnan(candidates)] = np.inf
-    return np.asarray(candidates[np.arange(len(asked)), np.argmin(loss, axis=1)])
 
 
 def _step(
@@ -161,7 +154,7 @@ def _step(
         step = np.zeros(len(right))
     angle_step = -np.linalg.solve(own, pull[:, :, None] + shared.swapaxes(1, 2) @ step[None, :, None])[:, :, 0]
     moved = h + (basis @ step).reshape(3, 3)
-    moved = moved / np.linalg.norm(moved) if image_K is None else nearest_unit_pose(image_K, moved)
+    moved = moved / np.linalg.norm(moved) if image_K is None else nearest_poses(image_K, moved[None])[0]
     information = np.diagonal(own, axis1=1, axis2=2) - 1.0 / angles.sigma**2
     value = (angles.value + angle_step) * angles.significant
     return np.asarray(moved), replace(angles, value=value), information
@@ -171,8 +164,6 @@ def _step(
 CHI2_2DOF_50 = 1.386
 # With fewer ticks the spread over them is not known.
 MIN_TICKS = 8
-# Distance in the image, as a share of the focal length, at which the roll of a warp is read.
-ROLL_ARM = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,22 +238,3 @@ def held_out_errors(
         squared.append(np.where(front, whitened, np.inf))  # infinite behind the camera
         distance.append(np.where(front, np.hypot(*error.T), np.inf))
     return HeldOutErrors(fixed[1].tick, np.stack(squared), np.stack(distance))
-
-
-def two_folds(correspondences: Correspondences) -> list[tuple[Correspondences, Correspondences]]:
-    """Split every tick's correspondences in turn into a training and a test half, and the other way round."""
-    order = np.argsort(correspondences.tick, kind="stable")
-    tick = correspondences.tick[order]
-    rank = np.arange(len(tick)) - np.searchsorted(tick, tick)
-    first, second = (correspondences.take(order[rank % 2 == k]) for k in range(2))
-    return [(first, second), (second, first)]
-
-
-def angle_sigmas_deg(moving: HomographyFit, K: Array) -> tuple[float, float]:
-    """Compute the standard deviations of pitch and roll over the ticks, degrees, for intrinsics (3, 3)."""
-    center, arm = K[:2, 2], np.array([ROLL_ARM * K[0, 0], 0.0])
-    q = np.linalg.inv(stabilizing_warps(moving)) @ np.column_stack([[*center, 1.0], [*(center + arm), 1.0]])
-    uv = q[:, :2] / q[:, 2:]
-    pitch = np.arctan((uv[:, 1, 0] - center[1]) / K[1, 1])
-    du, dv = (uv[:, :, 1] - uv[:, :, 0]).T
-    return float(np.degrees(pitch.std())), float(np.degrees(np.arctan2(dv, du).std()))

@@ -73,11 +73,6 @@ class RigState:
     # camera frame
     feet: Mapping[str, Array]
 
-    @classmethod
-    def calibrated(cls, rig: Rig, plane: Array) -> RigState:
-        """Make the state of a rig that is as its calibration says, over a plane (3,)."""
-        return cls(plane, 0.0, dict.fromkeys(rig.cameras, 0.0), {name: np.zeros(3) for name in rig.cameras})
-
 
 def rotation_of(vector: Array) -> Array:
     """Compute the rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad (Rodrigues)."""
@@ -466,7 +461,10 @@ def fit_rig(
     share = float(np.mean(((heights.xy1 @ plane - heights.height) / heights.sigma) ** 2 < CHI2_1DOF_99))
     if share < MIN_INLIER_SHARE:
         return RigFit(f"only {share:.0%} of the correspondences of all cameras agree on a ground", rig)
-    fit = fit_feet(rig, foot_rows, RigState.calibrated(rig, plane))
+    names = list(rig.cameras)
+    fit = fit_feet(
+        rig, foot_rows, RigState(plane, 0.0, dict.fromkeys(names, 0.0), {name: np.zeros(3) for name in names})
+    )
     ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
     if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
         ticks, tilt = tilt_of_ticks(heights_of(rig, ground_rows), plane)

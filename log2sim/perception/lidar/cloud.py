@@ -212,9 +212,25 @@ class AzimuthIndex:
         window, other = window[foreign], other[foreign]
         # Some points of each cluster show its faces as well as all do.
         some = np.flatnonzero((np.arange(len(row)) - start[group]) % -(-count // MAX_FACE_POINTS)[group] == 0)
-        unit = _directions()
+        unit, sides = _directions(), end.size
         corner, xy = (self.range_m[of][..., None] * unit[self.azimuth[of]] for of in (row[end], row[some]))
-        goes_on_m = _extended_face_ranges(corner, group[some], xy, window, unit[self.azimuth[other]])
+        at_end = [np.flatnonzero(((xy - corner[group[some], side]) ** 2).sum(axis=1) < FACE_M**2) for side in range(2)]
+        of = np.concatenate([2 * group[some[point]] + side for side, point in enumerate(at_end)])
+        x, y = xy[np.concatenate(at_end)].T
+        shown = np.maximum(np.bincount(of, minlength=sides), 1)
+        center_x, center_y = np.bincount(of, x, sides) / shown, np.bincount(of, y, sides) / shown
+        x, y = x - center_x[of], y - center_y[of]
+        xx, cross, yy = (np.bincount(of, a * b, sides) for a, b in ((x, x), (x, y), (y, y)))
+        # Eigenvalues and first eigenvector of a symmetric matrix of two rows: the face that ends there, unless it is a corner.
+        mean, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, cross)
+        is_face = (shown > 2) & (mean - radius <= MAX_FLATNESS * (mean + radius))
+        angle = np.arctan2(2 * cross, xx - yy) / 2
+        along_x, along_y = np.cos(angle), np.sin(angle)
+        # The range along each ray of that face, were it to go on.
+        ray_x, ray_y = unit[self.azimuth[other]].T
+        sine = ray_x * along_y[window] - ray_y * along_x[window]
+        meets_m = (center_x * along_y - center_y * along_x)[window] / np.where(sine == 0, np.inf, sine)
+        goes_on_m = np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
         beyond = self.range_m[other] > np.maximum(goes_on_m, range_m.ravel()[window]) + MIN_DEPTH_STEP_M
         rays = np.bincount(window[beyond], minlength=end.size)
         blocked = np.bincount(window[~beyond & self.obstacle[other]], minlength=end.size)
@@ -230,40 +246,6 @@ class AzimuthIndex:
         count = np.stack([np.maximum(end - begin, 0), rest], axis=1).ravel()
         ordinal = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         return np.repeat(np.arange(len(count)) // 2, count), np.repeat(start, count) + ordinal
-
-
-def _extended_face_ranges(
-    corner: NDArray[np.float64],
-    group: NDArray[np.intp],
-    xy: NDArray[np.float64],
-    window: NDArray[np.intp],
-    ray: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Range (n,) in m, along rays (n, 2), of the face that ends at an end of a cluster, were it to go on; 0 at a corner.
-
-    `corner`: (R, 2, 2): the points at the right and the left end of each cluster. `group`, `xy`: (K,), (K, 2): points of
-    the clusters, and which of them they belong to. `window`: (n,): twice the cluster, plus one at its left end.
-    """
-    near = [np.flatnonzero(((xy - corner[group, side]) ** 2).sum(axis=1) < FACE_M**2) for side in range(2)]
-    of = np.concatenate([2 * group[point] + side for side, point in enumerate(near)])
-    x, y = xy[np.concatenate(near)].T
-    count = np.maximum(np.bincount(of, minlength=2 * len(corner)), 1)
-
-    def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(np.bincount(of, values, minlength=2 * len(corner)), dtype=np.float64)
-
-    center_x, center_y = total(x) / count, total(y) / count
-    x, y = x - center_x[of], y - center_y[of]
-    xx, cross, yy = total(x * x), total(x * y), total(y * y)
-    # Eigenvalues and first eigenvector of a symmetric matrix of two rows.
-    mean, radius = (xx + yy) / 2, np.hypot((xx - yy) / 2, cross)
-    is_face = (count > 2) & (mean - radius <= MAX_FLATNESS * (mean + radius))
-    angle = np.arctan2(2 * cross, xx - yy) / 2
-    along_x, along_y = np.cos(angle), np.sin(angle)
-    sine = ray[:, 0] * along_y[window] - ray[:, 1] * along_x[window]
-    distance = (center_x * along_y - center_y * along_x)[window]
-    meets_m = distance / np.where(sine == 0, np.inf, sine)
-    return np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
 
 
 @lru_cache(maxsize=1)

@@ -106,7 +106,20 @@ def measure(
     found: dict[int, tuple[Cloud, dict[int, Index]]] = {}
     if sweep is not None:
         found[id(sweep)] = sweep, {k: members for k, members in enumerate(own) if len(members) >= MIN_CLUSTER_POINTS}
-    free = _free_points(frames, sweep, [own[k] for k in np.unique(pairs.box)])
+    # The obstacles of each cloud but those that boxes with an image own, and the same as rows x, y, z (3, n).
+    owned: dict[int, NDArray[np.bool_]] = {}
+    if sweep is not None and len(pairs.box):
+        mask = np.zeros(len(sweep.xyz), dtype=bool)
+        mask[np.concatenate([own[k] for k in np.unique(pairs.box)])] = True
+        edges = np.cumsum([len(part.xyz) for part in sweep.views])[:-1]
+        owned = {id(part): of_part for part, of_part in zip(sweep.views, np.split(mask, edges))}
+    free = {}
+    for one in {id(cloud): cloud for _, _, cloud in frames if cloud is not None}.values():
+        free[id(one)] = one.obstacles, one.obstacle_columns
+        if any(id(part) in owned for part in one.views):
+            masks = [owned.get(id(part), np.zeros(len(part.xyz), dtype=bool)) for part in one.views]
+            left = ~np.concatenate(masks)[one.obstacles]
+            free[id(one)] = one.obstacles[left], one.obstacle_columns.compress(left, axis=1)
     shown = list[tuple[Shown, Index, Array]]()
     for k, (view, detections, cloud) in enumerate(frames):
         of_frame = np.flatnonzero(frame == k)
@@ -120,10 +133,26 @@ def measure(
     columns |= vars(place_boxes(Measurements(**columns)))
     for seen, of_frame, boxes_px in shown:
         place_few_points(seen, columns, of_frame, boxes_px)
-    if mode == "paper":
-        for k, (view, _, cloud) in enumerate(frames):
-            if cloud is not None:
-                _measure_as_paper(view, cloud, columns, np.flatnonzero(frame == k))
+    for n, (view, _, cloud) in enumerate(frames if mode == "paper" else ()):
+        if cloud is None:
+            continue
+        # The depth of the point nearest to the box center, and the extents of all points in the box.
+        of_frame = np.flatnonzero(frame == n)
+        visible = project_points(view, cloud.origin, cloud.columns)
+        uv, xyz = np.stack([visible.u, visible.v], axis=1), cloud.xyz[visible.index]
+        for k, inside in zip(of_frame.tolist(), points_in_image_boxes(visible, columns["box_px"][of_frame])):
+            if len(inside) == 0:
+                continue
+            box = columns["box_px"][k]
+            nearest = inside[np.argmin(np.hypot(*(uv[inside] - (box[:2] + box[2:]) / 2).T))]
+            center = xyz[nearest] + cloud.origin
+            half = np.maximum(np.ptp(xyz[inside], axis=0), MIN_EXTENT_M) / 2
+            offset = (center - columns["sensor_m"][k])[:2]
+            columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = 0.0, offset - half[:2], offset + half[:2]
+            columns["bottom_m"][k], columns["top_m"][k] = center[2] - half[2], center[2] + half[2]
+            columns["center_m"][k], columns["covariance"][k], columns["source"][k] = center, np.eye(2), "lidar"
+            columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
+            columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
     if searched:
         _weigh_pairs(columns, images, pairs, [view for view, _, _ in frames])
     others = tuple(columns["others"]) if any(view is not None for view in columns["others"]) else ()
@@ -264,26 +293,6 @@ NEAR_END_QUANTILE = 0.05
 MIN_EXTENT_M = 0.1
 
 
-def _free_points(
-    frames: Sequence[Frame], sweep: Cloud | None, owned: Sequence[Index]
-) -> dict[int, tuple[Index, NDArray[np.float32]]]:
-    """Return the obstacles (n,) of each cloud but those that boxes in the sweep own, and the same as rows x, y, z (3, n)."""
-    own: dict[int, NDArray[np.bool_]] = {}
-    if sweep is not None and len(owned):
-        mask = np.zeros(len(sweep.xyz), dtype=bool)
-        mask[np.concatenate(owned)] = True
-        edges = np.cumsum([len(part.xyz) for part in sweep.views])[:-1]
-        own = {id(part): of_part for part, of_part in zip(sweep.views, np.split(mask, edges))}
-    out = {}
-    for cloud in {id(cloud): cloud for _, _, cloud in frames if cloud is not None}.values():
-        out[id(cloud)] = cloud.obstacles, cloud.obstacle_columns
-        if any(id(part) in own for part in cloud.views):
-            masks = [own.get(id(part), np.zeros(len(part.xyz), dtype=bool)) for part in cloud.views]
-            free = ~np.concatenate(masks)[cloud.obstacles]
-            out[id(cloud)] = cloud.obstacles[free], cloud.obstacle_columns.compress(free, axis=1)
-    return out
-
-
 def _cluster_boxes(seen: Shown, rows: Index, columns: dict[str, Any]) -> dict[int, Index]:
     """Assign a cluster to each of the rows (R,) of a frame, as indices in its cloud, and write how high the image box is there."""
     cloud, points, visible, columns_m = seen.cloud, seen.points, seen.visible, seen.columns_m
@@ -322,25 +331,6 @@ def _height_m(box_px: Array, depth_m: NDArray[np.floating[Any]], category: str, 
     is_long = MAX_SIZE_M[category][0] >= MIN_LONG_M
     at_m = float(np.quantile(depth_m, NEAR_END_QUANTILE)) if is_long else upper_median(depth_m)
     return float((box_px[3] - box_px[1]) * at_m / camera.K[1, 1])
-
-
-def _measure_as_paper(view: View, cloud: Cloud, columns: dict[str, Any], rows: Index) -> None:
-    """Take the depth of the point nearest to the box center, and the extents of all points in the box, for rows (R,) of a frame."""
-    visible = project_points(view, cloud.origin, cloud.columns)
-    uv, xyz = np.stack([visible.u, visible.v], axis=1), cloud.xyz[visible.index]
-    for k, inside in zip(rows.tolist(), points_in_image_boxes(visible, columns["box_px"][rows])):
-        if len(inside) == 0:
-            continue
-        box = columns["box_px"][k]
-        nearest = inside[np.argmin(np.hypot(*(uv[inside] - (box[:2] + box[2:]) / 2).T))]
-        center = xyz[nearest] + cloud.origin
-        half = np.maximum(np.ptp(xyz[inside], axis=0), MIN_EXTENT_M) / 2
-        offset = (center - columns["sensor_m"][k])[:2]
-        columns["yaw_rad"][k], columns["low_m"][k], columns["high_m"][k] = 0.0, offset - half[:2], offset + half[:2]
-        columns["bottom_m"][k], columns["top_m"][k] = center[2] - half[2], center[2] + half[2]
-        columns["center_m"][k], columns["covariance"][k], columns["source"][k] = center, np.eye(2), "lidar"
-        columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
-        columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
 
 
 # Points of a cluster that are kept as evidence; its extents are those of all, since ends are told by their outermost points.

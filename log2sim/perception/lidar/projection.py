@@ -103,10 +103,17 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
     before the division by depth. With a lens distortion the remaining points are projected in double precision; so they are
     where the camera moves while its lines are read, each point by the pose at the time of its line.
     """
-    if view.cam_T_map_at is not None:
-        return _project_by_lines(view, origin, columns)
-    camera, cam_R_map = view.camera, view.map_T_cam[:3, :3].T
+    camera, cam_R_map, cam_T_map_at = view.camera, view.map_T_cam[:3, :3].T, view.cam_T_map_at
     offset = cam_R_map @ (origin - view.map_T_cam[:3, 3])
+    if cam_T_map_at is not None:
+        rough = cam_R_map.astype(np.float32) @ columns + offset.astype(np.float32)[:, None]
+        first, last = (edge.astype(np.float32)[:, None] for edge in _frustum(camera))
+        near = (rough[:2] >= (first - READOUT_SLACK) * rough[2]) & (rough[:2] <= (last + READOUT_SLACK) * rough[2])
+        index = np.flatnonzero(near.all(axis=0) & (rough[2] > MIN_DEPTH_M))
+        map_T_origin, points = transform(np.eye(3), origin), columns[:, index].T.astype(np.float64)
+        uv, depth_m, inside = project_moving(camera, points, lambda t_s: cam_T_map_at(t_s) @ map_T_origin)
+        u, v = uv[inside].T.astype(np.float32)
+        return ProjectedPoints(index[inside], u, v, depth_m[inside].astype(np.float32))
     lens = camera.distortion_model != "none"
     K = np.eye(3) if lens else camera.K
     low, high = _frustum(camera) if lens else (np.zeros(2), np.array([camera.width_px, camera.height_px], dtype=float))
@@ -129,22 +136,6 @@ def project_points(view: View, origin: Array, columns: NDArray[np.float32]) -> P
     uv, inside = project(camera, turned[:, index].T)
     u, v = uv[inside].T.astype(np.float32)
     return ProjectedPoints(index[inside], u, v, depth[inside])
-
-
-def _project_by_lines(view: View, origin: Array, columns: NDArray[np.float32]) -> ProjectedPoints:
-    """Project points as `project_points` does, each by the pose at which its line is exposed."""
-    assert view.cam_T_map_at is not None
-    cam_T_map_at = view.cam_T_map_at
-    offset = view.map_T_cam[:3, :3].T @ (origin - view.map_T_cam[:3, 3])
-    rough = view.map_T_cam[:3, :3].T.astype(np.float32) @ columns + offset.astype(np.float32)[:, None]
-    low, high = (edge.astype(np.float32)[:, None] for edge in _frustum(view.camera))
-    near = (rough[:2] >= (low - READOUT_SLACK) * rough[2]) & (rough[:2] <= (high + READOUT_SLACK) * rough[2])
-    index = np.flatnonzero(near.all(axis=0) & (rough[2] > MIN_DEPTH_M))
-    map_T_origin = transform(np.eye(3), origin)
-    points = columns[:, index].T.astype(np.float64)
-    uv, depth, inside = project_moving(view.camera, points, lambda t_s: cam_T_map_at(t_s) @ map_T_origin)
-    u, v = uv[inside].T.astype(np.float32)
-    return ProjectedPoints(index[inside], u, v, depth[inside].astype(np.float32))
 
 
 def project_boxes_in_view(view: View, center_m: Array, size_m: Array, yaw_rad: Array) -> ProjectedBoxes:
