@@ -119,7 +119,8 @@ def roadside_sensors(log: Log, range_m: float) -> tuple[dict[str, Any], ...]:
             # Pixels in the middle row and column that the lens model explains.
             map_T_sensor, width, height = sensor.mount_T_cam, sensor.width_px, sensor.height_px
             u, v = np.linspace([0.0, 0.0], [width, height], 65).T
-            row, column = (np.column_stack(np.broadcast_arrays(*uv)) for uv in ((u, height / 2), (width / 2, v)))
+            row = np.column_stack([u, np.full_like(u, height / 2)])
+            column = np.column_stack([np.full_like(v, width / 2), v])
             xy = undistort(sensor, np.concatenate([row, column]))
             xy = xy[np.isfinite(xy).all(axis=1)]
             rays.append(np.column_stack([xy, np.ones(len(xy))]))
@@ -191,7 +192,7 @@ def conclude(
     scenario = replace(scenario, stages=tuple(stage.to_dict() for stage in stages))
     from_lidar = [rows.source == "lidar" for rows in measurements]
     total_s, detecting_s = clock.total(), clock.seconds.get("detect", 0.0)
-    without_pose = {}
+    without_pose: dict[str, int] = {}
     for name, index in schedule.frames.items():
         known = log.map_T_sensor(name, log.streams[name].t_ns[index[index >= 0]])[1]
         without_pose |= {} if known.all() else {name: int(np.sum(~known))}

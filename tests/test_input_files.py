@@ -19,12 +19,12 @@ from log2sim.files.inputs import TooLargeError, read_bytes
 from log2sim.logs.arrow import ParquetRows, read_columns
 from log2sim.logs.kitti.labels import read_text as read_kitti_text
 from log2sim.logs.native.reader import read_csv_table
-from log2sim.logs.nuscenes.tables import scan_records
+from log2sim.logs.nuscenes.scene import scan_records
 from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.records import image_stream, read_sweep
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.containers import ChunkedFile
-from log2sim.logs.waymo.tfrecord import RecordFile
+from log2sim.logs.waymo.messages import RecordFile
 from log2sim.synth.returns import lidar_model
 from log2sim.synth.scene import load_scene
 

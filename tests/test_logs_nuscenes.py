@@ -21,7 +21,7 @@ from log2sim import Config, reconstruct
 from log2sim.datatypes import Labels, Log
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, apply, inverse
-from log2sim.logs.nuscenes import tables
+from log2sim.logs.nuscenes import scene as tables
 from log2sim.logs.nuscenes.scene import FIRING_NS
 from log2sim.logs.opening import open_log
 from log2sim.logs.stamps import compute_scan_offset_ns

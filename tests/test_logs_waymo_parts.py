@@ -12,10 +12,9 @@ from log_encoders.waymo import Ranges, laser_message, record
 
 from log2sim.errors import LogError
 from log2sim.geometry import apply, inverse, rotation_from_rpy, transform
-from log2sim.logs.waymo.messages import WireError
+from log2sim.logs.waymo.messages import RecordFile, WireError, crc32c, masked_crc32c
 from log2sim.logs.waymo.range_images import points_of, read_range_images, row_inclinations, turn_of
 from log2sim.logs.waymo.segment import LaserCalibration, RangeImages
-from log2sim.logs.waymo.tfrecord import RecordFile, crc32c, masked_crc32c
 
 LASER = LaserCalibration(np.eye(4), np.array([-0.3, -0.1, 0.0, 0.05]), (0.0, 0.0))
 

@@ -178,6 +178,8 @@ def test_the_command(folder, tmp_path) -> None:
     assert sum(row["file"] is not None for row in table) == len(written)
     assert "exists already" in run("vary", folder, "overtaking", "-o", tmp_path / "v").line
     assert "cut_in" in run("vary", folder, "standing", "-o", tmp_path / "w").line
+    closest = run("vary", folder, "cut_in and gap_m < 0.001", "-o", tmp_path / "w").line
+    assert "without 'gap_m < 0.001' there are" in closest
     assert not (tmp_path / "w").exists()
 
 

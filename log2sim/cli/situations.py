@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from log2sim.scenarios.index import Index, Row
+    from log2sim.scenarios.query import Found
 
     MapFiles = Callable[[Callable[[str], Any], Sequence[str]], Iterator[Any]]
     from log2sim.geometry import Array
@@ -219,6 +220,16 @@ def _opened(index: Index, row: Row, number: int, out: Path | None) -> str:
     return address
 
 
+def _hits(found: Found) -> Sequence[Row]:
+    """Return the rows of what was found; where there are none, raise `ConfigError` that says what was closest."""
+    from log2sim.scenarios.logical import TIMING
+
+    if not found.rows:
+        said = ("condition: nothing fulfils it", *found.closest, f"what can be varied is {', '.join(TIMING)}")
+        raise ConfigError("; ".join(said))
+    return found.rows
+
+
 def vary(
     path: opt.ScenarioFolder,
     condition: opt.Condition,
@@ -251,7 +262,7 @@ def vary(
 
     refuse_folder(out, overwrite=overwrite, holding="logical.json", kind="folder of variations")
     index = open_index(path)
-    rows = ask(index, condition, min_probability=probability).rows
+    rows = _hits(ask(index, condition, min_probability=probability))
     logical = fit(rows)
     chosen = choose_base(logical, rows)
     base = Base.of(Scenario.load(index.folder / chosen["file"]), chosen)
@@ -355,7 +366,7 @@ def test_(
     source, _, name = policy.rpartition(":")
     driver = NamedPolicy(f"{Path(source).resolve()}:{name}" if source.endswith(".py") else policy, sensing)
     index = open_index(path)
-    rows = ask(index, condition).rows
+    rows = _hits(ask(index, condition))
     logical = fit(rows)
     chosen = choose_base(logical, rows)
     base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))

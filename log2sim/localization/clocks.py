@@ -358,18 +358,12 @@ def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progre
             faults += unseen_faults(lidar, None, asked)
             continue
         findings = Findings(lidar, found, seen, asked)
-        log, faults = corrected(log, findings), [*faults, *findings.faults()]
+        faults += findings.faults()
+        if asked.fix_time and findings.offset_s:
+            shifted = shift_stream(log.streams[lidar], round(findings.offset_s * NS_PER_S))
+            log = log.changed(streams={**log.streams, lidar: shifted})
+        if asked.fix_mounts and any((*findings.turn_rad, *findings.shift_m)):
+            mount = turn_mount(log.lidars[lidar].mount_T_lidar, np.array(findings.turn_rad))
+            mount[:3, 3] += findings.shift_m
+            log = log.changed(lidars={**log.lidars, lidar: replace(log.lidars[lidar], mount_T_lidar=mount)})
     return log, tuple(faults)
-
-
-def corrected(log: Log, findings: Findings) -> Log:
-    """Return the log with the stamps and the mount of a LiDAR corrected as far as it was asked for and is certain."""
-    lidar, asked = findings.lidar, findings.asked
-    if asked.fix_time and findings.offset_s:
-        shifted = shift_stream(log.streams[lidar], round(findings.offset_s * NS_PER_S))
-        log = log.changed(streams={**log.streams, lidar: shifted})
-    if asked.fix_mounts and any((*findings.turn_rad, *findings.shift_m)):
-        mount = turn_mount(log.lidars[lidar].mount_T_lidar, np.array(findings.turn_rad))
-        mount[:3, 3] += findings.shift_m
-        log = log.changed(lidars={**log.lidars, lidar: replace(log.lidars[lidar], mount_T_lidar=mount)})
-    return log

@@ -252,7 +252,10 @@ def list_faults(log: Log, stretches: Sequence[Stretch], first_ns: int, last_ns: 
     """
     records = np.unique(np.concatenate([stream.t_ns for stream in log.streams.values()] or [np.zeros(0, np.int64)]))
     records = records[(records >= first_ns) & (records <= last_ns)]
-    relevant = [s for s in stretches if _concerns(s, records)]
+    # Something was recorded while poses are in question; of a gap between its ends.
+    inner = [int(s.kind == "gap") for s in stretches]
+    spans = np.array([(s.first_ns + k, s.last_ns + 1 - k) for s, k in zip(stretches, inner)]).reshape(-1, 2)
+    relevant = [s for s, (first, stop) in zip(stretches, np.searchsorted(records, spans)) if stop > first]
     wrong = [s for s in relevant if s.kind not in ("gap", "skip", "copies")]
     # Where wrong poses are left out there is a gap, which is reported with them.
     gaps = [
@@ -264,13 +267,6 @@ def list_faults(log: Log, stretches: Sequence[Stretch], first_ns: int, last_ns: 
     found = [_fault(s, first_ns) for s in relevant if s.kind != "gap" or (s in gaps and s.unknown_s > 0)]
     found += [_sparse(sparse, first_ns)] if sparse else []
     return tuple(sorted(found, key=lambda fault: fault.start_s or 0.0))
-
-
-def _concerns(stretch: Stretch, records: NDArray[np.int64]) -> bool:
-    """Return whether something was recorded while poses are in question; of a gap between its ends."""
-    margin = 1 if stretch.kind == "gap" else 0
-    first, stop = np.searchsorted(records, [stretch.first_ns + margin, stretch.last_ns + 1 - margin])
-    return bool(stop > first)
 
 
 def _fault(s: Stretch, t0_ns: int) -> Finding:

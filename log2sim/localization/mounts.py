@@ -179,10 +179,15 @@ def estimate_mount_yaw(camera: Camera, views: list[EdgeView]) -> YawEstimate | N
 def find_mistakes(check: MountCheck, during_ns: tuple[int, int] | None) -> dict[str, Mistake]:
     """Find the cameras of which the own mount does not fit while another one does, within some time."""
     by_edges = _find_by_edges(check)
-    found = by_edges | _list_exchanged(check, by_edges)
-    return found | _find_by_flow(
-        check, [n for n, yaw in check.yaws.items() if yaw is None and n not in found], during_ns
-    )
+    found = dict(by_edges)
+    for name, mistake in by_edges.items():
+        # A camera whose mount is another one's, though its own images do not show it, gets what that one had.
+        other = mistake.fault.other
+        if other and other not in by_edges:
+            fault = Finding("swapped_cameras", other, other=name, case="exchanged")
+            found[other] = Mistake(fault, check.log.cameras[name].mount_T_cam)
+    unseen = [name for name, yaw in check.yaws.items() if yaw is None and name not in found]
+    return found | _find_by_flow(check, unseen, during_ns)
 
 
 def _find_by_edges(check: MountCheck) -> dict[str, Mistake]:
@@ -195,18 +200,6 @@ def _find_by_edges(check: MountCheck) -> dict[str, Mistake]:
             if found is not None and abs(found.yaw_rad) < MAX_LEFT_RAD and found.gain > best:
                 mistakes[name], best = mistake, found.gain
     return mistakes
-
-
-def _list_exchanged(check: MountCheck, mistakes: Mapping[str, Mistake]) -> dict[str, Mistake]:
-    """List the cameras whose mount is another one's, though their own images do not show it: they get what that one had."""
-    return {
-        mistake.fault.other: Mistake(
-            Finding("swapped_cameras", mistake.fault.other, other=name, case="exchanged"),
-            check.log.cameras[name].mount_T_cam,
-        )
-        for name, mistake in mistakes.items()
-        if mistake.fault.other and mistake.fault.other not in mistakes
-    }
 
 
 def _list_mistakes(check: MountCheck, name: str) -> list[Mistake]:
@@ -282,11 +275,24 @@ def check_cameras(
     treatment: Treatment = "corrected" if fix else "kept"
     mistakes = find_mistakes(check, during_ns(log, config))
     mounts = {name: mistake.mount_T_cam for name, mistake in mistakes.items()}
-    treatments = _treat_mistakes(mistakes, config, sensors)
-    faults = [replace(mistake.fault, treatment=treatments[name]) for name, mistake in mistakes.items()]
+    # Cameras with wrong mounts are left out where the run can go on without them.
+    certain = {name for name, mistake in mistakes.items() if mistake.certain}
+    goes_on = bool(set(sensors.cameras) - certain) and config.sync.reference not in certain
+    left_out: set[str] = certain if goes_on and not fix else set()
+    faults = [
+        replace(mistake.fault, treatment="left_out" if name in left_out else treatment)
+        for name, mistake in mistakes.items()
+    ]
     off = {name: yaw for name, yaw in check.yaws.items() if yaw is not None and is_off(yaw)}
     if turns_together(check.yaws):
-        faults.append(_fault_of_lidar(lidar, off, treatment))
+        # The mount of the LiDAR is told, with which that of no camera agrees; corrected are those of the cameras.
+        angle, sigma = np.array([(yaw.yaw_rad, yaw.sigma_rad) for yaw in off.values()]).T
+        mean = {
+            "yaw_deg": np.rad2deg(np.average(angle, weights=1 / sigma**2)),
+            "yaw_sigma_deg": np.rad2deg(sigma.max()),
+        }
+        values = {key: float(value) for key, value in mean.items()}
+        faults.append(Finding("lidar_rotation", lidar, treatment, values=values, other=", ".join(off), case="edges"))
     else:
         case = "either" if sum(yaw is not None for yaw in check.yaws.values()) == 1 else "camera"
         faults += [
@@ -300,15 +306,6 @@ def check_cameras(
         moved = {name: replace(log.cameras[name], mount_T_cam=mount_T_cam) for name, mount_T_cam in mounts.items()}
         log = log.changed(cameras={**log.cameras, **moved})
     return log, tuple(faults)
-
-
-def _treat_mistakes(mistakes: Mapping[str, Mistake], config: Config, sensors: Sensors) -> dict[str, Treatment]:
-    """Decide what is done about cameras with wrong mounts; they are left out where the run can go on without them."""
-    certain = {name for name, mistake in mistakes.items() if mistake.certain}
-    dispensable = bool(set(sensors.cameras) - certain) and config.sync.reference not in certain
-    if config.calibration.fix_mounts:
-        return dict.fromkeys(mistakes, "corrected")
-    return {name: "left_out" if dispensable and name in certain else "kept" for name in mistakes}
 
 
 def is_off(yaw: YawEstimate) -> bool:
@@ -335,33 +332,16 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Prog
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
-    looks = {name: _estimate_by_few_or_all(log.cameras[name], seen) for name in names}
+    views, yaws = {}, {}
+    for name in names:
+        # By every second moment, and by all where those do not show that a camera is sound.
+        for every in (2, 1):
+            views[name] = seen.of_camera(name, every=every)
+            yaws[name] = found = estimate_mount_yaw(log.cameras[name], views[name])
+            if found is not None and abs(found.yaw_rad) < SOUND_RAD:
+                break
     progress("check cameras", len(moments.sweeps), len(moments.sweeps))
-    views = {name: views for name, (views, _) in looks.items()}
-    return MountCheck(log, lidar, views, unknown | {name: yaw for name, (_, yaw) in looks.items()})
-
-
-def _estimate_by_few_or_all(camera: Camera, seen: EdgeViews) -> tuple[list[EdgeView], YawEstimate | None]:
-    """Return views of a camera and its yaw: by every second moment, and by all where those do not show that it is sound."""
-    few = seen.of_camera(camera.name, every=2)
-    yaw = estimate_mount_yaw(camera, few)
-    if yaw is not None and abs(yaw.yaw_rad) < SOUND_RAD:
-        return few, yaw
-    views = seen.of_camera(camera.name)
-    return views, estimate_mount_yaw(camera, views)
-
-
-def _fault_of_lidar(lidar: str, yaws: Mapping[str, YawEstimate], treatment: Treatment) -> Finding:
-    """Describe the mount of a LiDAR, with which that of no camera agrees; corrected are those of the cameras."""
-    weights = np.array([1 / yaw.sigma_rad**2 for yaw in yaws.values()])
-    mean = YawEstimate(
-        -float(np.average([yaw.yaw_rad for yaw in yaws.values()], weights=weights)),
-        max(yaw.sigma_rad for yaw in yaws.values()),
-        min(yaw.gain for yaw in yaws.values()),
-        sum(yaw.edges for yaw in yaws.values()),
-    )
-    others = ", ".join(yaws)
-    return Finding("lidar_rotation", lidar, treatment, values=_values(mean), other=others, case="edges")
+    return MountCheck(log, lidar, views, unknown | yaws)
 
 
 def _values(yaw: YawEstimate) -> dict[str, float]:

@@ -347,7 +347,16 @@ def run_odometry(
     best = max(paths, key=lambda p: p[-1].t_ns - p[0].t_ns)
     lost = sum(len(p) for p in paths) - len(best)
     problems = dict(run.problems) | ({"of another part of the drive": lost} if lost else {})
-    return _odometry(lidar, best, len(index), problems)
+    fits = [step.fit for step in best]
+
+    def column(name: str, missing: Any = np.nan) -> Array:
+        return np.array([missing if fit is None else getattr(fit, name) for fit in fits], dtype=np.float64)
+
+    return Odometry(
+        lidar, np.array([step.t_ns for step in best], dtype=np.int64), np.stack([step.pose for step in best]),
+        column("overlap"), column("residual"), column("constraint"), column("weakest", np.full(3, np.nan)),
+        np.array([not step.held for step in best]), np.array([step.predicted for step in best]), len(index), problems,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,16 +508,3 @@ def _is_possible(expected: Array, found: Array, dt_s: float) -> bool:
     """Return whether a vehicle can make the motion found instead of the one expected."""
     off_m = float(np.linalg.norm(found[:3, 3] - expected[:3, 3]))
     return off_m <= MAX_JUMP_M + 0.5 * MAX_ACCELERATION_MPS2 * dt_s * max(dt_s, 0.1)
-
-
-def _odometry(lidar: str, path: list[_Step], sweeps: int, problems: dict[str, int]) -> Odometry:
-    fits = [step.fit for step in path]
-
-    def column(name: str, missing: Any = np.nan) -> Array:
-        return np.array([missing if fit is None else getattr(fit, name) for fit in fits], dtype=np.float64)
-
-    return Odometry(
-        lidar, np.array([step.t_ns for step in path], dtype=np.int64), np.stack([step.pose for step in path]),
-        column("overlap"), column("residual"), column("constraint"), column("weakest", np.full(3, np.nan)),
-        np.array([not step.held for step in path]), np.array([step.predicted for step in path]), sweeps, problems,
-    )  # fmt: skip

@@ -139,34 +139,26 @@ def view_from_road(
     log: Log, lidars: Sequence[str], site_m: Array, during_ns: tuple[int, int] | None = None
 ) -> RoadView:
     """Collect the points of what stands still around a site (3,), m, by the LiDARs of a pole."""
-    parts = [_static_points(log, name, site_m, during_ns) for name in lidars]
-    points = np.concatenate(parts) if parts else np.zeros((0, 4))
+    found = [np.zeros((0, 4))]  # of each LiDAR, with the share of its sweeps that have a point in the same place
+    for name in lidars:
+        rows = np.flatnonzero(is_during(log.streams[name].t_ns, during_ns))
+        chosen = rows[
+            np.unique(np.linspace(0, len(rows) - 1, min(MAX_ROAD_SWEEPS, len(rows))).round().astype(np.int64))
+        ]
+        mapped = [_read(log, name, i) for i in chosen.tolist()]
+        parts = [read[0] - site_m for read in mapped if read is not None]
+        parts = [xyz[np.linalg.norm(xyz, axis=1) < MAX_REACH_M] for xyz in parts]
+        if not sum(map(len, parts)):
+            continue
+        xyz, sweep = np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        place = number_voxels(xyz, STATIC_VOXEL_M)
+        seen = np.unique(place * len(parts) + sweep) // len(parts)
+        share = (np.bincount(seen, minlength=int(place.max()) + 1) / len(parts))[place]
+        static = share >= MIN_STATIC_SHARE
+        found.append(thin(np.hstack([xyz[static], share[static, None]]), VOXEL_M))
+    points = np.concatenate(found)
     points = points[:: max(-(-len(points) // MAX_ROAD_POINTS), 1)]
     return RoadView(points[:, :3], points[:, 3])
-
-
-def _static_points(log: Log, lidar: str, site_m: Array, during_ns: tuple[int, int] | None) -> Array:
-    """Return points with the share of sweeps that have one in the same place, (N, 4)."""
-    t_ns = log.streams[lidar].t_ns
-    rows = np.flatnonzero(is_during(t_ns, during_ns))
-    chosen = (
-        rows[np.unique(np.linspace(0, len(rows) - 1, MAX_ROAD_SWEEPS).round().astype(np.int64))] if len(rows) else rows
-    )
-    parts = []
-    for i in chosen.tolist():
-        mapped = _read(log, lidar, i)
-        if mapped is not None:
-            xyz = mapped[0] - site_m
-            parts.append(xyz[np.linalg.norm(xyz, axis=1) < MAX_REACH_M])
-    if not parts or not sum(map(len, parts)):
-        return np.zeros((0, 4))
-    xyz = np.concatenate(parts)
-    sweep = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    place = number_voxels(xyz, STATIC_VOXEL_M)
-    seen = np.unique(place * len(parts) + sweep) // len(parts)
-    share = (np.bincount(seen, minlength=int(place.max()) + 1) / len(parts))[place]
-    static = share >= MIN_STATIC_SHARE
-    return thin(np.hstack([xyz[static], share[static, None]]), VOXEL_M)
 
 
 def _read(log: Log, lidar: str, index: int) -> tuple[Array, Array] | None:
@@ -342,8 +334,7 @@ def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector
         vehicle if vehicle not in ("", NO_DETECTIONS) and not vehicle.startswith(GIVEN) else "lidar:vehicle",
         road if road not in (AUTO, NO_DETECTIONS) else "lidar:roadside",
     )
-    first, second = (create_lidar_detector(name, log, config.lidar) for name in names)
-    return first, second
+    return create_lidar_detector(names[0], log, config.lidar), create_lidar_detector(names[1], log, config.lidar)
 
 
 # What an error may be before anything is known; a direction that nothing holds stays where it was.
@@ -564,14 +555,18 @@ class ObjectTrack:
         return box, velocity, (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & (gap <= MAX_GAP_S)
 
 
-def link_boxes(boxes: Sequence[SeenBoxes], site_m: Array, start_ns: int) -> list[ObjectTrack]:
+def link_boxes(seen: Sequence[SeenBoxes], site_m: Array, start_ns: int) -> list[ObjectTrack]:
     """Link boxes of successive moments to tracks."""
     growing: list[list[Array]] = []
     done: list[list[Array]] = []
-    for found in boxes:
-        rows = _rows_of(found, site_m, start_ns)
-        if len(rows) == 0:
+    for found in seen:
+        boxes, sides = found.boxes, found.sigma_m.reshape(-1, 4)
+        if len(boxes) == 0:
             continue
+        # Group, time, and box as in `ObjectTrack`.
+        group, t_s = [GROUPS.get(str(c), -1) for c in boxes.category], (boxes.t_ns - start_ns) / NS_PER_S
+        at = [boxes.center_m - site_m, boxes.size_m[:, :2] / 2, sides, boxes.yaw_rad, found.sigma_rad]
+        rows = np.column_stack([group, t_s, *at])
         costs = np.array([_costs(track, rows) for track in growing]).reshape(len(growing), len(rows))
         pairs = zip(*linear_sum_assignment(np.where(np.isfinite(costs), costs, UNLIKELY_M)))
         taken = {int(b): int(a) for a, b in pairs if np.isfinite(costs[a, b])}
@@ -582,14 +577,6 @@ def link_boxes(boxes: Sequence[SeenBoxes], site_m: Array, start_ns: int) -> list
         done += [track for track in growing if track[-1][1] < over_s]
         growing = [track for track in growing if track[-1][1] >= over_s]
     return [track_of(np.array(track)) for track in (*done, *growing) if len(track) >= MIN_BOXES]
-
-
-def _rows_of(seen: SeenBoxes, site_m: Array, start_ns: int) -> Array:
-    """Return rows (M, 13) of group, time, and box as in `ObjectTrack`."""
-    boxes, group = seen.boxes, [GROUPS.get(str(category), -1) for category in seen.boxes.category]
-    sides = seen.sigma_m.reshape(-1, 4)
-    at = np.column_stack([(boxes.t_ns - start_ns) / NS_PER_S, boxes.center_m - site_m, boxes.size_m[:, :2] / 2])
-    return np.column_stack([group, at, sides, boxes.yaw_rad, seen.sigma_rad])
 
 
 def _costs(track: list[Array], rows: Array) -> Array:
@@ -627,16 +614,15 @@ class CommonObjects:
     @classmethod
     def of(cls, vehicle: Sequence[ObjectTrack], road: Sequence[ObjectTrack]) -> CommonObjects:
         """Pair tracks of one group that come near each other, at whatever time."""
-        near = [(seen, tuple(other for other in road if _may_be_one(seen, other))) for seen in vehicle]
-        return cls(tuple((seen, others) for seen, others in near if others))
-
-
-def _may_be_one(first: ObjectTrack, second: ObjectTrack) -> bool:
-    (low, high), (other_low, other_high) = (
-        (t.box[:, :2].min(axis=0), t.box[:, :2].max(axis=0)) for t in (first, second)
-    )
-    near = (low < other_high + MAX_APART_M).all() and (other_low < high + MAX_APART_M).all()
-    return first.group == second.group and bool(near)
+        near = []
+        for seen in vehicle:
+            low, high = seen.box[:, :2].min(axis=0) - MAX_APART_M, seen.box[:, :2].max(axis=0) + MAX_APART_M
+            alike = (other for other in road if other.group == seen.group)
+            others = tuple(
+                o for o in alike if (o.box[:, :2].max(axis=0) > low).all() and (o.box[:, :2].min(axis=0) < high).all()
+            )
+            near += [(seen, others)] if others else []
+        return cls(tuple(near))
 
 
 @dataclass(frozen=True, eq=False)

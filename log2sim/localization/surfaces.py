@@ -310,25 +310,18 @@ def choose_sweeps(
     if len(spaced) == 0 or np.linalg.norm(np.ptp(track.at(t_ns[spaced])[0][:, :3, 3], axis=0)) < MIN_PATH_M:
         return rows[:0]
     if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
-        return np.sort(np.concatenate(_fastest_changes(spaced, velocity)))
+        # Runs of sweeps in which the velocity varies most, one after the other.
+        size, parts = MAX_SWEEPS // PARTS, list[NDArray[np.intp]]()
+        scaled = velocity * np.array([1.0, 1.0, 1.0, PAIR_LEVER_M, PAIR_LEVER_M, PAIR_LEVER_M])
+        change = np.array([scaled[k : k + size].var(axis=0).sum() for k in range(len(spaced) - size + 1)])
+        while len(parts) < PARTS and change.max() >= 0:
+            k = int(np.argmax(change))
+            parts.append(spaced[k : k + size])
+            change[max(k - size + 1, 0) : k + size] = -1.0
+        return np.sort(np.concatenate(parts))
     usable = rows[(rows >= spaced[0]) & (rows <= spaced[-1])]
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, MAX_SWEEPS).round().astype(np.int64))]
     return np.asarray(chosen[velocities_at(track, t_ns[chosen])[1]])
-
-
-def _fastest_changes(rows: NDArray[np.intp], velocity: Array) -> list[NDArray[np.intp]]:
-    """Choose `PARTS` runs of rows in which the velocity varies most, one after the other."""
-    size = MAX_SWEEPS // PARTS
-    scaled = velocity * np.array([1.0, 1.0, 1.0, PAIR_LEVER_M, PAIR_LEVER_M, PAIR_LEVER_M])
-    change = np.array([scaled[k : k + size].var(axis=0).sum() for k in range(len(rows) - size + 1)])
-    parts: list[NDArray[np.intp]] = []
-    for _ in range(PARTS):
-        k = int(np.argmax(change))
-        parts.append(rows[k : k + size])
-        change[max(k - size + 1, 0) : k + size] = -1.0
-        if change.max() < 0:
-            break
-    return parts
 
 
 def surfaces_of_sweep(log: Log, lidar: str, sweep: Sweep) -> tuple[int, Array, Surfaces] | None:

@@ -214,8 +214,10 @@ class Traffic:
             for edge, rows in out_of_sight(np.isfinite(seen.ahead_m[o])):
                 lead_s = (rows - edge) * TICK_S
                 near = np.flatnonzero(np.isfinite(seen.aside_m[o]) & (np.abs(now - edge) <= second))
-                lateral = np.polyfit(near * TICK_S, seen.aside_m[o, near], 1)[0] if len(near) > second // 2 else 0.0
-                way = (lateral if abs(lateral) > KEEPING_MPS else 0.0) * lead_s
+                slope = np.polyfit(near * TICK_S, seen.aside_m[o, near], 1)[0] if len(near) > second // 2 else 0.0
+                # Both to the path of R, which may bend, and to the road.
+                lateral = min(float(slope), float(self.drift_mps[o, edge] * np.cos(turn[o, edge])), key=abs)
+                way = (lateral if abs(lateral) > KEEPING_MPS and lateral * slope > 0 else 0.0) * lead_s
                 ahead[o, rows] = ahead[o, edge] + along[o, edge] * lead_s
                 lane = aside[o, edge] / width
                 middles = np.floor(lane) * width - aside[o, edge], np.ceil(lane) * width - aside[o, edge]

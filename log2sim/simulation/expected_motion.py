@@ -21,8 +21,7 @@ from log2sim.simulation.prediction.motion_table import Complex, MotionTable
 from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_table
 from log2sim.tracking.forward import CONFIRMED_AGE_S, TENTATIVE_HITS
 
-# Whose observations count: those of the sensors of the ego, of those at the roadside, or all.
-CHOICES = (*ENDS, "both")
+CHOICES = (*ENDS, "both")  # whose observations count: those of the sensors of the ego, of those at the roadside, or all
 
 _RANGES = {
     "horizon_s": (0.5, 10.0), "margin_s": (0.0, 10.0), "early_probability": (0.01, 1.0), "min_probability": (0.01, 1.0),

@@ -7,7 +7,6 @@ the group that live in the present window of time; `live` holds their indices in
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -81,8 +80,11 @@ class Snapshot(vehicle.Columns):
     gear: Array
 
 
-class AgentGroup(ABC):
-    """Agents driven alike; `first`, `last` (A,) are the steps between which each agent lives."""
+class AgentGroup:
+    """Agents driven alike: here they are exactly where the scenario has them, other groups move them.
+
+    `first`, `last` (A,) are the steps between which each agent lives.
+    """
 
     driver = "exact"
     follows_scenario_time = True  # its agents are where the scenario has them, after a discontinuity too
@@ -142,13 +144,15 @@ class AgentGroup(ABC):
         lower = self._table[k]
         self.row = lower + (place - k) * (self._table[k + 1] - lower)
 
-    @abstractmethod
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put the agents at `index` (of all agents of the group) on their references at a time, if they are not there anyway."""
 
-    @abstractmethod
     def snapshot(self) -> Snapshot:
         """Return the present states of the living agents."""
+        x, y, yaw, speed = self.row[:4]
+        unknown = np.full(len(self.live), np.nan)
+        x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
+        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown, unknown, unknown, unknown)
 
     def advance(self, dt_s: float) -> None:
         """Move the living agents by one step; within a long step controls are renewed."""
@@ -158,32 +162,14 @@ class AgentGroup(ABC):
                 self.look_up(self.now_s + held_s)
             self._step(held_s)
 
-    @abstractmethod
     def _step(self, dt_s: float) -> None:
-        """Move the living agents with their present controls."""
+        """Move the living agents with their present controls, if they have any."""
 
     def _exact(self, index: NDArray[np.intp], t_s: float) -> Array:
         return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
 
     def _slots(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
         return np.searchsorted(self.live, index)
-
-
-class LogReplayGroup(AgentGroup):
-    """Agents that are exactly where the scenario has them."""
-
-    def place(self, index: NDArray[np.intp], t_s: float) -> None:
-        """Do nothing: the agents are always on their references."""
-
-    def _step(self, dt_s: float) -> None:
-        pass
-
-    def snapshot(self) -> Snapshot:
-        """Return the states of the scenario."""
-        x, y, yaw, speed = self.row[:4]
-        unknown = np.full(len(self.live), np.nan)
-        x, y = x + self.origin_x_m[self.live], y + self.origin_y_m[self.live]
-        return Snapshot(x, y, wrap_angle(yaw), speed, np.zeros(len(self.live)), unknown, unknown, unknown, unknown)
 
 
 class VehicleGroup(AgentGroup):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import STANDSTILL_MPS, Agent, Trajectory
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation import corridors
-from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, Snapshot, StepClock, VehicleGroup
+from log2sim.simulation.groups import AgentGroup, PedestrianGroup, Snapshot, StepClock, VehicleGroup
 from log2sim.simulation.metrics.collisions import BoxTracks, contacts
 from log2sim.simulation.prediction.motion_table import TICK_S, displacement, smooth_motion, tabulate
 from log2sim.simulation.reference import GRID_S, POINT_COLUMNS, REFERENCE_HOLD_MPS, VEHICLE_COLUMNS
@@ -410,7 +410,7 @@ RATE_OF_SPEED = {"speed": "accel_ahead", "velocity_x": "accel_x", "velocity_y": 
 
 
 class ReactiveGroup(AgentGroup):
-    """A group whose agents follow the scenario at the time and rate that `traffic` decides."""
+    """Agents that follow the scenario at the time and rate that `traffic` decides, here placed exactly on their path."""
 
     driver = "reactive"
     follows_scenario_time = False
@@ -491,7 +491,3 @@ class ReactivePedestrianGroup(ReactiveGroup, PedestrianGroup):
     """Points that react."""
 
     columns = POINT_COLUMNS
-
-
-class ReactiveLogReplayGroup(ReactiveGroup, LogReplayGroup):
-    """Agents that react and are placed exactly on their path."""

@@ -21,7 +21,6 @@ from log2sim.simulation.corridors import PathTable, scenario_times_of_distance
 from log2sim.simulation.groups import (
     ONE,
     AgentGroup,
-    LogReplayGroup,
     PedestrianGroup,
     PolicyObserver,
     PolicyVehicle,
@@ -37,7 +36,6 @@ from log2sim.simulation.policy import SIGHT_M, Controls, Observation, Policy, qu
 from log2sim.simulation.reactive import (
     FORESIGHTS,
     ReactiveGroup,
-    ReactiveLogReplayGroup,
     ReactivePedestrianGroup,
     ReactiveVehicleGroup,
     Traffic,
@@ -263,8 +261,8 @@ def agent_groups(
         if walking:
             points = [point_reference(Trajectory.through(a.waypoints)) for a in walking]
             groups.append(on_foot(walking, points, *lifespans(walking)))
-    placed: list[tuple[str, type[LogReplayGroup]]] = [("exact", LogReplayGroup)]
-    for driver, tape in placed + ([("reactive", ReactiveLogReplayGroup)] if mode == "exact" else []):
+    placed: list[tuple[str, type[AgentGroup]]] = [("exact", AgentGroup)]
+    for driver, tape in placed + ([("reactive", ReactiveGroup)] if mode == "exact" else []):
         agents = assignment[driver]
         if agents:
             rows = [log_reference(Trajectory.through(a.waypoints, rear_axle_offset(a))) for a in agents]

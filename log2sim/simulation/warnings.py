@@ -199,18 +199,9 @@ def warn(
 ) -> Warnings:
     """Find the agents on a collision course with the ego, or without one with any vehicle: since when they are known, and when they are warned of.
 
-    Raises `ConfigError` for a scenario without an ego and without vehicles that move, or unknown ends.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        With the spans in which each end observed an agent.
-    replay : Replay, optional
-        Where agents are, instead of in the scenario.
-    ends : {"both", "vehicle", "road"}
-        Whose observations count.
-    settings : WarningSettings, optional
-        Its `ends` are replaced by those above.
+    Agents are where the replay has them, or the scenario without one; only what `ends` ("both", "vehicle" or "road") observed
+    counts, which overrides those of the settings. Raises `ConfigError` for a scenario without an ego and without vehicles that
+    move, or unknown ends.
 
     Notes
     -----

@@ -261,8 +261,7 @@ _PAINTERS = {
 
 FULL_SCALE = 255.0  # intensities are whole numbers up to it, as most LiDARs have them
 REFLECTANCE: Surface = {"meadow": 0.4, "sidewalk": 0.28, "curb": 0.32, "asphalt": 0.16, "paint": 0.48}
-# Paint that is bright to the eye is bright at 905 nm, dark paint mostly dark.
-BODY_REFLECTANCE = (0.06, 0.75)
+BODY_REFLECTANCE = (0.06, 0.75)  # paint that is bright to the eye is bright at 905 nm, dark paint mostly dark
 AIR_REFLECTANCE = 0.02
 WET_SHARE, WET_BEADS = 0.5, 0.1  # of a wet road's return, and of what beads add to it
 SPECKLE = 0.15  # standard deviation of a return relative to its mean

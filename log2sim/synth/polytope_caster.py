@@ -188,25 +188,6 @@ class Returns:
     line: NDArray[np.int32]  # (N,): line of the sensor
 
 
-def cast_polytopes(
-    model: LidarModel,
-    sensor: SensorState,
-    solids: Sequence[Solid],
-    surface: Surface,
-    rng: np.random.Generator,
-    returns: ReturnModel | None = None,
-) -> Returns:
-    """Cast a sweep.
-
-    `rng`: draws reflectances, losses and noise. `returns`: by default the noise of the model and no more.
-    """
-    rays = _cast_ground(model, sensor, surface)
-    windows = windows_of(solids, sensor)
-    for index in np.argsort(windows.near_m, kind="stable").tolist():
-        cast_solid(rays, solids[index], index, windows, sensor, rng)
-    return _returned(rays, sensor, len(solids), rng, returns or ReturnModel(model.noise_m, 0.0, 0.0), model.range_m)
-
-
 def _cast_ground(model: LidarModel, sensor: SensorState, surface: Surface) -> Rays:
     """Make the rays and intersect them with the ground."""
     azimuth, elevation = model.azimuths_rad(), model.elevations_rad()
@@ -239,12 +220,27 @@ def _cast_ground(model: LidarModel, sensor: SensorState, surface: Surface) -> Ra
     return out
 
 
-def _returned(
-    rays: Rays, sensor: SensorState, count: int, rng: np.random.Generator, model: ReturnModel, range_m: float
+def cast_polytopes(
+    model: LidarModel,
+    sensor: SensorState,
+    solids: Sequence[Solid],
+    surface: Surface,
+    rng: np.random.Generator,
+    returns: ReturnModel | None = None,
 ) -> Returns:
-    """Draw what comes back of each ray."""
-    hit_range = np.where(rays.range_m < range_m, rays.range_m, np.float32(np.inf))
-    early = backscattered(hit_range.ravel(), model.weather, rng).reshape(hit_range.shape)
+    """Cast a sweep.
+
+    `rng`: draws reflectances, losses and noise. `returns`: by default the noise of the model and no more.
+    """
+    rays = _cast_ground(model, sensor, surface)
+    windows = windows_of(solids, sensor)
+    for index in np.argsort(windows.near_m, kind="stable").tolist():
+        cast_solid(rays, solids[index], index, windows, sensor, rng)
+    # What comes back of each ray.
+    returns = returns or ReturnModel(model.noise_m, 0.0, 0.0)
+    weather = returns.weather
+    hit_range = np.where(rays.range_m < model.range_m, rays.range_m, np.float32(np.inf))
+    early = backscattered(hit_range.ravel(), weather, rng).reshape(hit_range.shape)
     from_air = early < hit_range
     line, firing = np.nonzero(np.isfinite(hit_range) | from_air)
     t = np.where(from_air, early, hit_range)[line, firing].astype(np.float32)
@@ -253,14 +249,14 @@ def _returned(
     material = rays.material[line, firing]
     low, high = np.array([REFLECTANCE[m] for m in Material], np.float32).T
     # One draw for each object and material, and a little for each ray.
-    draw = rng.random((count + 2, len(Material)), dtype=np.float32)[hit + 2, material]
+    draw = rng.random((len(solids) + 2, len(Material)), dtype=np.float32)[hit + 2, material]
     speckle = np.exp(0.25 * rng.standard_normal(len(t), dtype=np.float32))
     reflectance = (low[material] + (high - low)[material] * draw) * speckle
-    signal = reflected(t, reflectance, rays.incidence[line, firing], model.weather)
-    kept = detected(signal, model, rng) | air
+    signal = reflected(t, reflectance, rays.incidence[line, firing], weather)
+    kept = detected(signal, returns, rng) | air
     line, firing, t, hit, reflectance = line[kept], firing[kept], t[kept], hit[kept], reflectance[kept]
     intensity = np.clip(reflectance * rays.incidence[line, firing], 0.003, 1)
-    t = disturbed(t, model, rng)
+    t = disturbed(t, returns, rng)
     t_s = rays.column_s[firing]
     start = sensor.position_m.astype(np.float32) + t_s[:, None] * np.append(sensor.velocity_mps, 0).astype(np.float32)
     xyz = start + t[:, None] * rays.direction[line, firing]

@@ -37,59 +37,37 @@ def first_hit(origin: Array, ray: Array, triangles: Array) -> Array:
         groups = halves
     ordered = triangles[np.concatenate(groups)]
     ends = np.cumsum([len(rows) for rows in groups])
-    planes, starts = _Planes.of(ordered), np.concatenate([[0], ends[:-1]])
+    starts = np.concatenate([[0], ends[:-1]])
     low, high = np.minimum.reduceat(ordered.min(1), starts), np.maximum.reduceat(ordered.max(1), starts)
     # Spheres are larger by more than the rounding of the distances between rays and centers.
     centers, radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + SPHERE_MARGIN_M
+    # Of each triangle the normal, not of unit length, the offset of its plane along it, second and first edge, for both
+    # coordinates within it, and their products with its first vertex.
+    a = ordered[:, 0]
+    e1, e2 = ordered[:, 1] - a, ordered[:, 2] - a
+    normal, edges = cross_products(e1, e2), np.stack([e2, e1])
+    offset, moments = np.einsum("fi,fi->f", a, normal), cross_products(a[None], edges)
     moment, along_origin = cross_products(origin, ray), np.einsum("ni,ni->n", origin, ray)
     square_origin = np.einsum("ni,ni->n", origin, origin)
     for center, radius, rows, end in zip(centers, radii, groups, ends.tolist()):
         along = ray @ center - along_origin
         square = square_origin - 2 * (origin @ center) + center @ center
         near = np.flatnonzero((square - along**2 <= radius**2) & (along >= -radius))
-        own = planes.part(end - len(rows), end)
-        step = max(1, MAX_PAIRS_PER_BATCH // len(rows))
-        for k in range(0, len(near), step):
+        own, step = slice(end - len(rows), end), max(1, MAX_PAIRS_PER_BATCH // len(rows))
+        for k in range(0, len(near), step):  # each ray against each triangle
             some = near[k : k + step]
-            out[some] = np.minimum(out[some], own.nearest_hit(origin[some], ray[some], moment[some]))
+            o, d, m = origin[some], ray[some], moment[some]
+            determinant = -(d @ normal[own].T)
+            # (o - a) . (d x e) from the moments o x d of the rays and a x e of the edges.
+            u = m @ edges[0, own].T + d @ moments[0, own].T
+            v = -(m @ edges[1, own].T + d @ moments[1, own].T)
+            t = o @ normal[own].T - offset[own]
+            solid = np.abs(determinant) > 1e-12
+            scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=solid)
+            u, v, t = u * scale, v * scale, t * scale
+            inside = solid & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
+            out[some] = np.minimum(out[some], np.where(inside, t, np.inf).min(1, initial=np.inf))
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class _Planes:
-    """Triangles as what products with rays need."""
-
-    normal: Array  # (F, 3): product of the edges, not of unit length
-    offset: Array  # (F,): of the planes along their normals
-    edges: Array  # (2, F, 3): second and first edge, for both coordinates within a triangle
-    moments: Array  # (2, F, 3): products of these edges with the first vertex
-
-    @classmethod
-    def of(cls, triangles: Array) -> _Planes:
-        """Compute the planes of triangles (F, 3, 3)."""
-        a = triangles[:, 0]
-        e1, e2 = triangles[:, 1] - a, triangles[:, 2] - a
-        normal = cross_products(e1, e2)
-        edges = np.stack([e2, e1])
-        return cls(normal, np.einsum("fi,fi->f", a, normal), edges, cross_products(a[None], edges))
-
-    def part(self, start: int, end: int) -> _Planes:
-        """Take some of them."""
-        rows = slice(start, end)
-        return _Planes(self.normal[rows], self.offset[rows], self.edges[:, rows], self.moments[:, rows])
-
-    def nearest_hit(self, o: Array, d: Array, moment: Array) -> Array:
-        """Distance (N,) along rays to the nearest triangle, each tested against each; inf without one."""
-        determinant = -(d @ self.normal.T)
-        # (o - a) . (d x e) from the moments o x d of the rays and a x e of the edges.
-        u = moment @ self.edges[0].T + d @ self.moments[0].T
-        v = -(moment @ self.edges[1].T + d @ self.moments[1].T)
-        t = o @ self.normal.T - self.offset
-        solid = np.abs(determinant) > 1e-12
-        scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=solid)
-        u, v, t = u * scale, v * scale, t * scale
-        inside = solid & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0)
-        return np.asarray(np.where(inside, t, np.inf).min(1, initial=np.inf))
 
 
 NEAR_M = 0.3
@@ -163,7 +141,12 @@ class Samples:
         by_ray = normals / np.where(facing, volume, -1.0)[:, None, None]
         slope_u, slope_v = by_ray[..., 0] / K[0, 0], by_ray[..., 1] / K[1, 1]
         planes = np.stack([slope_u, slope_v, by_ray[..., 2] - slope_u * K[0, 2] - slope_v * K[1, 2]], 2)
-        low, high = _row_ranges(triangles, K, height_px)
+        # Rows that faces can touch, from (F,) to before (F,); all rows where a face reaches behind the near plane.
+        z = triangles[:, :, 2]
+        ahead = z.min(1) > NEAR_M
+        at = triangles[:, :, 1] / np.where(ahead[:, None], z, 1.0) * K[1, 1] + K[1, 2]
+        low = np.where(ahead, np.clip(np.ceil(at.min(1)), 0, height_px), 0).astype(np.int32)
+        high = np.where(ahead, np.clip(np.floor(at.max(1)) + 1, 0, height_px), height_px).astype(np.int32)
         kept = np.flatnonzero(facing & (high > low) & (triangles[:, :, 2].max(1) > NEAR_M)).astype(np.int32)
         # Near faces last, so that they are written over far ones.
         kept = kept[np.argsort(-triangles[kept, :, 2].sum(1))]
@@ -234,16 +217,6 @@ def _counted(counts: Index) -> Index:
     ends = np.cumsum(counts, dtype=np.int32)
     total = int(ends[-1]) if len(ends) else 0
     return np.arange(total, dtype=np.int32) - np.repeat(ends - counts, counts)
-
-
-def _row_ranges(triangles: Array, K: Array, height_px: int) -> tuple[Index, Index]:
-    """Rows that faces can touch, from (F,) to before (F,); all rows where a face reaches behind the near plane."""
-    z = triangles[:, :, 2]
-    ahead = z.min(1) > NEAR_M
-    v = triangles[:, :, 1] / np.where(ahead[:, None], z, 1.0) * K[1, 1] + K[1, 2]
-    low = np.where(ahead, np.clip(np.ceil(v.min(1)), 0, height_px), 0).astype(np.int32)
-    high = np.where(ahead, np.clip(np.floor(v.max(1)) + 1, 0, height_px), height_px).astype(np.int32)
-    return low, high
 
 
 def _spans(planes: Array, face: Index, v: Index, width_px: int) -> tuple[Index, Index, Array, Array]:

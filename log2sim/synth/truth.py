@@ -161,8 +161,7 @@ def _along(whole: LineString, part: BaseGeometry) -> list[Interval]:
     """Parts of a line, as distances along it in ascending order."""
     pieces = [p for p in shapely.get_parts(part) if p.geom_type == "LineString" and p.length >= MIN_PIECE_M]
     ends = [[float(whole.project(Point(p.coords[n]))) for n in (0, -1)] for p in pieces]
-    # Pieces that meet at a point of the line are one.
-    out: list[Interval] = []
+    out: list[Interval] = []  # pieces that meet at a point of the line are one
     for begin, end in sorted((min(e), max(e)) for e in ends):
         if out and begin - out[-1][1] < 10**-DIGITS:
             out[-1] = (out[-1][0], end)

@@ -24,7 +24,7 @@ from log2sim.geometry import (
     transform,
     yaw_of,
 )
-from log2sim.logs.waymo.tfrecord import masked_crc32c
+from log2sim.logs.waymo.messages import masked_crc32c
 from log_encoders.world import labels_at
 
 PERIOD_NS = 100_000_000

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from log_encoders import ros
 
-from log2sim.logs.waymo.tfrecord import masked_crc32c
+from log2sim.logs.waymo.messages import masked_crc32c
 from mutation.bases import small_world
 
 MAX_TRIES = 50

@@ -19,8 +19,17 @@ from log2sim.errors import LogError
 from log2sim.files.images import MAX_IMAGE_PX
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.excerpt import digest_of
-from log2sim.logs.nuscenes.scene import Channel, Scene, read_labels, read_sweep
-from log2sim.logs.nuscenes.tables import DATA, SCENES, Record, Tables, numbers_of
+from log2sim.logs.nuscenes.scene import (
+    DATA,
+    SCENES,
+    Channel,
+    Record,
+    Scene,
+    Tables,
+    numbers_of,
+    read_labels,
+    read_sweep,
+)
 from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_folders
 from log2sim.logs.stamps import defer_notes
 

@@ -28,6 +28,7 @@ from log2sim.logs.records import sweep_of
 from log2sim.logs.stamps import MAX_TIME_S, defer_notes, strictly_increasing
 from log2sim.logs.waymo.messages import (
     FrameIndex,
+    RecordFile,
     Span,
     WireError,
     read_box,
@@ -35,6 +36,7 @@ from log2sim.logs.waymo.messages import (
     read_camera_labels,
     read_index,
     segment_name,
+    starts_like_tfrecord,
     take_index,
 )
 from log2sim.logs.waymo.range_images import (
@@ -58,7 +60,6 @@ from log2sim.logs.waymo.segment import (
     Segment,
     plausible_stamp,
 )
-from log2sim.logs.waymo.tfrecord import RecordFile, starts_like_tfrecord
 
 # From OpenCV's axes to x forward, y left, z up.
 CAMERA_T_OPENCV = transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))

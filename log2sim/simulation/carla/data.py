@@ -40,28 +40,22 @@ CARS: Mapping[str, Size] = {
     "vehicle.tesla.model3": (4.79, 2.16, 1.49), "vehicle.toyota.prius": (4.51, 2.01, 1.52),
 }  # fmt: skip
 VANS: Mapping[str, Size] = {
-    "vehicle.mercedes.sprinter": (5.92, 1.99, 2.56),
-    "vehicle.volkswagen.t2": (4.48, 2.07, 2.04),
+    "vehicle.mercedes.sprinter": (5.92, 1.99, 2.56), "vehicle.volkswagen.t2": (4.48, 2.07, 2.04),
     "vehicle.volkswagen.t2_2021": (4.44, 1.77, 1.99),
-}
+}  # fmt: skip
 TRUCKS: Mapping[str, Size] = {
-    "vehicle.carlamotors.carlacola": (5.20, 2.63, 2.47),
-    "vehicle.carlamotors.european_hgv": (7.94, 2.89, 3.46),
-    "vehicle.carlamotors.firetruck": (8.47, 2.89, 3.83),
-    "vehicle.tesla.cybertruck": (6.27, 2.39, 2.10),
-}
+    "vehicle.carlamotors.carlacola": (5.20, 2.63, 2.47), "vehicle.carlamotors.european_hgv": (7.94, 2.89, 3.46),
+    "vehicle.carlamotors.firetruck": (8.47, 2.89, 3.83), "vehicle.tesla.cybertruck": (6.27, 2.39, 2.10),
+}  # fmt: skip
 BUSES: Mapping[str, Size] = {"vehicle.mitsubishi.fusorosa": (10.27, 3.94, 4.25)}
 MOTORCYCLES: Mapping[str, Size] = {
-    "vehicle.harley-davidson.low_rider": (2.35, 0.77, 1.65),
-    "vehicle.kawasaki.ninja": (2.04, 0.80, 1.52),
-    "vehicle.vespa.zx125": (1.82, 0.87, 1.59),
-    "vehicle.yamaha.yzf": (2.19, 0.87, 1.53),
-}
+    "vehicle.harley-davidson.low_rider": (2.35, 0.77, 1.65), "vehicle.kawasaki.ninja": (2.04, 0.80, 1.52),
+    "vehicle.vespa.zx125": (1.82, 0.87, 1.59), "vehicle.yamaha.yzf": (2.19, 0.87, 1.53),
+}  # fmt: skip
 BICYCLES: Mapping[str, Size] = {
-    "vehicle.bh.crossbike": (1.51, 0.87, 1.61),
-    "vehicle.diamondback.century": (1.66, 0.58, 1.62),
+    "vehicle.bh.crossbike": (1.51, 0.87, 1.61), "vehicle.diamondback.century": (1.66, 0.58, 1.62),
     "vehicle.gazelle.omafiets": (1.84, 0.66, 1.78),
-}
+}  # fmt: skip
 
 # The box of a walker is its capsule; adults, older and younger children have one size each.
 _CHILDREN = {

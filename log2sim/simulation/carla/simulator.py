@@ -20,7 +20,7 @@ from log2sim.errors import ConfigError, MissingExtra
 from log2sim.geometry import Array, whole_kilometers
 from log2sim.simulation.carla import player
 from log2sim.simulation.carla.data import carla_agents
-from log2sim.simulation.groups import AgentGroup, LogReplayGroup, PedestrianGroup, StepClock, VehicleGroup
+from log2sim.simulation.groups import AgentGroup, PedestrianGroup, StepClock, VehicleGroup
 from log2sim.simulation.vehicles.vehicle import PointState, step_point
 
 
@@ -52,7 +52,7 @@ class CarlaSimulator:
         """
         self.clock = clock
         all_agents = [a for g in groups for a in g.agents] + list(statics)
-        log_groups = [g for g in groups if isinstance(g, LogReplayGroup)]
+        log_groups = [g for g in groups if not isinstance(g, (VehicleGroup, PedestrianGroup))]
         replayed = [a for g in log_groups if g.follows_scenario_time for a in g.agents] + list(statics)
         xy: Array = np.concatenate([np.column_stack([a.waypoints.x_m, a.waypoints.y_m]) for a in all_agents])
         x, y = whole_kilometers(xy)
@@ -154,7 +154,7 @@ class CarlaSimulator:
             if walks:
                 yield self._player.walk(actor, (goal_x - x) / dt_s, (goal_y - y) / dt_s, yaw)
 
-    def _show(self, group: LogReplayGroup, step: int) -> Iterator[Any]:
+    def _show(self, group: AgentGroup, step: int) -> Iterator[Any]:
         """Yield the commands that put delayed agents on their path."""
         now, dt_s = group.snapshot(), self.clock.dt_s
         for slot in self._present(group, step):

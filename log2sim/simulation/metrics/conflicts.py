@@ -142,11 +142,8 @@ CROSSING_RAD = math.radians(30.0)
 
 # Rows of the largest blocks, the factor by which blocks are divided, and the number of sizes.
 COARSE, FINER, LEVELS = 64, 4, 3
-
 BATCH = 2000  # pairs whose times are refined together, which bounds memory
-# Pairs of blocks that are divided together: each becomes up to 256 pairs of parts before its rows.
-BLOCK_PAIRS = 20_000
-
+BLOCK_PAIRS = 20_000  # pairs of blocks that are divided together: each becomes up to 256 pairs of parts before its rows
 PARTS, ZOOMS = 4, 4  # a row is divided into so many parts so many times: 50 ms to 0.2 ms
 
 
@@ -175,8 +172,7 @@ class _Pairs(NamedTuple):
     def divided(self) -> _Pairs:
         """Divide the blocks and return all pairs of parts in which the second agent is not before the first."""
         part = np.arange(FINER)
-        i = self.i[:, None, None] * FINER + part[:, None]
-        j = self.j[:, None, None] * FINER + part
+        i, j = self.i[:, None, None] * FINER + part[:, None], self.j[:, None, None] * FINER + part
         i, j = np.broadcast_arrays(i, j)
         k, *_ = np.nonzero(i <= j)
         return _Pairs(self.a[k], self.b[k], i[i <= j], j[i <= j])
@@ -278,12 +274,9 @@ def _overlapping_blocks(hulls: _SweptRectangles, moves: NDArray[np.bool_], lag: 
 
 def _crossings(boxes: BoxTracks, pairs: _Pairs, lag: float) -> _Pairs:
     """Select the pairs of rows at which the boxes cover a common place that one leaves before the other arrives."""
-    count = len(boxes.x_m)
-    pairs = pairs.take((pairs.i < pairs.j) & (pairs.j < count) & (pairs.j - pairs.i <= lag))
-    a, b, i, j = pairs
+    a, b, i, j = pairs = pairs.take((pairs.i < pairs.j) & (pairs.j < len(boxes.x_m)) & (pairs.j - pairs.i <= lag))
     angle = np.abs(wrap_angle(boxes.yaw_rad[j, b] - boxes.yaw_rad[i, a]))
-    pairs = pairs.take(boxes.present[i, a] & boxes.present[j, b] & (angle >= CROSSING_RAD))
-    a, b, i, j = pairs
+    a, b, i, j = pairs = pairs.take(boxes.present[i, a] & boxes.present[j, b] & (angle >= CROSSING_RAD))
     a, b, i, j = pairs = pairs.take(boxes.overlap(i, a, j, b))
     stays, was = boxes.overlap(boxes.last_row[a], a, j, b), boxes.overlap(i, a, boxes.first_row[b], b)
     return pairs.take(~stays & ~was)

@@ -293,20 +293,9 @@ def predict_scenario(
 ) -> Predictions:
     """Predict where each agent of a scenario will be, at every tick and from its states up to then.
 
-    Parameters
-    ----------
-    horizon_s : float, s
-        Longest lead.
-    methods : sequence of str
-        Of `METHODS`; `path` knows the lanes of the scenario that are between markings.
+    `horizon_s`: longest lead, from 0.1 to 10 s. `methods`: of `METHODS`; `path` knows the lanes of the scenario that are between
+    markings. Raises `ConfigError` for any other.
 
-    Raises
-    ------
-    ConfigError
-        For a horizon that is not from 0.1 to 10 s, or an unknown method.
-
-    Notes
-    -----
     Only states up to a tick are used. Those of a reconstruction were smoothed over the whole log, so that they depend a little
     of what came next: predictions by a system that measures while it drives are worse.
     """
