@@ -408,10 +408,10 @@ def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
     layers = []
     for layer, cells in enumerate(FEATURE_CELLS):
         scale = scales[layer]
-        shapes = [(scale, ratio) for ratio in (1.0, 2.0, 0.5, 3.0, 1 / 3)] + [(np.sqrt(scale * scales[layer + 1]), 1.0)]
+        forms = [(scale, ratio) for ratio in (1.0, 2.0, 0.5, 3.0, 1 / 3)] + [(np.sqrt(scale * scales[layer + 1]), 1.0)]
         if layer == 0:
-            shapes = [(0.1, 1.0), (scale, 2.0), (scale, 0.5)]
-        size = np.array([(s / np.sqrt(ratio), s * np.sqrt(ratio)) for s, ratio in shapes])
+            forms = [(0.1, 1.0), (scale, 2.0), (scale, 0.5)]
+        size = np.array([(s / np.sqrt(ratio), s * np.sqrt(ratio)) for s, ratio in forms])
         v, u = np.mgrid[:cells, :cells]
         middle = (np.stack([v.ravel(), u.ravel()], axis=1) + 0.5) / cells
         layers.append(np.concatenate([np.repeat(middle, len(size), axis=0), np.tile(size, (len(middle), 1))], axis=1))
