@@ -433,8 +433,8 @@ def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
         "Concat", [add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")], "boxes", axis=2
     )
     converter.add("Sigmoid", [logits], "scores")
-    outputs = {"boxes": ("N", len(anchors), 4), "scores": ("N", len(anchors), len(CLASS_NAMES))}
-    model = converter.model("ssd_mobilenet_v2_coco", INPUT_PX, outputs)
+    shapes = {"boxes": ("N", len(anchors), 4), "scores": ("N", len(anchors), len(CLASS_NAMES))}
+    model = converter.model("ssd_mobilenet_v2_coco", INPUT_PX, shapes)
     entry = model.metadata_props.add()
     entry.key, entry.value = "names", repr(dict(enumerate(CLASS_NAMES.values())))
     return model
