@@ -13,7 +13,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 import ablate  # noqa: E402
 
-from log2sim import pipeline  # noqa: E402
 from log2sim.config import Config  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -101,7 +100,7 @@ def test_whole_numbers_change_by_one_and_shares_stay_below_one():
 
 
 def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
-    assert all(hasattr(pipeline, name) for functions, _, _ in ablate.STAGES.values() for name in functions)
+    assert all(hasattr(*ablate.place_of(name)) for functions, _, _ in ablate.STAGES.values() for name in functions)
     found = list(ablate.variations(Config()))
     assert {v.stage for v in found} == set(ablate.STAGES)
     labels = {v.label for v in found}

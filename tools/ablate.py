@@ -55,7 +55,7 @@ STAGES = {
     "homography": (("fit_homographies", "place_by_homography"), "perception.homography perception.homography_stage", "topdown seed"),
     "fusion": (("fuse",), "perception.fusion", ""),
     "tracking": (("track", "mark_unrecorded"), "tracking", "track"),
-    "agents": (("estimate_agents", "decide_headings"), "agents", "smooth"),
+    "agents": (("estimate.estimate_agents", "decide_headings"), "agents", "smooth"),
     "judgement": (("judge",), "agents.judge agents.conflicts agents.evidence agents.rays agents.weights", ""),
     "road": (("describe",), "road", "map appearance"),
 }  # fmt: skip
@@ -211,9 +211,15 @@ def case_of(path: str, detector: str) -> Case:
     return Case(name, replace(log, streams=kept), truth)
 
 
+def place_of(name: str) -> tuple[Any, str]:
+    """Where the pipeline finds a function: itself or a module in it, and the name there."""
+    module, _, function = name.rpartition(".")
+    return getattr(pipeline, module) if module else pipeline, function
+
+
 def recorded(case: Case, config: Config) -> Case:
     """The case with what the stages return in it and the code that runs."""
-    usual = {name: getattr(pipeline, name) for functions, _, _ in STAGES.values() for name in functions}
+    usual = {name: getattr(*place_of(name)) for functions, _, _ in STAGES.values() for name in functions}
 
     def recording(name: str) -> Any:
         def call(*arguments: Any, **named: Any) -> Any:
@@ -228,7 +234,7 @@ def recorded(case: Case, config: Config) -> Case:
             case.called.add(frame.f_code)
 
     for name in usual:
-        setattr(pipeline, name, recording(name))
+        setattr(*place_of(name), recording(name))
     threading.setprofile(profile)
     sys.setprofile(profile)
     try:
@@ -237,7 +243,7 @@ def recorded(case: Case, config: Config) -> Case:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]
         for name, function in usual.items():
-            setattr(pipeline, name, function)
+            setattr(*place_of(name), function)
     return case
 
 
@@ -250,7 +256,7 @@ def figures_of(case: Case, config: Config, stage: str) -> tuple[Figures, str]:
     given = [n for s in names[: names.index(stage)] for n in STAGES[s][0]]
     for name in given:
         results = iter(case.recorded[name])
-        setattr(pipeline, name, lambda *_, results=results, **__: next(results))
+        setattr(*place_of(name), lambda *_, results=results, **__: next(results))
     with_road = stage in ("localization", "perception", "road")
     if not with_road:
         _, decisions, figures = case.recorded["describe"][0]

@@ -71,12 +71,12 @@ class ObstacleList(Sequence["Obstacles | None"]):
 
     def __init__(self, file: ArrayFile) -> None:
         self._file = file
-        self._ticks: list[Callable[[], Obstacles | None]] = []
+        self._ticks: list[Callable[[], Obstacles] | None] = []
 
     def append(self, obstacles: Obstacles | None) -> None:
         """Add those of the next tick."""
         if obstacles is None:
-            self._ticks.append(lambda: None)
+            self._ticks.append(None)
             return
         of, free, seen_from = obstacles, obstacles.free, obstacles.seen_from
         points, rays = (
@@ -84,9 +84,7 @@ class ObstacleList(Sequence["Obstacles | None"]):
             for columns in ((of.xyz, of.t_s, seen_from), () if free is None else (free.end, free.t_s, free.sensor))
         )
         read = partial(points.__getitem__, 0), partial(points.__getitem__, 1)
-        of_rays = (
-            None if free is None else partial(lambda *lidars: Rays(*rays, *lidars), free.position, free.velocity_mps)
-        )
+        of_rays = None if free is None else partial(_read_rays, rays, free.position, free.velocity_mps)
         last = None if seen_from is None else partial(points.__getitem__, 2)
         self._ticks.append(partial(Obstacles, of.stamp_ns, of.origin, *read, of.sensor, of_rays, of.viewpoints, last))
 
@@ -96,7 +94,16 @@ class ObstacleList(Sequence["Obstacles | None"]):
 
     def __getitem__(self, tick: Any) -> Any:
         """Return the obstacles of a tick, a list of them for a slice."""
-        return [make() for make in self._ticks[tick]] if isinstance(tick, slice) else self._ticks[tick]()
+        if isinstance(tick, slice):
+            return [self[k] for k in range(len(self))[tick]]
+        make = self._ticks[tick]
+        return None if make is None else make()
+
+
+def _read_rays(kept: ArrayList, position: NDArray[np.float32], velocity_mps: NDArray[np.float32]) -> Rays:
+    """Make rays of what is kept of them; a function of the module, so that first passes can be pickled."""
+    end, t_s, sensor = kept
+    return Rays(end, t_s, sensor, position, velocity_mps)
 
 
 # Sweeps of each LiDAR that are kept for the next ticks, which may share some.
