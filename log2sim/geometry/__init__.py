@@ -49,6 +49,7 @@ from log2sim.geometry.statistics import (
     CHI2_4DOF_999,
     choose_pairs,
     fit_windows,
+    median,
     weighted_quantile,
 )
 from log2sim.geometry.transforms import (
