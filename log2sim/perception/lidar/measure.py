@@ -12,7 +12,6 @@ their ends are ends of the object.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -460,19 +459,16 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
         longest_m, seed = MAX_SIZE_M[category][0], members[k]
         if longest_m < MIN_LONG_M or len(seed) < MIN_CLUSTER_POINTS:
             continue
-        # The boxes of a detector that sees little of a long flank at a time end before it does. Most sides end where they seem
-        # to, as points within a gap around the box tell; others go on along the flank, then round the corner.
+        # The boxes of a detector that sees little of a long flank at a time end before it does.
         middle = center[k].astype(xyz.dtype)
+        rest = np.flatnonzero(free & (np.abs(x - middle[0]) < longest_m) & (np.abs(y - middle[1]) < longest_m))
         yaw_rad = corrected_yaw(place[seed].astype(np.float64), float(boxes.yaw_rad[k]))
-        seed, half_m = np.sort(seed), boxes.size_m[k, :2] / 2 + BOX_MARGIN_M
-        for reach_m in (math.sqrt(2) * (math.hypot(*half_m) + ROW_GAP_M), longest_m, longest_m):
-            rest = np.flatnonzero(free & (np.abs(x - middle[0]) < reach_m) & (np.abs(y - middle[1]) < reach_m))
+        for _ in range(2):  # along the flank, then round the corner
             own, more = (place[index].astype(np.float64) for index in (seed, rest))
             added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
+            seed, rest = np.sort(np.concatenate([seed, rest[added]])), np.delete(rest, added)
             if not len(added):
                 break
-            if reach_m == longest_m:
-                seed = np.sort(np.concatenate([seed, rest[added]]))
         # Sides that go on past the longest and widest vehicle are a wall's.
         sides_m = np.sort(np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0))
         if (sides_m <= MAX_SIZE_M[category][1::-1]).all():
