@@ -14,7 +14,7 @@ from entry import commands_in, run_named
 from fits import late_fusion
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from mutants import MUTANTS
-from profile_ticks import Measured, Times, figures
+from profile_ticks import Measured, figures
 from worlds import tiny_toml
 
 from log2sim.logs.native.writer import write_log
@@ -118,10 +118,9 @@ def test_pairs_of_labels_that_late_fusion_is_fitted_to_are_right(tmp_path: Path)
 
 def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread() -> None:
     def run(cpu_s: float) -> Measured:
-        stages = {"poses": Times(0.1, 0.1 * cpu_s), "detect": Times(1.0, 0.5 * cpu_s)}
-        return Measured(Times(cpu_s / 2, cpu_s), 10, stages)
+        return Measured((cpu_s / 2, cpu_s), 10, {"poses": (0.1, 0.1 * cpu_s), "detect": (1.0, 0.5 * cpu_s)})
 
-    floor = {1: [Times(0.5, 0.5)], 2: [Times(0.3, 0.6)]}
+    floor = {1: [(0.5, 0.5)], 2: [(0.3, 0.6)]}
     row, stages = figures("some", "labels", [run(1.0), run(9.0), run(2.0)], floor)
     assert row == ["some", "`labels`", "10", "10.00", "100", "200", "100", "50", "30", "4.00", "2.00"]
     assert "| detect | 100.0 | 100.0 |" in stages
