@@ -15,8 +15,6 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.report import Result
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"
-
-
 RANGE_M = 40.0
 
 

@@ -20,7 +20,6 @@ from worlds import tiny_toml
 from log2sim.logs.native.writer import write_log
 
 pytestmark = pytest.mark.slow
-
 PAPERS = ("zou2021", "two_stream")
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
