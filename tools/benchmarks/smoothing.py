@@ -301,26 +301,83 @@ START_SIGMAS, START_MPS = (10.0, 2.0, 0.5), 12.0
 DENSITIES = (0.1, 0.3, 1.0, 2.0)
 
 
-def cramer_rao_m(density: float, sigma_m: float) -> float:
-    """Least root mean square position error of any estimator of motions with white jerk that knows its density and the noise.
+def smooth_told(
+    densities: Array, yaw_rad: Array, xy: Array, valid: NDArray[np.bool_], sigma_m: float
+) -> tuple[Array, Array]:
+    """Positions (B, T, 2) of the Rauch-Tung-Striebel smoother that is told jerk densities (B, T-1, 2) along and across the way, and variances (B, T).
 
-    The posterior Cramer-Rao bound (Tichavsky, Muravchik & Nehorai, 1998), which for linear motion is the covariance of the Rauch-Tung-
-    Striebel smoother with the true parameters.
+    The variances, of both axes together, are the posterior Cramer-Rao bound (Tichavsky, Muravchik & Nehorai, 1998) of all motions
+    with such jerk about this way, which is linear. Positions (B, T, 2) count where they are `valid` (B, T).
     """
-    step, added = white_jerk(density)
-    covariance, filtered, predicted = np.diag(np.square(START_SIGMAS)), [], []
-    for k in range(FRAMES):
-        covariance = step @ covariance @ step.T + added if k else covariance
-        predicted.append(covariance)
-        gain = covariance[:, :1] / (covariance[0, 0] + sigma_m**2)
-        covariance = covariance - gain @ covariance[:1]
-        filtered.append(covariance)
-    variances = [covariance[0, 0]]
-    for k in range(FRAMES - 2, -1, -1):
-        gain = filtered[k] @ step.T @ np.linalg.inv(predicted[k + 1])
-        covariance = filtered[k] + gain @ (covariance - predicted[k + 1]) @ gain.T
-        variances.append(covariance[0, 0])
-    return float(np.sqrt(2 * np.mean(variances)))
+    step, unit = (np.kron(block, np.eye(2)) for block in white_jerk(1.0))
+    turn = np.moveaxis(np.array([[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]), 2, 0)
+    by_axis = np.einsum("tij,btj,tkj->btik", turn[1:], densities, turn[1:])
+    mean = np.concatenate([xy[:, 0], np.zeros((len(xy), 4))], axis=1)
+    mean[:, 2:4] = START_MPS * turn[0, :, 0]
+    covariance = np.tile(np.kron(np.diag(np.square(START_SIGMAS)), np.eye(2)), (len(xy), 1, 1))
+    filtered, predicted = [], []
+    for k in range(len(yaw_rad)):
+        if k:
+            mean, covariance = mean @ step.T, step @ covariance @ step.T + unit * np.tile(by_axis[:, k - 1], (1, 3, 3))
+        predicted.append((mean, covariance))
+        gain = (
+            covariance[:, :, :2]
+            @ np.linalg.inv(covariance[:, :2, :2] + sigma_m**2 * np.eye(2))
+            * valid[:, k, None, None]
+        )
+        mean = mean + np.einsum("bij,bj->bi", gain, xy[:, k] - mean[:, :2])
+        covariance = covariance - gain @ covariance[:, :2]
+        filtered.append((mean, covariance))
+    smoothed = [(mean, covariance)]
+    for (m, c), (ahead, spread) in zip(filtered[-2::-1], predicted[:0:-1], strict=True):
+        gain = c @ step.T @ np.linalg.inv(spread)
+        mean = m + np.einsum("bij,bj->bi", gain, mean - ahead)
+        covariance = c + gain @ (covariance - spread) @ np.swapaxes(gain, 1, 2)
+        smoothed.append((mean, covariance))
+    return tuple(
+        np.stack(columns[::-1], axis=1) for columns in zip(*((m[:, :2], c[:, 0, 0] + c[:, 1, 1]) for m, c in smoothed))
+    )  # type: ignore[return-value]
+
+
+def cramer_rao_m(density: float, sigma_m: float) -> float:
+    """Least root mean square position error of any estimator of motions with white jerk that knows its density and the noise."""
+    told = (
+        np.full((1, FRAMES - 1, 2), density**2),
+        np.zeros(FRAMES),
+        np.zeros((1, FRAMES, 2)),
+        np.ones((1, FRAMES), bool),
+    )
+    return float(np.sqrt(smooth_told(*told, sigma_m)[1].mean()))
+
+
+def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, float, float]:
+    """Root mean square position errors in m on a maneuver: of log2sim, and the bounds with constant jerk densities and with those that follow it.
+
+    Of the motions with white jerk those that have the maneuver's: the densities with which the smoother that is told them errs least on
+    the maneuver itself, constant along and across, or in proportion to the mean of the squared true jerk within some second.
+    """
+    cases = [world for world in worlds(sigma_m, seeds=seeds) if world.maneuver == maneuver]
+    truth = cases[0].truth
+    velocity = truth.velocity_mps
+    jerk = np.gradient(np.gradient(velocity, PERIOD_S, axis=0), PERIOD_S, axis=0)[1:]
+    cos, sin = np.cos(truth.yaw_rad[1:]), np.sin(truth.yaw_rad[1:])
+    squared = np.column_stack([jerk[:, 0] * cos + jerk[:, 1] * sin, jerk[:, 1] * cos - jerk[:, 0] * sin]) ** 2
+    nearby = np.exp(-0.5 * ((ALL_S[1:, None] - ALL_S[None, 1:]) / 0.5) ** 2)
+    following = nearby @ squared / nearby.sum(axis=1, keepdims=True)
+    each = 10.0 ** np.arange(-4, 2.5, 0.5)
+    constant = np.stack(np.meshgrid(each, each), axis=-1).reshape(-1, 1, 2) * np.ones((1, FRAMES - 1, 1))
+    families = constant, np.geomspace(0.1, 3.0, 7)[:, None, None] * following + 1e-4
+    xy, valid = np.array([w.xy_m for w in cases]), np.array([w.valid for w in cases])
+    bounds = []
+    for family in families:
+        rows, n = np.repeat(np.arange(len(cases)), len(family)), len(family)
+        found, variance = smooth_told(
+            np.tile(family, (len(cases), 1, 1)), truth.yaw_rad, xy[rows], valid[rows], sigma_m
+        )
+        off = ((found - truth.xy_m) ** 2).sum(axis=2).mean(axis=1).reshape(-1, n).mean(axis=0)
+        bounds.append(float(np.sqrt(variance.mean(axis=1).reshape(-1, n).mean(axis=0)[np.argmin(off)])))
+    ours = [log2sim(ALL_S[w.valid], w.xy_m[w.valid], sigma_m)[0] - truth.xy_m for w in cases]
+    return float(np.sqrt(np.mean(np.square(ours).sum(axis=2)))), bounds[0], bounds[1]
 
 
 def drawn_error_m(density: float, sigma_m: float, seeds: int) -> float:
@@ -354,7 +411,19 @@ def by_bound(seeds: int) -> str:
         f" the motion: {seeds} drawn motions of white jerk at 10 Hz, around 12 m/s; root mean square position errors in m."
     )
     head = ["jerk, m/s^2.5", *(f"{c}, {s} m" for s in (0.1, 0.3) for c in ("error", "bound", "ratio"))]
-    return f"{text}\n\n{markdown(head, rows)}"
+    drawn = f"{text}\n\n{markdown(head, rows)}"
+    rows = []
+    for maneuver in MANEUVERS:
+        rows.append([maneuver])
+        for sigma_m in (0.1, 0.3, 0.6):
+            error_m, constant_m, following_m = maneuver_bounds(maneuver, sigma_m, max(2, seeds // 4))
+            rows[-1] += [f"{error_m:.3f}", f"{error_m / constant_m:.2f} / {error_m / following_m:.2f}"]
+    text = (
+        "The maneuvers of the first table, and errors in proportion to the bounds of motions with as much white jerk along and across"
+        " the way: told how much there is in all / at every time."
+    )
+    head = ["maneuver", *(f"{c}, {s} m" for s in (0.1, 0.3, 0.6) for c in ("error", "ratios"))]
+    return f"{drawn}\n\n{text}\n\n{markdown(head, rows)}"
 
 
 def main(quick: bool = False, write: Path | None = None) -> None:
