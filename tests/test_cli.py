@@ -26,7 +26,9 @@ from log2sim.files.documents import check
 from log2sim.files.plugins import BUILT_IN
 from log2sim.logs.native.writer import write_log
 
-COMMANDS = ["reconstruct", "replay", "edit", "plot", "view", "detect", "evaluate", "bench", "synth", "inspect", "validate", "cache", "config"]
+COMMANDS = [
+    "reconstruct", "replay", "edit", "plot", "view", "detect", "evaluate", "bench", "synth", "inspect", "validate", "cache", "config",
+]  # fmt: skip
 PNG = b"\x89PNG"
 
 
@@ -250,7 +252,18 @@ def test_every_command_names_the_files_it_wrote(
     monkeypatch.chdir(tmp_path)
     scenario = tiny_scenario
     commands = [
-        ("reconstruct", tiny_folder, *["--detector", "labels", "-o", "s.json", "--report", "r.json", "--topdown", "t.png"]),
+        (
+            "reconstruct",
+            tiny_folder,
+            "--detector",
+            "labels",
+            "-o",
+            "s.json",
+            "--report",
+            "r.json",
+            "--topdown",
+            "t.png",
+        ),
         ("detect", tiny_folder, "--detector", "lidar:labels", "-o", "boxes.json"),
         ("replay", scenario, "-o", "replay.json"),
         ("plot", scenario, "-o", "plot.svg"),
