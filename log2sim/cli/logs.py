@@ -119,7 +119,6 @@ def inspect(
         "Time to draw, in s after the first tick.", "S", default="in the middle")] = None,
     cameras: opt.Cameras = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Describe the content of a log, or of a scenario.json, or draw one tick of a log.
@@ -149,17 +148,17 @@ def inspect(
     else:
         names = opt.camera_names(cameras)
         check_targets(overlay, overwrite=overwrite)
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             report_progress(OPENING, 0, 0)
             opened = open_log(log, format=format, sequence=sequence)
         if overlay is not None:
             from log2sim.visualization.overlay import read_moment, write_overlay
 
             write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-            opt.report_written(overlay, quiet=quiet)
+            opt.report_written(overlay)
             return
         document = summarize(opened)
-    opt.say(json.dumps(document, indent=2) if as_json else "\n".join(describe(document, verbose=verbose)), quiet=quiet)
+    opt.tell(json.dumps(document, indent=2) if as_json else "\n".join(describe(document, verbose=verbose)))
 
 
 SCHEMAS = {
@@ -174,7 +173,6 @@ def validate(
         help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Validate a file, or every record of a log.
 
@@ -193,11 +191,11 @@ def validate(
         from log2sim.logs.opening import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             problems = validate_log(opened, progress=partial(report_progress, VALIDATING))
         # Those of native logs are among the problems.
         notes = () if opened.format == READER.name else opened.notes
-        opt.say_all("note", [*notes, *list_gaps(opened)], quiet=quiet)
+        opt.say_all("note", [*notes, *list_gaps(opened)])
         if problems:
             raise LogError(f"{path}: {opt.counted(len(problems), 'problem')}\n  " + "\n  ".join(problems))
     else:
@@ -217,7 +215,7 @@ def validate(
             DetectedBoxes.load(path)
         else:
             Scenario.load(path)
-    opt.say(f"{path}: valid", quiet=quiet)
+    opt.tell(f"{path}: valid")
 
 
 def convert(
@@ -230,7 +228,6 @@ def convert(
     cameras: opt.Cameras = None,
     labels: opt.LabelFile = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are.
 
@@ -251,18 +248,15 @@ def convert(
         raise ConfigError(f"{out}: holds the log that is converted; choose another folder")
     opened = open_log(log, format=format, sequence=sequence, labels=labels)
     part = cut_log(opened, cameras=names, start_s=start, stop_s=stop)
-    opt.say_all("note", part.notes, quiet=quiet)
+    opt.say_all("note", part.notes)
     problems: list[str] = []
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         done = partial(report_progress, "convert")
         write_log(part, out, overwrite=overwrite, jpeg_quality=95, progress=done, problems=problems)
-    opt.say_all("note: left out", problems, quiet=quiet)
+    opt.say_all("note: left out", problems)
     records = sum(len(stream.t_ns) for stream in part.streams.values()) - len(problems)
     size_mb = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
-    opt.say(
-        f"{out}: {opt.counted(records, 'record')} of {opt.counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB",
-        quiet=quiet,
-    )
+    opt.tell(f"{out}: {opt.counted(records, 'record')} of {opt.counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB")
 
 
 def detect(
@@ -281,7 +275,6 @@ def detect(
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Detect road users in the LiDAR sweeps of a log.
 
@@ -301,17 +294,17 @@ def detect(
     chosen = opt.load_config(config, settings, detector=detector, poses=poses, start_s=start, stop_s=stop)
     opened = open_log(log, format=format, sequence=sequence, labels=labels)
     weakness = describe_weakness(detector)
-    opt.say_all("note", [*opened.notes, *([weakness] if weakness else [])], quiet=quiet)
-    with progress(quiet=quiet) as report_progress:
+    opt.say_all("note", [*opened.notes, *([weakness] if weakness else [])])
+    with progress() as report_progress:
         result = detect_log(opened, chosen, progress=partial(report_progress, "detect"))
     result.found.save(out)
-    opt.say_all("poses", pose_reasons(result.poses.to_dict()), quiet=quiet)
-    opt.say_all("note", result.findings, quiet=quiet)
+    opt.say_all("poses", pose_reasons(result.poses.to_dict()))
+    opt.say_all("note", result.findings)
     if result.left_out:
-        opt.say(f"note: {opt.counted(result.left_out, 'sweep')} left out, without points or a known pose", quiet=quiet)
+        opt.tell(f"note: {opt.counted(result.left_out, 'sweep')} left out, without points or a known pose")
     boxes = sum(len(found) for found in result.found.boxes)
     words = f"{boxes} box{'es' * (boxes != 1)} in {opt.counted(len(result.found.t_ns), 'sweep')}"
-    opt.say(f"{out}: {words} by {result.found.detector}", quiet=quiet)
+    opt.tell(f"{out}: {words} by {result.found.detector}")
 
 
 def map(
@@ -327,7 +320,6 @@ def map(
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Make a map of the ground of a log: its color, its height, or how strongly it reflects the LiDAR.
 
@@ -357,9 +349,9 @@ def map(
     if chosen != "color" and not opened.lidars:
         raise ConfigError(f"{opened.name}: the log has no LiDAR; take --layer color")
     opened, loaded, note = _agents_of(opened, scenario)
-    opt.say_all("note", (*opened.notes, *((note,) if note else ())), quiet=quiet)
+    opt.say_all("note", (*opened.notes, *((note,) if note else ())))
     records = RecordSource(opened)
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         whole = map_ground(opened, loaded, settings, records, report_progress)
     ground = whole.around(map_files.known_cells(whole, chosen))
     with together():
@@ -374,11 +366,11 @@ def map(
         notes.append(
             f"heights in {out.name}: value 1 is {map_files.lowest_m(ground):.2f} m, {map_files.HEIGHT_STEP_M:g} m a step, 0 is unknown"
         )
-    opt.say_all("note", notes, quiet=quiet)
+    opt.say_all("note", notes)
     rows, columns = ground.alpha.shape
     d = ground.resolution_m
-    opt.report_written(world, quiet=quiet)
-    opt.say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
+    opt.report_written(world)
+    opt.tell(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m")
 
 
 def _agents_of(log: Log, scenario: Path | None) -> tuple[Log, Scenario, str | None]:

@@ -1,13 +1,14 @@
 """Options that several commands share, and output for the user.
 
-Every command writes with `-o/--out`, is silent with `-q/--quiet` and tells more with `-v/--verbose`. `--debug`, `--follow-links`
-and `--help` are added to all of them by `log2sim.cli.shared`.
+Every command writes with `-o/--out` and tells more with `-v/--verbose`. `--quiet`, `--debug`, `--follow-links` and `--help` are
+added to all of them by `log2sim.cli.shared`.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -71,7 +72,7 @@ PageLog = Annotated[Path | None, option(
     "Log whose pictures with boxes, LiDAR points and map of the ground the page shows.", "LOG")]  # fmt: skip
 DropDoubtful = Annotated[bool, option(
     "Leave out agents that the scenario itself doubts; the ego stays.", None, "--drop-doubtful")]  # fmt: skip
-Quiet = Annotated[bool, option("Print nothing but errors.", None, "--quiet", "-q")]
+
 Verbose = Annotated[bool, option("Print everything, not only the first of many.", None, "--verbose", "-v")]
 AsJson = Annotated[bool, option("Print JSON, for programs, instead of a table.", None, "--json")]
 Format = Annotated[str, option(
@@ -111,24 +112,33 @@ def fail(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
-def say(text: str, *, quiet: bool = False) -> None:
+def say(text: str) -> None:
     """Print a line for the user."""
-    if not quiet:
-        sys.stdout.write(printable(text) + "\n")
-        sys.stdout.flush()
+    sys.stdout.write(printable(text) + "\n")
+    sys.stdout.flush()
 
 
-def say_all(kind: str, lines: Iterable[object], *, quiet: bool) -> None:
-    """Print lines that each begin with their kind, such as "note"."""
+is_quiet = ContextVar("is_quiet", default=False)
+"""Whether the command runs with --quiet; then `tell`, all that uses it, and progress print nothing."""
+
+
+def tell(text: str) -> None:
+    """Print a line for the user, but for --quiet."""
+    if not is_quiet.get():
+        say(text)
+
+
+def say_all(kind: str, lines: Iterable[object]) -> None:
+    """Tell lines that each begin with their kind, such as "note"."""
     for line in lines:
-        say(f"{kind}: {line}", quiet=quiet)
+        tell(f"{kind}: {line}")
 
 
-def report_written(*paths: Path | None, quiet: bool) -> None:
+def report_written(*paths: Path | None) -> None:
     """Name the files that a command wrote; None stands for one that was not asked for."""
     written = [str(path) for path in paths if path is not None]
     if written:
-        say(f"{', '.join(written)}: written", quiet=quiet)
+        tell(f"{', '.join(written)}: written")
 
 
 def split_names(text: str | None) -> tuple[str, ...]:

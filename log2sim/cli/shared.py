@@ -18,6 +18,7 @@ from typing import Annotated, Any, TextIO
 import typer
 from typer.core import TyperCommand
 
+from log2sim.cli.options import is_quiet
 from log2sim.files.inputs import OPTION
 
 ENDING_SIGNALS = ("SIGTERM", "SIGHUP")
@@ -179,9 +180,11 @@ class CommandWithPlugins(TyperCommand):
         super().format_epilog(ctx, formatter)
 
 
+OUTPUT_ALONE = ("config", "cache", "doctor", "help")  # commands that only print, also with nobody to tell
 DEBUG = "--debug"
-KEYWORD = inspect.Parameter.KEYWORD_ONLY
+KEYWORD = inspect.Parameter.POSITIONAL_OR_KEYWORD
 Debug = Annotated[bool, typer.Option(DEBUG, help="Show where in the program an error comes from.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 FollowLinks = Annotated[bool, typer.Option(OPTION, help="Follow links in logs that lead out of their folders.")]
 
 
@@ -201,13 +204,17 @@ def add_command(app: typer.Typer, command: Callable[..., None]) -> None:
     add = app.command(name=name, cls=CommandWithPlugins, help=text.strip(), epilog=epilog, context_settings=settings)
 
     @functools.wraps(command)
-    def run(*args: Any, debug: bool = False, follow_links: bool = False, **options: Any) -> None:
+    def run(*args: Any, quiet: bool = False, debug: bool = False, follow_links: bool = False, **options: Any) -> None:
+        is_quiet.set(quiet)
         command(*args, **options)  # `log2sim.cli.entry` reads the others before it runs any command
 
     signature = inspect.signature(command, eval_str=True)
-    shared = (("debug", Debug), ("follow_links", FollowLinks))
-    added = [inspect.Parameter(name, KEYWORD, default=False, annotation=kind) for name, kind in shared]
-    parameters = [*signature.parameters.values(), *added]
+    parameters = list(signature.parameters.values())
+    shared = {"debug": Debug, "follow_links": FollowLinks}
+    parameters += [inspect.Parameter(key, KEYWORD, default=False, annotation=kind) for key, kind in shared.items()]
+    if name not in OUTPUT_ALONE:  # before --verbose, where there is that
+        place = next(k for k, p in enumerate(parameters) if p.name in ("verbose", "debug"))
+        parameters.insert(place, inspect.Parameter("quiet", KEYWORD, default=False, annotation=Quiet))
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     add(run)

@@ -32,7 +32,6 @@ def tag(
         "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
         "FILE.csv")] = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Find lane changes, cut-ins, overtaking, near misses and more, of the ego and of all others.
@@ -58,14 +57,14 @@ def tag(
         for g in shown
     ]  # fmt: skip
     for line in format_rows([head, *rows]):
-        opt.say(line, quiet=quiet)
+        opt.tell(line)
     counts = {name: sum(g.tag == name for g in shown) for name in TAGS}
-    opt.say(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag", quiet=quiet)
+    opt.tell(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag")
     if out is not None:
         tagged.save(out)
     if criticality is not None:
         write_criticality(criticality, criticality_table(tagged))
-    opt.report_written(out, criticality, quiet=quiet)
+    opt.report_written(out, criticality)
 
 
 MAX_LISTED = 40
@@ -90,7 +89,6 @@ def find(
         "Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     as_json: opt.AsJson = False,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Find situations in many scenarios by a condition on their tags.
 
@@ -111,14 +109,15 @@ def find(
     from log2sim.scenarios.query import ask
 
     check_targets(out, table, overwrite=overwrite)
-    quiet = quiet or as_json
+    if as_json:
+        opt.is_quiet.set(True)
     opt.require_own_workers(jobs, scheduler)
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         index = open_index(
             path, fresh=fresh, jobs=jobs, map_files=_on_workers(scheduler) if scheduler else None,
             progress=lambda done, total: report_progress("scenarios", done, total),
         )  # fmt: skip
-    opt.say_all("left out", index.problems, quiet=quiet)
+    opt.say_all("left out", index.problems)
     if fields or not condition:
         for line in format_rows(_overview(index, fields=fields)):
             opt.say(line)
@@ -129,22 +128,22 @@ def find(
 
         opt.say(json.dumps(list(found.rows), ensure_ascii=False))
     for k, row in enumerate(found.rows[:MAX_LISTED]):
-        opt.say(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}", quiet=quiet)
+        opt.tell(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}")
     more = len(found.rows) - MAX_LISTED
     if more > 0:
-        opt.say(f"and {more} more; --out and --table have all", quiet=quiet)
-    opt.say(f"{opt.counted(len(found.rows), 'hit')} in {opt.counted(index.scenarios, 'scenario')}", quiet=quiet)
+        opt.tell(f"and {more} more; --out and --table have all")
+    opt.tell(f"{opt.counted(len(found.rows), 'hit')} in {opt.counted(index.scenarios, 'scenario')}")
     for line in found.closest:
-        opt.say(line, quiet=quiet)
+        opt.tell(line)
     if out is not None:
         write_hits(out, index, condition, found.rows)
     if table is not None:
         write_table(table, found.rows)
-    opt.report_written(out, table, quiet=quiet)
+    opt.report_written(out, table)
     if open_ is not None:
         if open_ > len(found.rows):
             raise ConfigError(f"--open {open_}: there are {opt.counted(len(found.rows), 'hit')}")
-        opt.say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet)
+        opt.tell(_opened(index, found.rows[open_ - 1], open_, out))
 
 
 def _on_workers(scheduler: str) -> MapFiles:
@@ -243,7 +242,6 @@ def vary(
         bool, opt.option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")
     ] = False,
     overwrite: opt.OverwriteFolder = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Vary a situation: fit the distribution of its parameters over all that are found, and draw concrete scenarios.
 
@@ -289,17 +287,14 @@ def vary(
         figures = (p["least"], p["greatest"], *(p["quantiles"][q] for q in ("0.05", "0.5", "0.95")))
         shown.append((name, *(f"{figure:.4g}" for figure in figures)))
     for line in format_rows(shown):
-        opt.say(line, quiet=quiet)
-    opt.say(
+        opt.tell(line)
+    opt.tell(
         f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "
-        f"in {chosen['file']} at {chosen['t_s']:.1f} s",
-        quiet=quiet,
+        f"in {chosen['file']} at {chosen['t_s']:.1f} s"
     )
     refused = [row["problem"] for row in table if row["problem"]]
     if refused:
-        opt.say(
-            f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}", quiet=quiet
-        )
+        opt.tell(f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}")
 
 
 def test_(
@@ -322,7 +317,6 @@ def test_(
     scheduler: Annotated[str | None, opt.option(
         "Drive on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     overwrite: opt.OverwriteFolder = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Test a policy in variations of a situation: where it fails, how critical, how likely.
 
@@ -373,7 +367,7 @@ def test_(
     outcomes: list[Outcome] = []
     values: list[Array] = []
     work = partial(judge_run, base, logical, driver, limits, agents)
-    with progress(quiet=quiet) as report_progress, _runs(jobs, scheduler) as run:
+    with progress() as report_progress, _runs(jobs, scheduler) as run:
 
         def margins(scores: Array) -> Array:
             drawn = logical.from_scores(scores)
@@ -412,11 +406,10 @@ def test_(
             ],
         )  # fmt: skip
     failures = int((found.margins <= 0).sum())
-    opt.say(
-        f"{opt.counted(failures, 'failure')} in {opt.counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}",
-        quiet=quiet,
+    opt.tell(
+        f"{opt.counted(failures, 'failure')} in {opt.counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}"
     )
     errors = sum(bool(o.problem) for o in outcomes)
     if errors:
-        opt.say(f"the policy raised in {opt.counted(errors, 'run')}; the report has the traceback", quiet=quiet)
-    opt.say(f"{out / 'report.html'}: written", quiet=quiet)
+        opt.tell(f"the policy raised in {opt.counted(errors, 'run')}; the report has the traceback")
+    opt.tell(f"{out / 'report.html'}: written")

@@ -116,7 +116,7 @@ def measure(root: Path, out: Path, jobs: int, format: str) -> dict[str, str]:
     batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": "lidar:labels"}), format=format)
     found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
     before = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
-    with progress(quiet=False) as report:
+    with progress() as report:
         rows = run_batch(batch, lambda: local_workers(jobs), progress=lambda done, total: report("logs", done, total))
     after = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
     wall, own, workers = (b - a for a, b in zip(before, after))
