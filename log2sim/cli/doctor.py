@@ -94,6 +94,22 @@ def examine() -> dict[str, Any]:
     if sys.version_info < MIN_PYTHON:
         wanted = ".".join(map(str, MIN_PYTHON))
         broken.insert(0, f"Python {platform.python_version()} is too old: log2sim needs {wanted}")
+    # The built-in detectors with what they need; `broken` takes what should be there and is not
+    folder = Path(__file__).resolve().parents[1] / "perception" / "detect3d" / "weights"
+    models = {}
+    for name in ("vehicle", "roadside"):
+        model = folder / f"{name}.onnx"
+        models[f"lidar:{name}"] = "ready" if model.is_file() else f"{model} is missing"
+        broken += [] if model.is_file() else [f"{model}: is missing; install log2sim again"]
+    try:
+        from log2sim.perception.detect.ssd_mobilenet import NAME, graph_bytes
+
+        state = "ready"
+        if not any(cache.glob(f"{NAME}-*.onnx")):
+            graph_bytes()
+            state = "ready; converted into the cache at its first use"
+    except (Log2SimError, ImportError) as error:
+        state = str(error)
     return {
         "log2sim": __version__,
         "python": platform.python_version(),
@@ -101,7 +117,7 @@ def examine() -> dict[str, Any]:
         "program": sys.executable,
         "packages": packages,
         "extras": extras,
-        "models": _find_models(cache, broken),
+        "models": (models | {"ssd-mobilenet-v2": state}),
         "cache": str(cache),
         "cache_bytes": cache_bytes,
         "cores": os.cpu_count() or 1,
@@ -139,26 +155,6 @@ def version_of(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _find_models(cache: Path, broken: list[str]) -> dict[str, str]:
-    """Return the built-in detectors with what they need; `broken` takes what should be there and is not."""
-    folder = Path(__file__).resolve().parents[1] / "perception" / "detect3d" / "weights"
-    models = {}
-    for name in ("vehicle", "roadside"):
-        model = folder / f"{name}.onnx"
-        models[f"lidar:{name}"] = "ready" if model.is_file() else f"{model} is missing"
-        broken += [] if model.is_file() else [f"{model}: is missing; install log2sim again"]
-    try:
-        from log2sim.perception.detect.ssd_mobilenet import NAME, graph_bytes
-
-        state = "ready"
-        if not any(cache.glob(f"{NAME}-*.onnx")):
-            graph_bytes()
-            state = "ready; converted into the cache at its first use"
-    except (Log2SimError, ImportError) as error:
-        state = str(error)
-    return models | {"ssd-mobilenet-v2": state}
 
 
 def doctor(as_json: opt.AsJson = False) -> None:

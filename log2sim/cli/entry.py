@@ -8,18 +8,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from log2sim.cli import change, doctor, evaluate, exchange, logs, reconstruct, show, simulate, situations
+from log2sim.cli import change, doctor, evaluate, exchange, logs, reconstruct, shared, show, simulate, situations
 from log2sim.cli.options import fail, printable, say
-from log2sim.cli.shared import (
-    DEBUG,
-    SIGNAL_CODE,
-    Debug,
-    Ended,
-    FollowLinks,
-    add_command,
-    ending_by_signals,
-    tolerating_lost_output,
-)
 from log2sim.errors import Log2SimError
 from log2sim.files.inputs import OPTION, following_links
 from log2sim.files.outputs import holding_claims
@@ -53,8 +43,8 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    debug: Debug = False,
-    follow_links: FollowLinks = False,
+    debug: shared.Debug = False,
+    follow_links: shared.FollowLinks = False,
 ) -> None:
     """Reconstruct driving logs as scenarios that a simulator can run."""
     if version:
@@ -68,19 +58,19 @@ for command in (
     change.correct, situations.tag, situations.find, situations.vary, exchange.export, exchange.synth, doctor.config, doctor.cache,
     doctor.doctor, doctor.help, exchange.import_, situations.test_, logs.map,
 ):  # fmt: skip
-    add_command(app, command)
+    shared.add_command(app, command)
 
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
-    with tolerating_lost_output(), ending_by_signals() as ended, holding_claims():
+    with shared.tolerating_lost_output(), shared.ending_by_signals() as ended, holding_claims():
         _run(ended)
 
 
-def _run(ended: Ended) -> NoReturn:
+def _run(ended: shared.Ended) -> NoReturn:
     # Taken off here, too: before the name of a command they mean the same.
-    arguments = [a for a in sys.argv[1:] if a not in (DEBUG, OPTION)]
-    debug = DEBUG in sys.argv
+    arguments = [a for a in sys.argv[1:] if a not in (shared.DEBUG, OPTION)]
+    debug = shared.DEBUG in sys.argv
     try:
         with following_links(OPTION in sys.argv):
             code = app(args=arguments, prog_name="log2sim", standalone_mode=False)
@@ -113,8 +103,8 @@ def _run(ended: Ended) -> NoReturn:
     _end(code, ended)
 
 
-def _end(code: Any, ended: Ended) -> NoReturn:
+def _end(code: Any, ended: shared.Ended) -> NoReturn:
     if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
-        word, code = ("terminated", SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
+        word, code = ("terminated", shared.SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
         fail(f"{word}; no incomplete file was left", code)
     sys.exit(code if isinstance(code, int) else 0)

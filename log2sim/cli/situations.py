@@ -143,7 +143,24 @@ def find(
     if open_ is not None:
         if open_ > len(found.rows):
             raise ConfigError(f"--open {open_}: there are {opt.counted(len(found.rows), 'hit')}")
-        opt.tell(_opened(index, found.rows[open_ - 1], open_, out))
+        # Write the page of a hit's scenario, open it in a browser at the moment, and return its address
+        hit = found.rows[open_ - 1]
+        import tempfile
+        import webbrowser
+        from urllib.parse import quote
+
+        from log2sim.datatypes import Scenario
+        from log2sim.visualization.page.writer import write_page
+
+        page = (
+            out.with_name(f"{out.stem}-{open_}.html")
+            if out is not None
+            else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{open_}.html"
+        )
+        write_page(Scenario.load(index.folder / hit["file"]), page, overwrite=True)
+        address = f"{page.resolve().as_uri()}#t={hit['t_s']:.2f}&agent={quote(hit['agent'])}"
+        webbrowser.open(address)
+        opt.tell(address)
 
 
 def _on_workers(scheduler: str) -> MapFiles:
@@ -197,26 +214,6 @@ def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
         span = pc.min_max(column).as_py() if known and str(column.type) == "double" else None
         rows.append((name, str(known), f"{span['min']:.4g} {span['max']:.4g}" if span else ""))
     return rows
-
-
-def _opened(index: Index, row: Row, number: int, out: Path | None) -> str:
-    """Write the page of a hit's scenario, open it in a browser at the moment, and return its address."""
-    import tempfile
-    import webbrowser
-    from urllib.parse import quote
-
-    from log2sim.datatypes import Scenario
-    from log2sim.visualization.page.writer import write_page
-
-    page = (
-        out.with_name(f"{out.stem}-{number}.html")
-        if out is not None
-        else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{number}.html"
-    )
-    write_page(Scenario.load(index.folder / row["file"]), page, overwrite=True)
-    address = f"{page.resolve().as_uri()}#t={row['t_s']:.2f}&agent={quote(row['agent'])}"
-    webbrowser.open(address)
-    return address
 
 
 def _hits(found: Found) -> Sequence[Row]:

@@ -82,23 +82,7 @@ def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external
         axles = element("Axles", body)
         element("FrontAxle", axles, maxSteering=number(kind.max_steering_rad), positionX=number(wheelbase), **shared)
         element("RearAxle", axles, maxSteering="0", positionX="0", **shared)
-    _add_properties(body, agent, minor)
-    if external and minor > 0:
-        controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
-        properties = element("Properties", controller)
-        element("Property", properties, name="esminiController", value="ExternalController")
-        element("Property", properties, name="useGhost", value="false")
-
-
-def _add_box(parent: Element, agent: Agent) -> None:
-    length, width, height = agent.size_m
-    box = element("BoundingBox", parent)
-    element("Center", box, x=number(agent.rear_axle_offset_m), y="0", z=number(height / 2))
-    element("Dimensions", box, width=number(width), length=number(length), height=number(height))
-
-
-def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
-    """Add the properties that players use (`type` of ScenarioRunner, `color` in its form or esmini's), then those for an import."""
+    # The properties that players use (`type` of ScenarioRunner, `color` in its form or esmini's), then those for an import
     w = agent.waypoints
     values = {"type": "ego_vehicle" if agent.id == "ego" else "simulation"}
     if agent.color is not None:
@@ -119,9 +103,21 @@ def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
             values[PREFIX + key] = " ".join(number(v, 4) for v in column)
     if agent.doubts:
         values[PREFIX + "doubts"] = escaped(json.dumps([doubt.to_dict() for doubt in agent.doubts]))
-    properties = element("Properties", parent)
+    properties = element("Properties", body)
     for name, value in values.items():
         element("Property", properties, name=name, value=value)
+    if external and minor > 0:
+        controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
+        properties = element("Properties", controller)
+        element("Property", properties, name="esminiController", value="ExternalController")
+        element("Property", properties, name="useGhost", value="false")
+
+
+def _add_box(parent: Element, agent: Agent) -> None:
+    length, width, height = agent.size_m
+    box = element("BoundingBox", parent)
+    element("Center", box, x=number(agent.rear_axle_offset_m), y="0", z=number(height / 2))
+    element("Dimensions", box, width=number(width), length=number(length), height=number(height))
 
 
 # Each waiting agent has a depth of its own, so that none overlaps another.
@@ -145,26 +141,6 @@ class AgentStory:
     hidden_m: float  # how far below it waits in revisions without spawning
     external: bool  # whether it is driven from outside: it gets a place and a speed at the start, and nothing else
     start: Array  # (5,) the first vertex, or the pose at 0 s if its waypoints begin before
-
-
-def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float, minor: int) -> None:
-    """Add the `Storyboard` of all agents."""
-    storyboard = element("Storyboard", parent)
-    actions = element("Actions", element("Init", storyboard))
-    for story in stories:
-        if not story.enters or minor == 0:
-            private = element("Private", actions, entityRef=story.name)
-            below_m = story.hidden_m if story.enters else 0.0
-            _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
-            _add_speed(private, 0.0 if story.enters else story.speed_mps)
-        if story.external:
-            _add_external_control(actions[-1], minor)
-    act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
-    for story in stories:
-        if not story.external:
-            _add_group(act, story, minor)
-    _add_trigger(act, "StartTrigger", "at the start", 0.0, minor)
-    _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, minor)
 
 
 def _add_external_control(private: Element, minor: int) -> None:
@@ -308,8 +284,13 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     require_start_as_in_scenario(scenario.agents, boxes)
     root = element("OpenSCENARIO")
     # A leading "CARLA:" in the description would switch ScenarioRunner to left-handed axes.
+    # When the scenario begins: the file's date too, so that the same scenario gives the same file
+    try:
+        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=scenario.t0_ns // 1_000_000_000)
+    except OverflowError:
+        moment = datetime(1970, 1, 1, tzinfo=UTC)
     element(
-        "FileHeader", root, revMajor="1", revMinor=str(minor), date=_date(scenario.t0_ns), author="log2sim",
+        "FileHeader", root, revMajor="1", revMinor=str(minor), date=moment.replace(tzinfo=None).isoformat(timespec="seconds"), author="log2sim",
         description=f"log2sim: {escaped(scenario.name)}",
     )  # fmt: skip
     # What an import needs of the scenario as a whole; 1.0 and 1.1 have no properties without an agent.
@@ -330,14 +311,21 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     entities = element("Entities", root)
     for agent, name, flag in zip(scenario.agents, names, driven):
         add_entity(entities, agent, name, minor, external=flag)
-    add_storyboard(root, stories, duration_s, minor)
+    # The `Storyboard` of all agents
+    storyboard = element("Storyboard", root)
+    actions = element("Actions", element("Init", storyboard))
+    for story in stories:
+        if not story.enters or minor == 0:
+            private = element("Private", actions, entityRef=story.name)
+            below_m = story.hidden_m if story.enters else 0.0
+            _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
+            _add_speed(private, 0.0 if story.enters else story.speed_mps)
+        if story.external:
+            _add_external_control(actions[-1], minor)
+    act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
+    for story in stories:
+        if not story.external:
+            _add_group(act, story, minor)
+    _add_trigger(act, "StartTrigger", "at the start", 0.0, minor)
+    _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, minor)
     xml_text.write(root, folder / "scenario.xosc")
-
-
-def _date(t0_ns: int) -> str:
-    """When the scenario begins: the file's date too, so that the same scenario gives the same file."""
-    try:
-        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=t0_ns // 1_000_000_000)
-    except OverflowError:
-        moment = datetime(1970, 1, 1, tzinfo=UTC)
-    return moment.replace(tzinfo=None).isoformat(timespec="seconds")

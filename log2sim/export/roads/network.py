@@ -379,7 +379,23 @@ def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]
         parts = cut_together(lanes, refused)
         by_id = {lane.id: lane for lane in parts}
         crossing = {lane.id for lane in parts if is_connection(lane, by_id)}
-        sides = _with_opposites(_groups([lane for lane in parts if lane.id not in crossing], by_id))
+        # Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road
+        groups = _groups([lane for lane in parts if lane.id not in crossing], by_id)
+        by_left = {group[0].id: group for group in groups}
+        sides: list[tuple[list[MapLane], list[MapLane]]] = []
+        taken: set[str] = set()
+        for group in groups:
+            if group[0].id in taken:
+                continue
+            other = by_left.get(str(group[0].opposite), [])
+            if other:  # begins and ends with the lane, to the left of it
+                first, facing = group[0], _turned(other[0])
+                heading = float(Polyline(first.points_m).heading_rad[0])
+                gap = facing.points_m[0] - first.points_m[0]
+                left = gap[1] * np.cos(heading) > gap[0] * np.sin(heading)
+                other = other if other[0].opposite == first.id and left and _aligned(first, facing) else []
+            taken |= {side[0].id for side in (group, other) if side}
+            sides.append((group, other) if _surest([*group, *other]) in group else (other, group))
         plain = {k + 1: pair for k, pair in enumerate(sides)}
         place: dict[str, _Place] = {}
         for number, (group, opposite) in plain.items():
@@ -393,7 +409,22 @@ def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]
     place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
     names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
-    headings = _shared_headings(plain, place, by_id)
+    # The headings of cross sections where two roads meet, by road and end (0 or -1)
+    headings: dict[tuple[int, int], float] = {}
+    across = {number: [*map(_turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
+    for number, sides in plain.items():
+        for lane in (*sides[0], *sides[1]):
+            for name in lane.successors:
+                one, two = place[lane.id], place[name]
+                if two.road not in plain or (number, one.end) in headings or (two.road, two.start) in headings:
+                    continue
+                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
+                first = cross_heading(across[number], one.end) + turns[0]
+                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
+                wide = [len(across[k]) > 1 for k in (number, two.road)]
+                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
+                headings[number, one.end] = first + share * turn - turns[0]
+                headings[two.road, two.start] = first + share * turn - turns[1]
     roads: list[Road] = []
     ends: dict[tuple[str, int], End] = {}
     # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
@@ -447,26 +478,6 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
                 group.insert(0 if side == "left_lane" else len(group), by_id[name])
         seen |= {member.id for member in group}
         found.append(group)
-    return found
-
-
-def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane], list[MapLane]]]:
-    """Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road."""
-    by_left = {group[0].id: group for group in groups}
-    found: list[tuple[list[MapLane], list[MapLane]]] = []
-    taken: set[str] = set()
-    for group in groups:
-        if group[0].id in taken:
-            continue
-        other = by_left.get(str(group[0].opposite), [])
-        if other:  # begins and ends with the lane, to the left of it
-            lane, facing = group[0], _turned(other[0])
-            heading = float(Polyline(lane.points_m).heading_rad[0])
-            gap = facing.points_m[0] - lane.points_m[0]
-            left = gap[1] * np.cos(heading) > gap[0] * np.sin(heading)
-            other = other if other[0].opposite == lane.id and left and _aligned(lane, facing) else []
-        taken |= {side[0].id for side in (group, other) if side}
-        found.append((group, other) if _surest([*group, *other]) in group else (other, group))
     return found
 
 
@@ -537,27 +548,3 @@ def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> l
     """Return the lanes of a road with those that adjoin them at its start (0) or end (-1)."""
     ends_here = {lane.id: place[lane.id].end == at for lane in group}
     return [(a, name) for a in group for name in (a.successors if ends_here[a.id] else a.predecessors)]
-
-
-def _shared_headings(
-    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
-    place: Mapping[str, _Place],
-    by_id: Mapping[str, MapLane],
-) -> dict[tuple[int, int], float]:
-    """Return the headings of cross sections where two roads meet, by road and end (0 or -1)."""
-    found: dict[tuple[int, int], float] = {}
-    across = {number: [*map(_turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
-    for number, sides in plain.items():
-        for lane in (*sides[0], *sides[1]):
-            for name in lane.successors:
-                one, two = place[lane.id], place[name]
-                if two.road not in plain or (number, one.end) in found or (two.road, two.start) in found:
-                    continue
-                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
-                first = cross_heading(across[number], one.end) + turns[0]
-                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
-                wide = [len(across[k]) > 1 for k in (number, two.road)]
-                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
-                found[number, one.end] = first + share * turn - turns[0]
-                found[two.road, two.start] = first + share * turn - turns[1]
-    return found
