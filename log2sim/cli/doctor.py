@@ -19,7 +19,6 @@ import typer
 from packaging.requirements import InvalidRequirement, Requirement
 
 from log2sim.cli import options as opt
-from log2sim.cli.shared import format_rows
 from log2sim.errors import ConfigError, Log2SimError, install_command
 from log2sim.files.plugins import nearest
 from log2sim.files.version import __version__
@@ -174,7 +173,7 @@ def doctor(as_json: opt.AsJson = False) -> None:
         limits = "".join(f", {name}={value}" for name, value in found["threads"].items())
         extras = [extra for extra in found["extras"] if extra["purpose"]]
         absent = [f"  {extra['install']}" for extra in extras if extra["missing"]]
-        lines = format_rows([
+        lines = opt.format_rows([
             ("log2sim", found["log2sim"]),
             ("Python", f"{found['python']}, {found['program']}"),
             ("system", found["system"]),
@@ -183,10 +182,10 @@ def doctor(as_json: opt.AsJson = False) -> None:
             ("browser", found["browser"] or "none found; open the pages of log2sim view on another machine"),
         ])  # fmt: skip
         packages = [(p["name"], p["version"] or "-", p["state"]) for p in found["packages"]]
-        lines += ["", "packages", *format_rows(packages, indent=2)]
-        lines += ["", "detectors", *format_rows(list(found["models"].items()), indent=2)]
+        lines += ["", "packages", *opt.format_rows(packages, indent=2)]
+        lines += ["", "detectors", *opt.format_rows(list(found["models"].items()), indent=2)]
         states = [(e["name"], "missing" if e["missing"] else "installed", e["purpose"]) for e in extras]
-        lines += ["", "extras", *format_rows(states, indent=2)]
+        lines += ["", "extras", *opt.format_rows(states, indent=2)]
         lines += ["", "to add one:", *absent] if absent else []
         lines += ["", f"{len(found['broken'])} problems" if found["broken"] else "nothing needed is missing"]
         opt.say("\n".join(lines))
@@ -254,7 +253,7 @@ def cache(
     ]
     if last_run is not None:
         rows.append(("last run", f"{opt.counted(last_run['found'], 'tick')} known, {last_run['kept']} kept"))
-    opt.say("\n".join(format_rows(rows)))
+    opt.say("\n".join(opt.format_rows(rows)))
 
 
 def pages() -> dict[str, str]:

@@ -11,7 +11,6 @@ import typer
 
 from log2sim.cli import options as opt
 from log2sim.cli.progress import progress
-from log2sim.cli.shared import format_rows, wrap
 from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.files.outputs import together
 from log2sim.visualization.progress import OPENING, VALIDATING
@@ -40,7 +39,7 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
         told = f"{len(gaps)}, longest {longest:.1f} s" if gaps else "none"
         hertz = "-" if rate is None else f"{rate:.1f} Hz"
         rows.append((name, str(sensor["records"]), hertz, told, sensor["mount"], what))
-    lines += [*format_rows(rows), ""]
+    lines += [*opt.format_rows(rows), ""]
     driven, boxes, place = "no poses", "none", "local, its place on Earth is not known"
     if (ego := log["ego"]) is not None:
         at = "" if ego["rate_hz"] is None else f" at {ego['rate_hz']:.1f} Hz"
@@ -59,11 +58,11 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
             counts = {s: n if isinstance(n, int) else sum(n.values()) for s, n in log[name].items()}
             facts.append((title, ", ".join(f"{sensor} {count}" for sensor, count in counts.items())))
     facts += [(key, str(value)) for key, value in log["details"].items() if isinstance(value, str | int | float)]
-    lines += format_rows(facts)
+    lines += opt.format_rows(facts)
     topics = log["details"].get("topics")
     if isinstance(topics, list) and topics:  # of a ROS recording, with what each was taken for
         taken = [(str(t["topic"]), str(t["messages"]), str(t["role"] or "-"), str(t["reason"])) for t in topics]
-        lines += ["", *format_rows([("topic", "messages", "role", ""), *taken])]
+        lines += ["", *opt.format_rows([("topic", "messages", "role", ""), *taken])]
     return [*lines, *_notes(log["notes"], verbose=verbose)]
 
 
@@ -92,7 +91,7 @@ def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]
         ("ego", kept),
     ]
     lines = [f"{scenario['name']}: a scenario with {total} over {scenario['duration_s']:.1f} s", ""]
-    return [*lines, *format_rows(facts), *_notes(scenario["notes"], verbose=verbose)]
+    return [*lines, *opt.format_rows(facts), *_notes(scenario["notes"], verbose=verbose)]
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -104,7 +103,7 @@ def _notes(notes: Sequence[str], *, verbose: bool) -> list[str]:
     """Return the first notes, or all of them, and how many more there are."""
     shown = notes if verbose else notes[:MAX_NOTES]
     rest = len(notes) - len(shown)
-    lines = [line for note in shown for line in wrap(f"note: {note}", indent=6)]
+    lines = [line for note in shown for line in opt.wrap(f"note: {note}", indent=6)]
     return [*([""] if lines else []), *lines, *([f"note: and {rest} more; --verbose lists them"] if rest else [])]
 
 

@@ -32,7 +32,6 @@ LOOKED_FOR = (
 
 def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
     """Summarize a run for people; with `verbose` everything is listed, also which stages were left out."""
-    from log2sim.cli.shared import format_rows
     from log2sim.datatypes import count_agents, count_categories
 
     scenario, seconds = result.scenario, result.report["seconds"]
@@ -59,7 +58,7 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
         stages = [f"{'with' if s['kept'] else 'no'} {s['stage']}: {s['reason']}" for s in scenario.stages]
         rows += [("used", line) for line in stages]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
-    table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
+    table = opt.format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
     known = (result.report["detection_cache"] or {"found": 0})["found"]
     made = f"made in {speed}" + (f", {opt.counted(known, 'tick')} known from earlier runs" if known else "")
     # Never broken into lines: it is there to be copied.

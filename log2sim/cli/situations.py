@@ -10,7 +10,6 @@ import typer
 
 from log2sim.cli import options as opt
 from log2sim.cli.progress import progress
-from log2sim.cli.shared import format_rows
 from log2sim.errors import ConfigError
 from log2sim.files.outputs import replaced_folder
 
@@ -56,7 +55,7 @@ def tag(
          ", ".join(f"{k} {v:.3g}" for k, v in g.quantities.items()))
         for g in shown
     ]  # fmt: skip
-    for line in format_rows([head, *rows]):
+    for line in opt.format_rows([head, *rows]):
         opt.tell(line)
     counts = {name: sum(g.tag == name for g in shown) for name in TAGS}
     opt.tell(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag")
@@ -119,7 +118,7 @@ def find(
         )  # fmt: skip
     opt.say_all("left out", index.problems)
     if fields or not condition:
-        for line in format_rows(_overview(index, fields=fields)):
+        for line in opt.format_rows(_overview(index, fields=fields)):
             opt.say(line)
         return
     found = ask(index, condition, min_probability=probability)
@@ -283,7 +282,7 @@ def vary(
     for name, p in described.items():
         figures = (p["least"], p["greatest"], *(p["quantiles"][q] for q in ("0.05", "0.5", "0.95")))
         shown.append((name, *(f"{figure:.4g}" for figure in figures)))
-    for line in format_rows(shown):
+    for line in opt.format_rows(shown):
         opt.tell(line)
     opt.tell(
         f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "
