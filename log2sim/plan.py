@@ -97,8 +97,8 @@ def select_sensors(log: Log, config: Config) -> Sensors:
         raise ConfigError(f"--ends {config.cooperation.ends}: {log.name}: no sensor is {place}; choose both")
     cameras = _cameras(log, config)
     # Raise `LogError` for a mounting that is no rigid motion and for intrinsics that project nothing
-    mounts = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
-    for sensor, mount_T_sensor in mounts.items():
+    mounted = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
+    for sensor, mount_T_sensor in mounted.items():
         rotation = mount_T_sensor[:3, :3]
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not np.isfinite(mount_T_sensor).all() or not error < MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:

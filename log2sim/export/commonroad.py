@@ -116,26 +116,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         role = role if obstacle is None else obstacle.tag
         table.append((number, agent.id, agent.category, role, agent.confidence, doubts))
     root.extend(sorted(obstacles, key=lambda o: o.tag != "staticObstacle"))  # the schema wants these first
-    # The task of the ego: from its first to its last pose, in about the time that it takes
-    steps_s = step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)
-    move, last, spare = sample_motion(ego, steps_s), len(steps_s) - 1, round(GOAL_S / STEP_S)
-    problem = element("planningProblem", id=str(first))
-    initial = _state("initialState", move, 0, 0)
-    for key in ("yawRate", "slipAngle"):
-        _texts(element(key, initial), exact="0")
-    problem.append(initial)
-    yaw = float(move.yaw_rad[last])
-    speed = _along(move.velocity_mps[last], yaw)
-    goal = element("goalState", problem)
-    area = element("rectangle", element("position", goal))
-    width = _decimal(ego.size_m[1] + 2 * GOAL_SIDE_M)
-    _texts(area, length=_decimal(GOAL_LENGTH_M), width=width, orientation=_decimal(yaw))
-    x, y, _ = map(_decimal, move.position_m[last])
-    _texts(element("center", area), x=x, y=y)
-    for tag, middle, reach in (("orientation", yaw, GOAL_YAW_RAD), ("velocity", speed, GOAL_SPEED_MPS)):
-        _texts(element(tag, goal), intervalStart=_decimal(middle - reach), intervalEnd=_decimal(middle + reach))
-    _texts(element("time", goal), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
-    root.append(problem)
+    root.append(_planning_problem(ego, first, step_times(t_s[0], ego.waypoints.t_s[-1], STEP_S)))
     xml_text.write(root, folder / f"{name}.xml")
     write_csv_table(folder / "agents.csv", table)
 
@@ -203,3 +184,25 @@ def _state(tag: str, move: SampledMotion, k: int, step: int) -> Element:
     for key, value in rows:
         _texts(element(key, state), exact=str(value) if isinstance(value, int) else _decimal(value))
     return state
+
+
+def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
+    """Return the task of the ego: from its first to its last pose, in about the time that it takes."""
+    move, last, spare = sample_motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
+    problem = element("planningProblem", id=str(number))
+    initial = _state("initialState", move, 0, 0)
+    for key in ("yawRate", "slipAngle"):
+        _texts(element(key, initial), exact="0")
+    problem.append(initial)
+    yaw = float(move.yaw_rad[last])
+    speed = _along(move.velocity_mps[last], yaw)
+    goal = element("goalState", problem)
+    area = element("rectangle", element("position", goal))
+    width = _decimal(ego.size_m[1] + 2 * GOAL_SIDE_M)
+    _texts(area, length=_decimal(GOAL_LENGTH_M), width=width, orientation=_decimal(yaw))
+    x, y, _ = map(_decimal, move.position_m[last])
+    _texts(element("center", area), x=x, y=y)
+    for tag, middle, reach in (("orientation", yaw, GOAL_YAW_RAD), ("velocity", speed, GOAL_SPEED_MPS)):
+        _texts(element(tag, goal), intervalStart=_decimal(middle - reach), intervalEnd=_decimal(middle + reach))
+    _texts(element("time", goal), intervalStart=str(max(0, last - spare)), intervalEnd=str(last + spare))
+    return problem

@@ -267,10 +267,10 @@ def parse_pcd(data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:
             raise ValueError(
                 f"{count * sum(widths)} values as text, more than the {MAX_ASCII_VALUES} that are read; convert it to binary"
             )
-        words = body.split(maxsplit=count * sum(widths))[: count * sum(widths)]
-        if len(words) != count * sum(widths):
-            raise ValueError(f"truncated: {len(words)} of {count * sum(widths)} values")
-        table = np.array(words, dtype="S32").reshape(count, sum(widths))
+        cells = body.split(maxsplit=count * sum(widths))[: count * sum(widths)]
+        if len(cells) != count * sum(widths):
+            raise ValueError(f"truncated: {len(cells)} of {count * sum(widths)} values")
+        table = np.array(cells, dtype="S32").reshape(count, sum(widths))
         rows = np.zeros(count, layout)
         for name, width, start in zip(layout.names or (), widths, np.cumsum([0, *widths])):
             if width == 1 and not name.startswith("_"):

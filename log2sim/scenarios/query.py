@@ -102,25 +102,7 @@ class Condition:
             divisor = f"nullif({right.text}, 0)" if isinstance(node.op, ast.Div) else right.text
             return _Sql(f"({left.text} {ARITHMETIC[type(node.op)]} {divisor})", left.values + right.values, "number")
         if isinstance(node, ast.Compare):
-            texts, values, left = [], list[Any](), node.left
-            for op, right in zip(node.ops, node.comparators):
-                one = self._sql(left)
-                if isinstance(op, (ast.In, ast.NotIn)) and isinstance(right, (ast.Tuple, ast.List)) and right.elts:
-                    others = [self._sql(e) for e in right.elts]
-                    marks = ", ".join(o.text for o in others)
-                    texts.append(f"{one.text} {'NOT ' * isinstance(op, ast.NotIn)}IN ({marks})")
-                elif type(op) in COMPARISONS:
-                    others = [self._sql(right)]
-                    texts.append(f"{one.text} {COMPARISONS[type(op)]} {others[0].text}")
-                else:
-                    raise self._wrong(
-                        node, "compares in a way that is not understood; expected < <= > >= == != or in (A, B)"
-                    )
-                if any(o.kind != one.kind or o.kind == "truth" for o in others):
-                    raise self._wrong(node, "compares a number with a text, or what is neither; texts need quotes")
-                values += [*one.values, *(v for o in others for v in o.values)]
-                left = right
-            return _Sql(f"({' AND '.join(texts)})", values)
+            return self._comparison(node)
         if (
             isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name)
@@ -146,6 +128,27 @@ class Condition:
         if part.kind != "number":
             raise self._wrong(node, f"is a {part.kind.replace('truth', 'tag or comparison')}, expected a number")
         return part
+
+    def _comparison(self, node: ast.Compare) -> _Sql:
+        texts, values, left = [], list[Any](), node.left
+        for op, right in zip(node.ops, node.comparators):
+            one = self._sql(left)
+            if isinstance(op, (ast.In, ast.NotIn)) and isinstance(right, (ast.Tuple, ast.List)) and right.elts:
+                others = [self._sql(e) for e in right.elts]
+                marks = ", ".join(o.text for o in others)
+                texts.append(f"{one.text} {'NOT ' * isinstance(op, ast.NotIn)}IN ({marks})")
+            elif type(op) in COMPARISONS:
+                others = [self._sql(right)]
+                texts.append(f"{one.text} {COMPARISONS[type(op)]} {others[0].text}")
+            else:
+                raise self._wrong(
+                    node, "compares in a way that is not understood; expected < <= > >= == != or in (A, B)"
+                )
+            if any(o.kind != one.kind or o.kind == "truth" for o in others):
+                raise self._wrong(node, "compares a number with a text, or what is neither; texts need quotes")
+            values += [*one.values, *(v for o in others for v in o.values)]
+            left = right
+        return _Sql(f"({' AND '.join(texts)})", values)
 
     def _name(self, name: str) -> _Sql:
         if name in TAGS:

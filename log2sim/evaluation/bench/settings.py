@@ -116,40 +116,8 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
     for key in named:
         values = choices(config.smooth, key)[1:]
         out += [Setting("smooth", value, config.changed(smooth={key: value}), False) for value in values]
-    # List every detector with all distinct numbers of tiles, and with other input sizes where the model accepts them
-    names = list(dict.fromkeys([config.detect.name, *detectors]))
-    for name in names:
-        if config.changed(detect={"name": name}).detect.in_sweeps:
-            raise ConfigError(
-                f"bench: compares detectors in images, '{name}' searches LiDAR sweeps; see log2sim detect"
-            )
-    out: list[Setting] = []
-    stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]
-    for name, stem in zip(names, stems):
-        own = config
-        if name != config.detect.name:
-            own = config.changed(detect={"name": name, "layout": "", "input_px": 0})
-        label = f"{stem if stems.count(stem) == 1 else name} " if len(names) > 1 else ""
-        detector = create_image_detector(log, own)
-        if not isinstance(detector, OnnxDetector):
-            out.append(Setting("detect", name, own, not out))
-            continue
-        # List names and settings of a detector with different inputs, the present one first
-        inputs, seen = [], set()
-        side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
-        cameras = [log.cameras[name] for name in own.cameras or log.cameras]
-        for tiles in dict.fromkeys([own.detect.tiles, *TILES]):
-            plan = tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
-            if plan not in seen:
-                seen.add(plan)
-                inputs.append(({0: "auto tiles", 1: "no tiles"}.get(tiles, f"{tiles} tiles"), "tiles", tiles))
-        if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
-            usual = detector.layout.preprocessing.default_px
-            inputs += [(f"input {side} px", "input_px", side) for side in SIDES_PX if side != usual]
-        for title, key, value in inputs:
-            out.append(Setting("detect", f"{label}{title}", own.changed(detect={key: value}), not out))
     return Grid(
-        detect=tuple(out),
+        detect=tuple(_detector_settings(log, config, detectors)),
         measure=_choices("measure", config, "measure", "mode"),
         homography=tuple(homography),
         hypotheses=tuple(hypotheses),
@@ -181,6 +149,42 @@ def _smooth_name(config: Config, switches: Sequence[str], named: Sequence[str]) 
     if "enabled" in switches and (not config.smooth.enabled or not values):
         return "on" if config.smooth.enabled else "off"
     return " ".join(values) or f"{switches[0]}={str(getattr(config.smooth, switches[0])).lower()}"
+
+
+def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> list[Setting]:
+    """List every detector with all distinct numbers of tiles, and with other input sizes where the model accepts them."""
+    names = list(dict.fromkeys([config.detect.name, *detectors]))
+    for name in names:
+        if config.changed(detect={"name": name}).detect.in_sweeps:
+            raise ConfigError(
+                f"bench: compares detectors in images, '{name}' searches LiDAR sweeps; see log2sim detect"
+            )
+    out: list[Setting] = []
+    stems = [Path(n).stem if n.endswith(".onnx") else n for n in names]
+    for name, stem in zip(names, stems):
+        own = config
+        if name != config.detect.name:
+            own = config.changed(detect={"name": name, "layout": "", "input_px": 0})
+        label = f"{stem if stems.count(stem) == 1 else name} " if len(names) > 1 else ""
+        detector = create_image_detector(log, own)
+        if not isinstance(detector, OnnxDetector):
+            out.append(Setting("detect", name, own, not out))
+            continue
+        # List names and settings of a detector with different inputs, the present one first
+        inputs, seen = [], set()
+        side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
+        cameras = [log.cameras[name] for name in own.cameras or log.cameras]
+        for tiles in dict.fromkeys([own.detect.tiles, *TILES]):
+            plan = tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
+            if plan not in seen:
+                seen.add(plan)
+                inputs.append(({0: "auto tiles", 1: "no tiles"}.get(tiles, f"{tiles} tiles"), "tiles", tiles))
+        if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
+            usual = detector.layout.preprocessing.default_px
+            inputs += [(f"input {side} px", "input_px", side) for side in SIDES_PX if side != usual]
+        for title, key, value in inputs:
+            out.append(Setting("detect", f"{label}{title}", own.changed(detect={key: value}), not out))
+    return out
 
 
 NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, GROUPS, MIN_TRUSTED_CONFIDENCE, Agent
 from log2sim.evaluation.metrics.comparison import Comparison, Mask, StateTable
-from log2sim.evaluation.metrics.verdicts import REPORTED, correctness_rules, judge_against_truth
+from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_rules, judge_against_truth
 from log2sim.geometry import Array
 
 BINS = 10
@@ -146,19 +147,6 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         })  # fmt: skip
     shown = (v.judged | v.undecided).any(axis=1)
     kinds, categories = (set(column[shown].tolist()) for column in (c.other.group, c.other.category))
-    # Count, by category of the agent and of what is there, judged ticks, and agents by what is there most of the time
-    names = np.array([*CATEGORIES, "nothing"])
-    place = {str(name): k for k, name in enumerate(names)}
-    true_place = np.array([*(place[str(c)] for c in c.truth.category), len(CATEGORIES)], dtype=np.int64)
-    ours = np.array([place[str(c)] for c in c.other.category], dtype=np.int64)
-    judged = v.judged
-    row, _ = np.nonzero(judged)
-    counts = np.zeros((len(ours), len(names)), dtype=np.int64)
-    np.add.at(counts, (row, true_place[v.taken_for[judged]]), 1)
-    rows = np.flatnonzero(judged.any(axis=1))
-    ticks, agents = (np.zeros((len(CATEGORIES), len(names)), dtype=np.int64) for _ in range(2))
-    np.add.at(ticks, ours, counts)
-    np.add.at(agents, (ours[rows], counts[rows].argmax(axis=1)), 1)
     return {
         "rules": correctness_rules(MAX_WRONG_SHARE, MIN_TRUSTED_CONFIDENCE),
         **detailed(everything),
@@ -166,15 +154,7 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         "by_category": {
             k: figures(over_ticks(c.other.category == k, everything)) for k in CATEGORIES if k in categories
         },
-        "confusion": (
-            {
-                what: {
-                    str(names[r]): {str(names[k]): int(matrix[r, k]) for k in np.flatnonzero(matrix[r])}
-                    for r in np.flatnonzero(matrix.any(axis=1))
-                }
-                for what, matrix in (("ticks", ticks), ("agents", agents))
-            }
-        ),
+        "confusion": _confusion(v, c.other.category, c.truth.category),
         "judged_agents": rows,
     }
 
@@ -203,3 +183,26 @@ def _wrong_agents(ticks: Mask, mask: Mask) -> Mask:
 
 def _mean(values: Mask) -> float | None:
     return float(values.mean()) if len(values) else None
+
+
+def _confusion(v: Verdicts, category: NDArray[np.str_], true_category: NDArray[np.str_]) -> dict[str, Any]:
+    """Count, by category of the agent and of what is there, judged ticks, and agents by what is there most of the time."""
+    names = np.array([*CATEGORIES, "nothing"])
+    place = {str(name): k for k, name in enumerate(names)}
+    true_place = np.array([*(place[str(c)] for c in true_category), len(CATEGORIES)], dtype=np.int64)
+    ours = np.array([place[str(c)] for c in category], dtype=np.int64)
+    judged = v.judged
+    row, _ = np.nonzero(judged)
+    counts = np.zeros((len(ours), len(names)), dtype=np.int64)
+    np.add.at(counts, (row, true_place[v.taken_for[judged]]), 1)
+    rows = np.flatnonzero(judged.any(axis=1))
+    ticks, agents = (np.zeros((len(CATEGORIES), len(names)), dtype=np.int64) for _ in range(2))
+    np.add.at(ticks, ours, counts)
+    np.add.at(agents, (ours[rows], counts[rows].argmax(axis=1)), 1)
+    return {
+        what: {
+            str(names[r]): {str(names[k]): int(matrix[r, k]) for k in np.flatnonzero(matrix[r])}
+            for r in np.flatnonzero(matrix.any(axis=1))
+        }
+        for what, matrix in (("ticks", ticks), ("agents", agents))
+    }

@@ -46,7 +46,7 @@ def hota(
     present = truth_present[pairs.truth, pairs.tick] & other_present[pairs.other, pairs.tick] & (pairs.similarity > 0)
     pairs = pairs.take(present)
     truth_count, other_count = truth_present.sum(1), other_present.sum(1)
-    # The Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment.
+    # Compute the Jaccard alignment (A, B) of the identities over all ticks, before the one-to-one assignment.
     ticks = truth_present.shape[1]
     row_sum, col_sum = np.zeros((len(truth_count), ticks)), np.zeros((len(other_count), ticks))
     np.add.at(row_sum, (pairs.truth, pairs.tick), pairs.similarity)
@@ -80,6 +80,29 @@ def hota(
 
 
 DIGITS = 6
+
+
+def agent_rows(c: comparison.Comparison) -> list[dict[str, Any]]:
+    """Make one row per counted truth agent: its matches and errors; size errors are signed."""
+    truth, other, counted, switched = c.truth, c.other, c.counted, c.switched
+    errors = verdicts.state_errors(truth, other, c.match, counted)
+    rows, rows_of = [], np.broadcast_to(np.arange(len(truth.agents))[:, None], counted.shape)
+    for i in np.flatnonzero(counted.any(1)):
+        mine, covered = errors.take(errors.truth == i), comparison.coverage(c, rows_of == i)
+        ids, ticks = np.unique(mine.other, return_counts=True)
+        size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
+        headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
+        rows.append({
+            "id": truth.agents[i].id, "category": str(truth.category[i]), "ticks": int(counted[i].sum()),
+            "matched": len(mine.other), **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
+            "matched_ids": {other.agents[j].id: int(n) for j, n in zip(ids, ticks)},
+            "id_switches": int(switched[i].sum()), "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
+            "position_rmse_m": verdicts.root_mean_square(mine.position_m),
+            "yaw_median_deg": verdicts.median(np.degrees(headed)),
+            "speed_rmse_mps": verdicts.root_mean_square(mine.speed_mps),
+            **{f"{side}_error_m": float(v) for side, v in zip(("length", "width", "height"), size)},
+        })  # fmt: skip
+    return rows
 
 
 def uncounted_rows(
@@ -162,27 +185,7 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
         if apart_m is None or apart_m <= comparison.GATE_M:
             return truth, {"method": "same_map", "ego_apart_m": apart_m}
         method = "ego_path"
-        # The rigid motion that puts the true ego on the other one, as well as one motion can
-        true, ours = _common_egos(truth, scenario)
-        half_m = truth.ego.size_m[0] / 2 if truth.ego is not None else 0.0
-        # Both ends of the ego, so that a standing one has a heading, too.
-        a, b = (
-            np.concatenate(
-                [s[:, :2] + end * np.stack([np.cos(s[:, 3]), np.sin(s[:, 3])], axis=1) for end in (-half_m, half_m)]
-            )
-            for s in (true, ours)
-        )
-        from_m, to_m = a.mean(axis=0), b.mean(axis=0)
-        p, q = a - from_m, b - to_m
-        turn = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))
-        rise_m = float(np.mean(ours[:, 2] - true[:, 2]))
-
-        def move(states: geometry.Array, _t_s: geometry.Array) -> geometry.Array:
-            pivot, goal = np.array([*from_m, 0.0]), np.array([*to_m, rise_m])
-            xyz = (states[:, :3] - pivot) @ geometry.rotation_from_rpy(0.0, 0.0, turn).T + goal
-            return np.column_stack([xyz, states[:, 3] + turn])
-
-        near = far = move
+        near = far = _fit_egos(truth, scenario)
     moved = replace(_moved(truth, near, far), map=scenario.map)
     return moved, {"method": method, "ego_apart_m": _ego_apart_m(moved, scenario, np.zeros(3))}
 
@@ -214,6 +217,30 @@ def _ego_apart_m(truth: Scenario, scenario: Scenario, shift_m: geometry.Array) -
     true, ours = _common_egos(truth, scenario)
     gap = true[:, :2] + shift_m[:2] - ours[:, :2]
     return float(np.median(np.hypot(gap[:, 0], gap[:, 1]))) if len(gap) else None
+
+
+def _fit_egos(truth: Scenario, scenario: Scenario) -> Move:
+    """Return the rigid motion that puts the true ego on the other one, as well as one motion can."""
+    true, ours = _common_egos(truth, scenario)
+    half_m = truth.ego.size_m[0] / 2 if truth.ego is not None else 0.0
+    # Both ends of the ego, so that a standing one has a heading, too.
+    a, b = (
+        np.concatenate(
+            [s[:, :2] + end * np.stack([np.cos(s[:, 3]), np.sin(s[:, 3])], axis=1) for end in (-half_m, half_m)]
+        )
+        for s in (true, ours)
+    )
+    from_m, to_m = a.mean(axis=0), b.mean(axis=0)
+    p, q = a - from_m, b - to_m
+    turn = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))
+    rise_m = float(np.mean(ours[:, 2] - true[:, 2]))
+
+    def move(states: geometry.Array, _t_s: geometry.Array) -> geometry.Array:
+        pivot, goal = np.array([*from_m, 0.0]), np.array([*to_m, rise_m])
+        xyz = (states[:, :3] - pivot) @ geometry.rotation_from_rpy(0.0, 0.0, turn).T + goal
+        return np.column_stack([xyz, states[:, 3] + turn])
+
+    return move
 
 
 def _moved(truth: Scenario, near: Move, far: Move) -> Scenario:
@@ -336,25 +363,6 @@ def evaluate(
             "yaw_median_deg": verdicts.median(np.degrees(errors.yaw_rad)),
             "speed_rmse_mps": verdicts.root_mean_square(errors.speed_mps),
         }
-    # Make one row per counted truth agent: its matches and errors; size errors are signed
-    truth, other, counted, switched = compared.truth, compared.other, compared.counted, compared.switched
-    errors = verdicts.state_errors(truth, other, compared.match, counted)
-    rows, rows_of = [], np.broadcast_to(np.arange(len(truth.agents))[:, None], counted.shape)
-    for i in np.flatnonzero(counted.any(1)):
-        mine, covered = errors.take(errors.truth == i), comparison.coverage(compared, rows_of == i)
-        ids, ticks = np.unique(mine.other, return_counts=True)
-        size = mine.size_m.mean(axis=0) if len(mine.other) else np.full(3, np.nan)
-        headed = mine.yaw_rad[np.isfinite(mine.yaw_rad)]
-        rows.append({
-            "id": truth.agents[i].id, "category": str(truth.category[i]), "ticks": int(counted[i].sum()),
-            "matched": len(mine.other), **{key: covered[key] for key in ("labeled", "hit", "hit_matched")},
-            "matched_ids": {other.agents[j].id: int(n) for j, n in zip(ids, ticks)},
-            "id_switches": int(switched[i].sum()), "mean_range_m": float(truth.range_m[i, counted[i]].mean()),
-            "position_rmse_m": verdicts.root_mean_square(mine.position_m),
-            "yaw_median_deg": verdicts.median(np.degrees(headed)),
-            "speed_rmse_mps": verdicts.root_mean_square(mine.speed_mps),
-            **{f"{side}_error_m": float(v) for side, v in zip(("length", "width", "height"), size)},
-        })  # fmt: skip
     result = {
         "metrics_version": VERSION,
         "scenario": scenario.name,
@@ -375,7 +383,7 @@ def evaluate(
         "signals": signal_figures(scenario, truth),
         "matching": verdicts.matching_rules(),
         "counting": verdicts.counting_rules(truth),
-        "agents": rows,
+        "agents": agent_rows(compared),
         "false_agents": uncounted_rows(
             ours, "false", compared.false, matched_ticks=comparison.matched_ticks(compared, compared.counted)
         ),

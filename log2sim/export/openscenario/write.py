@@ -143,6 +143,26 @@ class AgentStory:
     start: Array  # (5,) the first vertex, or the pose at 0 s if its waypoints begin before
 
 
+def add_storyboard(parent: Element, stories: list[AgentStory], duration_s: float, minor: int) -> None:
+    """Add the `Storyboard` of all agents."""
+    storyboard = element("Storyboard", parent)
+    actions = element("Actions", element("Init", storyboard))
+    for story in stories:
+        if not story.enters or minor == 0:
+            private = element("Private", actions, entityRef=story.name)
+            below_m = story.hidden_m if story.enters else 0.0
+            _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
+            _add_speed(private, 0.0 if story.enters else story.speed_mps)
+        if story.external:
+            _add_external_control(actions[-1], minor)
+    act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
+    for story in stories:
+        if not story.external:
+            _add_group(act, story, minor)
+    _add_trigger(act, "StartTrigger", "at the start", 0.0, minor)
+    _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, minor)
+
+
 def _add_external_control(private: Element, minor: int) -> None:
     """Hand the control over: to who reports states to esmini from 1.1 on, to who drives the vehicle in CARLA in 1.0."""
     control = element("ControllerAction", element("PrivateAction", private))
@@ -311,21 +331,5 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     entities = element("Entities", root)
     for agent, name, flag in zip(scenario.agents, names, driven):
         add_entity(entities, agent, name, minor, external=flag)
-    # The `Storyboard` of all agents
-    storyboard = element("Storyboard", root)
-    actions = element("Actions", element("Init", storyboard))
-    for story in stories:
-        if not story.enters or minor == 0:
-            private = element("Private", actions, entityRef=story.name)
-            below_m = story.hidden_m if story.enters else 0.0
-            _add_position(element("TeleportAction", element("PrivateAction", private)), story.start, below_m)
-            _add_speed(private, 0.0 if story.enters else story.speed_mps)
-        if story.external:
-            _add_external_control(actions[-1], minor)
-    act = element("Act", element("Story", storyboard, name="scenario"), name="replay")
-    for story in stories:
-        if not story.external:
-            _add_group(act, story, minor)
-    _add_trigger(act, "StartTrigger", "at the start", 0.0, minor)
-    _add_trigger(storyboard, "StopTrigger", "at the end", duration_s, minor)
+    add_storyboard(root, stories, duration_s, minor)
     xml_text.write(root, folder / "scenario.xosc")

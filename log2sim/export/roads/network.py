@@ -389,11 +389,11 @@ def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]
                 continue
             other = by_left.get(str(group[0].opposite), [])
             if other:  # begins and ends with the lane, to the left of it
-                first, facing = group[0], _turned(other[0])
-                heading = float(Polyline(first.points_m).heading_rad[0])
-                gap = facing.points_m[0] - first.points_m[0]
+                leftmost, facing = group[0], _turned(other[0])
+                heading = float(Polyline(leftmost.points_m).heading_rad[0])
+                gap = facing.points_m[0] - leftmost.points_m[0]
                 left = gap[1] * np.cos(heading) > gap[0] * np.sin(heading)
-                other = other if other[0].opposite == first.id and left and _aligned(first, facing) else []
+                other = other if other[0].opposite == leftmost.id and left and _aligned(leftmost, facing) else []
             taken |= {side[0].id for side in (group, other) if side}
             sides.append((group, other) if _surest([*group, *other]) in group else (other, group))
         plain = {k + 1: pair for k, pair in enumerate(sides)}
@@ -409,22 +409,7 @@ def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]
     place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
     names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
-    # The headings of cross sections where two roads meet, by road and end (0 or -1)
-    headings: dict[tuple[int, int], float] = {}
-    across = {number: [*map(_turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
-    for number, sides in plain.items():
-        for lane in (*sides[0], *sides[1]):
-            for name in lane.successors:
-                one, two = place[lane.id], place[name]
-                if two.road not in plain or (number, one.end) in headings or (two.road, two.start) in headings:
-                    continue
-                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
-                first = cross_heading(across[number], one.end) + turns[0]
-                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
-                wide = [len(across[k]) > 1 for k in (number, two.road)]
-                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
-                headings[number, one.end] = first + share * turn - turns[0]
-                headings[two.road, two.start] = first + share * turn - turns[1]
+    headings = _shared_headings(plain, place, by_id)
     roads: list[Road] = []
     ends: dict[tuple[str, int], End] = {}
     # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
@@ -548,3 +533,27 @@ def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> l
     """Return the lanes of a road with those that adjoin them at its start (0) or end (-1)."""
     ends_here = {lane.id: place[lane.id].end == at for lane in group}
     return [(a, name) for a in group for name in (a.successors if ends_here[a.id] else a.predecessors)]
+
+
+def _shared_headings(
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
+    place: Mapping[str, _Place],
+    by_id: Mapping[str, MapLane],
+) -> dict[tuple[int, int], float]:
+    """Return the headings of cross sections where two roads meet, by road and end (0 or -1)."""
+    found: dict[tuple[int, int], float] = {}
+    across = {number: [*map(_turned, opposite[::-1]), *group] for number, (group, opposite) in plain.items()}
+    for number, sides in plain.items():
+        for lane in (*sides[0], *sides[1]):
+            for name in lane.successors:
+                one, two = place[lane.id], place[name]
+                if two.road not in plain or (number, one.end) in found or (two.road, two.start) in found:
+                    continue
+                turns = [0.0 if where.lane < 0 else np.pi for where in (one, two)]
+                first = cross_heading(across[number], one.end) + turns[0]
+                turn = float(np.angle(np.exp(1j * (cross_heading(across[two.road], two.start) + turns[1] - first))))
+                wide = [len(across[k]) > 1 for k in (number, two.road)]
+                share = 0.5 if wide[0] == wide[1] else 0.0 if wide[0] else 1.0
+                found[number, one.end] = first + share * turn - turns[0]
+                found[two.road, two.start] = first + share * turn - turns[1]
+    return found

@@ -116,6 +116,28 @@ def road_objects(
     return crosswalks, signals
 
 
+def _add_signals(
+    parent: Element, road: Road, own: Sequence[tuple[Signal, MapLane]], placement: ExportPlacement
+) -> None:
+    """Add the traffic lights where the lanes end that they are for: at the end of the road, or for lanes against it at its start."""
+    nodes = element("signals", parent) if own else parent
+    for signal, lane in own:
+        along = any(lane is other for other in road.lanes)
+        s = road.line.length_m if along else 0.0
+        x, y, heading = road.line.at(np.array([s]))[0]
+        dx, dy, height = signal.position_m - [x, y, lane.points_m[-1, 2]]
+        aside = float(dy * np.cos(heading) - dx * np.sin(heading))
+        node = element(
+            "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(s, DIGITS),
+            t=number(aside, DIGITS), dynamic="yes", orientation="+" if along else "-", zOffset=number(float(height), DIGITS),
+            country="OpenDRIVE", type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2),
+            width=number(LIGHT_WIDTH_M, 2), hOffset="0", pitch="0", roll="0",
+        )  # fmt: skip
+        at = signal.position_m - placement.origin_m
+        place = {key: number(float(v), DIGITS) for key, v in zip("xyz", at)}
+        element("positionInertial", node, **place, hdg=number(float(signal.heading_rad or 0.0), DIGITS))
+
+
 # Stations may repeat the sum of lengths with as little as six decimals.
 GAP_M = 1e-4
 
@@ -242,24 +264,7 @@ def _document(scenario: Scenario, placement: ExportPlacement) -> Element:
             outline = element("outline", element("outlines", crossing), id="0", closed="true", outer="true")
             for k, (a, b) in enumerate(zip(u.tolist(), v.tolist())):
                 element("cornerLocal", outline, u=number(a, DIGITS), v=number(b, DIGITS), z="0", height="0", id=str(k))
-        # The traffic lights where the lanes end that they are for: at the end of the road, or for lanes against it at its start
-        lights = signals.get(road.number, ())
-        nodes = element("signals", node) if lights else node
-        for signal, lane in lights:
-            along = any(lane is other for other in road.lanes)
-            s = road.line.length_m if along else 0.0
-            x, y, heading = road.line.at(np.array([s]))[0]
-            dx, dy, height = signal.position_m - [x, y, lane.points_m[-1, 2]]
-            aside = float(dy * np.cos(heading) - dx * np.sin(heading))
-            node = element(
-                "signal", nodes, id=escaped(signal.id), name=escaped(signal.id), s=number(s, DIGITS),
-                t=number(aside, DIGITS), dynamic="yes", orientation="+" if along else "-", zOffset=number(float(height), DIGITS),
-                country="OpenDRIVE", type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2),
-                width=number(LIGHT_WIDTH_M, 2), hOffset="0", pitch="0", roll="0",
-            )  # fmt: skip
-            at = signal.position_m - placement.origin_m
-            place = {key: number(float(v), DIGITS) for key, v in zip("xyz", at)}
-            element("positionInertial", node, **place, hdg=number(float(signal.heading_rad or 0.0), DIGITS))
+        _add_signals(node, road, signals.get(road.number, ()), placement)
     for junction, name in junctions.items():
         parent = element("junction", root, name=escaped(name), id=str(junction), type="default")
         for k, road in enumerate(road for road in roads if road.junction == junction):

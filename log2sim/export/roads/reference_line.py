@@ -91,17 +91,7 @@ def fit(xy_m: Array, start: Array | None = None, end: Array | None = None) -> tu
     samples, sample_of_point = _spline(xy_m)
     if start is not None or end is not None:
         samples, sample_of_point = _pinned(samples, sample_of_point, start, end)
-    # Return indices of the samples (M, 3) between which biarcs stay within `ARCS_M`; the step doubles, then is bisected
-    ends, last = [0], len(samples) - 1
-    while ends[-1] < last:
-        start, reach, stride = ends[-1], 1, 1
-        while stride and start + reach < last:
-            end = min(start + reach + stride, last)
-            if _deviation(samples[start : end + 1]) <= ARCS_M:
-                reach, stride = end - start, 2 * stride
-            else:
-                stride //= 2
-        ends.append(start + reach)
+    ends = _longest_biarcs(samples)
     steps, stations = [], np.zeros(len(samples))
     s = 0.0
     for i, j in pairwise(ends):
@@ -181,6 +171,21 @@ def _straight_samples(xy_m: Array) -> tuple[Array, Array] | None:
     heading = np.arctan2(along[1], along[0])
     ends = np.array([[*(middle + v * along), heading] for v in (s[0], s[-1])])
     return ends, (s - s[0]) / (s[-1] - s[0])
+
+
+def _longest_biarcs(samples: Array) -> list[int]:
+    """Return indices of the samples (M, 3) between which biarcs stay within `ARCS_M`; the step doubles, then is bisected."""
+    ends, last = [0], len(samples) - 1
+    while ends[-1] < last:
+        start, reach, step = ends[-1], 1, 1
+        while step and start + reach < last:
+            end = min(start + reach + step, last)
+            if _deviation(samples[start : end + 1]) <= ARCS_M:
+                reach, step = end - start, 2 * step
+            else:
+                step //= 2
+        ends.append(start + reach)
+    return ends
 
 
 def _deviation(samples: Array) -> float:

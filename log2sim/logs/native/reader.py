@@ -258,18 +258,7 @@ class _Folder:
         m = self.manifest
         map_frame, track = self._ego()
         sensors = [self._sensor(k, entry) for k, entry in enumerate(m["sensors"])]
-        names = [sensor.name for sensor in sensors]
-        for place, sensor in enumerate(sensors):
-            where = f"{self.file}, sensors[{place}] '{sensor.name}'"
-            if sensor.name in names[:place]:
-                raise LogError(f"{where}: the name occurs twice; names must be unique")
-            if sensor.mount == "ego" and "ego" not in self.manifest:
-                advice = "an empty 'ego' says that its poses are not known"
-                raise LogError(f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss; {advice}")
-        reference, cameras = self.manifest.get("reference_camera"), [s.name for s in sensors if isinstance(s, Camera)]
-        if reference is not None and reference not in cameras:
-            there = f"no camera '{reference}'; there are: {', '.join(cameras)}"
-            raise LogError(f"{self.file}, field 'reference_camera': {there}")
+        self._check_sensors(sensors)
         labels = self._labels()
         boxes, regions = self._label_table("boxes_2d", BOX_2D_COLUMNS), self._label_table("ignored_2d", REGION_COLUMNS)
         # Whole kilometers (3,), m, by which the log is shifted towards the map's origin.
@@ -366,6 +355,20 @@ class _Folder:
         lines = i.get("rolling_shutter")
         shutter = None if lines is None else RollingShutter(lines["direction"], float(lines["readout_s"]))
         return replace(camera_of(entry["name"], i, entry["mount"], mount_T_sensor), rolling_shutter=shutter)
+
+    def _check_sensors(self, sensors: list[Camera | datatypes.Lidar]) -> None:
+        names = [sensor.name for sensor in sensors]
+        for k, sensor in enumerate(sensors):
+            where = f"{self.file}, sensors[{k}] '{sensor.name}'"
+            if sensor.name in names[:k]:
+                raise LogError(f"{where}: the name occurs twice; names must be unique")
+            if sensor.mount == "ego" and "ego" not in self.manifest:
+                advice = "an empty 'ego' says that its poses are not known"
+                raise LogError(f"{where}: is mounted on the ego, but the log has no 'ego' with poses or gnss; {advice}")
+        reference, cameras = self.manifest.get("reference_camera"), [s.name for s in sensors if isinstance(s, Camera)]
+        if reference is not None and reference not in cameras:
+            there = f"no camera '{reference}'; there are: {', '.join(cameras)}"
+            raise LogError(f"{self.file}, field 'reference_camera': {there}")
 
     def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> datatypes.Stream:
         frame = entry.get("points_frame", "lidar")
