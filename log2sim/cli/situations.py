@@ -16,12 +16,10 @@ from log2sim.files.outputs import replaced_folder
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from log2sim.scenarios.index import Index, Row
-    from log2sim.scenarios.query import Found
-
-    MapFiles = Callable[[Callable[[str], Any], Sequence[str]], Iterator[Any]]
     from log2sim.geometry import Array
     from log2sim.scenarios.failure import Outcome
+    from log2sim.scenarios.index import Index, Row
+    from log2sim.scenarios.query import Found
 
 
 def tag(
@@ -111,9 +109,10 @@ def find(
     if as_json:
         opt.is_quiet.set(True)
     opt.require_own_workers(jobs, scheduler)
-    with progress() as report_progress:
+    with progress() as report_progress, _runs(jobs, scheduler) as run:
         index = open_index(
-            path, fresh=fresh, jobs=jobs, map_files=_on_workers(scheduler) if scheduler else None,
+            path, fresh=fresh, jobs=jobs,
+            map_files=None if scheduler is None else lambda work, names: run(work, [str(Path(n).resolve()) for n in names]),
             progress=lambda done, total: report_progress("scenarios", done, total),
         )  # fmt: skip
     opt.say_all("left out", index.problems)
@@ -162,17 +161,6 @@ def find(
         opt.tell(address)
 
 
-def _on_workers(scheduler: str) -> MapFiles:
-    """Return a function that maps over files on the workers of a scheduler."""
-    from log2sim.batch.run import workers_of
-
-    def run(work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
-        with workers_of(scheduler) as workers:
-            yield from map_on_workers(workers.client, work, names)
-
-    return run
-
-
 @contextmanager
 def _runs(
     jobs: int | None, scheduler: str | None
@@ -186,15 +174,13 @@ def _runs(
     from log2sim.batch.run import workers_of
 
     with workers_of(scheduler) as workers:
-        yield lambda work, tasks: (f.result() for f in workers.client.map(work, tasks, pure=False))
 
+        def on_workers(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
+            futures = workers.client.map(work, tasks, pure=False)
+            while futures:  # each result is freed once it was taken
+                yield futures.pop(0).result()
 
-def map_on_workers(client: Any, work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
-    """Yield what a function makes of files on the workers of a client, in any order; each result is freed once it was taken."""
-    from distributed import as_completed
-
-    for future in as_completed(client.map(work, [str(Path(n).resolve()) for n in names], pure=False)):
-        yield future.result()
+        yield on_workers
 
 
 def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:

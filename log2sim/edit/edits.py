@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Waypoints, retime_spans
 from log2sim.errors import ConfigError
@@ -52,13 +51,6 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
         return kept
     start = replace(resampled(agent, np.array([-seconds])), t_s=np.zeros(1))
     return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.columns().items()})
-
-
-def parallel_fails(w: Waypoints, meters: float) -> NDArray[np.bool_]:
-    """Mask (T - 1,) of the steps between waypoints whose radius is not larger than the shift."""
-    chord, turn = chords(w)
-    moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
-    return moves & (chord * (chord - meters * turn) <= 0)
 
 
 def chords(w: Waypoints) -> tuple[Array, Array]:
@@ -314,11 +306,13 @@ class Lateral(_WaypointEdit):
     def moved(self, agent: Agent) -> tuple[Waypoints, None]:
         """Return the waypoints of the parallel path."""
         w = agent.waypoints
-        fails = parallel_fails(w, self.meters)
+        # Steps between waypoints (T - 1,) whose radius is not larger than the shift.
+        chord, turn = chords(w)
+        moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
+        fails = moves & (chord * (chord - self.meters * turn) <= 0)
         if self.window is not None:
             fails &= w.t_s[1:] > self.window.begin_s
         if fails.any():
-            chord, turn = chords(w)
             radius_m = np.where(fails, np.abs(chord / np.where(fails, turn, 1.0)), np.inf)
             k = int(np.argmin(radius_m))
             raise ConfigError(
