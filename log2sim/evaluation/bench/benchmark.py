@@ -182,20 +182,9 @@ def bench(
     Raises `LogError` or `ConfigError` or `MissingExtra` for a log that cannot be read or has neither a camera nor
     LiDARs at both ends, invalid settings, or a detector whose package is missing.
 
-    Parameters
-    ----------
-    log : Log
-        From `open_log`.
-    config : Config, optional
-        The present settings; the defaults without.
-    truth : Scenario, optional
-        Without it only figures that need no truth are computed.
-    scope : Scope
-        Which objects are compared with the truth.
-    detectors : tuple of str
-        Detectors to compare with that of `config`.
-    progress : callable, optional
-        Called as `progress(what, done, total)`.
+    `log`: from `open_log`. `config`: the present settings; the defaults without. `truth`: without it only figures that need no truth
+    are computed. `scope`: which objects are compared with the truth. `detectors`: detectors to compare with that of `config`.
+    `progress`: called as `progress(what, done, total)`.
     """
     report = progress or (lambda what, done, total: None)
     config = config or Config()

@@ -288,26 +288,13 @@ def evaluate(
     Raises `ConfigError` for an unknown category, a range that is not positive, or a range without an ego to measure it
     from. Raises `LogError` when the log has no labels. Raises `ScenarioError` when the two do not overlap in time.
 
-    Parameters
-    ----------
-    scenario : Scenario, Result, Path or str
-        A scenario or its file, or what `log2sim.reconstruct` returns.
-    truth : Scenario, Log, Path or str
-        A scenario or its file, or a log or its path, whose labels in view of the cameras that the scenario used are taken.
-        Start time and map may be others. The ego (id "ego") is compared separately from the other agents.
-    max_range_m : float, m, optional
-        Only agents within this distance of the ego are compared, in both scenarios.
-    categories : sequence of str, optional
-        Only agents of these categories or groups ("vehicle", "two_wheeler") are compared, in both scenarios.
+    `scenario`: a scenario or its file, or what `log2sim.reconstruct` returns. `truth`: a scenario or its file, or a log or its path,
+    whose labels in view of the cameras that the scenario used are taken. Start time and map may be others. The ego (id "ego") is
+    compared separately from the other agents. `max_range_m`, m: only agents within this distance of the ego are compared, in both
+    scenarios. `categories`: only agents of these categories or groups ("vehicle", "two_wheeler") are compared, in both scenarios.
+    Returns the document of `schemas/metrics-1.json`. Keys carry the unit: `_m` meters, `_mps` m/s, `_deg` degrees, `_s` seconds;
+    recall, precision, MOTA and HOTA are fractions. A figure that cannot be computed is None.
 
-    Returns
-    -------
-    dict
-        The document of `schemas/metrics-1.json`. Keys carry the unit: `_m` meters, `_mps` m/s, `_deg` degrees, `_s` seconds;
-        recall, precision, MOTA and HOTA are fractions. A figure that cannot be computed is None.
-
-    Notes
-    -----
     CLEAR MOT (Bernardin and Stiefelhagen, 2008) and HOTA (Luiten et al., 2021) with matches by the distance of box centers.
     Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks. Quarantined agents, which
     replays and exports leave out, are left out here too, and listed; static agents are compared from their first to their last

@@ -177,22 +177,9 @@ def plot(
 
     Raises `ScenarioError` when the truth's map has another projection.
 
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes, optional
-        Drawn into; limits of axes that show something already are kept. Without, a new figure of pyplot.
-    replay : Replay, optional
-        Drawn over the scenario.
-    truth : Scenario, optional
-        Brought to the scenario's start and map.
-    background : GroundMap, optional
-        A picture of the ground in the map frame.
-    legend : bool, optional
-        By default only in a new figure.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
+    `ax`: drawn into; limits of axes that show something already are kept. Without, a new figure of pyplot. `replay`: drawn over the
+    scenario. `truth`: brought to the scenario's start and map. `background`: a picture of the ground in the map frame. `legend`: by
+    default only in a new figure.
     """
     aligned = None if truth is None else truth.aligned_to(scenario)
     new = ax is None
