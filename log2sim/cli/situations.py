@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -174,13 +175,14 @@ def _runs(
     from log2sim.batch.run import workers_of
 
     with workers_of(scheduler) as workers:
+        yield partial(map_on_workers, workers.client)
 
-        def on_workers(work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
-            futures = workers.client.map(work, tasks, pure=False)
-            while futures:  # each result is freed once it was taken
-                yield futures.pop(0).result()
 
-        yield on_workers
+def map_on_workers(client: Any, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
+    """Yield what a function makes of tasks on the workers of a client, in their order; each result is freed once it was taken."""
+    futures = client.map(work, tasks, pure=False)
+    while futures:
+        yield futures.pop(0).result()
 
 
 def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
@@ -311,7 +313,6 @@ def test_(
     log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o late/ --latency 0.3:0.05 --noise 0.2
     """
     from dataclasses import asdict
-    from functools import partial
 
     import numpy as np
 
