@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario, Stream, Sweep, Waypoints
+from log2sim.datatypes import Agent, EgoVehicle, Lidar, Log, MapFrame, Scenario, Stream, Waypoints
 from log2sim.datatypes.color_names import name_of
 from log2sim.errors import ConfigError
 from log2sim.files.documents import check_folder
@@ -32,7 +32,6 @@ from log2sim.synth.paint import GroundReflectance
 from log2sim.synth.render import Body, SceneInstant, bodies_at, camera_of, frame_stamps, render, signals_of
 from log2sim.synth.scene import Scene
 from log2sim.synth.truth import (
-    Caster,
     FrameVisibility,
     labels_2d,
     labels_3d,
@@ -72,7 +71,7 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
     streams = _image_streams(moving, cameras, seed)
     for spec in scene.lidar:
         stamps = raycast.sweep_stamps(spec, scene)
-        streams[spec.name] = Stream(spec.name, stamps, partial(_read_sweep, cast, spec.name))
+        streams[spec.name] = Stream(spec.name, stamps, lambda i, name=spec.name: cast(name, i).sweep)
     frames: dict[str, list[FrameVisibility]] = {}
     t_s = np.arange(0, scene.duration_s + 1e-9, TRUTH_STEP_S)
     visible = None
@@ -99,10 +98,6 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
         notes=(f"synthetic, seed {seed}",),
     )  # fmt: skip
     return log, truth
-
-
-def _read_sweep(cast: Caster, name: str, i: int) -> Sweep:
-    return cast(name, i).sweep
 
 
 def _image_streams(moving: MovingScene, cameras: dict[str, Camera], seed: int) -> dict[str, Stream]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, RELATED_GROUPS, Measurements, Track
+from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs
 from log2sim.tracking.forward import (
     ACCELERATION_MPS2,
@@ -82,7 +83,7 @@ END_MEASUREMENTS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class _Ends:
+class _Ends(Columns):
     """States of tracks at both ends, from one filter pass in each direction."""
 
     first_ns: NDArray[np.int64]  # (A,)
@@ -92,12 +93,6 @@ class _Ends:
     last: Array
     last_covariance: Array
     group: NDArray[np.str_]  # (A,)
-
-    def join(self, other: _Ends) -> _Ends:
-        return _Ends(*(np.concatenate(columns) for columns in zip(vars(self).values(), vars(other).values())))
-
-    def take(self, rows: list[int]) -> _Ends:
-        return _Ends(*(column[rows] for column in vars(self).values()))
 
 
 def stitch(
@@ -130,7 +125,7 @@ def stitch(
         number = iter(range(len(current), len(current) + len(joined)))
         rows = [next(number) if len(c) > 1 else c[0] for c in chains]
         everyone = [*current, *joined]
-        ends = ends.join(_ends(joined, whole_boxes=whole_boxes)).take(rows)
+        ends = _Ends.join([ends, _ends(joined, whole_boxes=whole_boxes)]).take(rows)
         current = [everyone[k] for k in rows]
     return current
 
