@@ -27,8 +27,8 @@ from log2sim.synth.light import light_of
 from log2sim.synth.polytope_caster import SensorState
 from log2sim.synth.render import Visibility, render, segment
 from log2sim.synth.scene import Environment
+from log2sim.synth.synthesis import MIN_LABEL_PX, MIN_UNOCCLUDED
 from log2sim.synth.traffic_picture import TrafficPainter
-from log2sim.synth.truth import MIN_LABEL_PX, MIN_UNOCCLUDED
 
 FOLDERS = {"image_2": ".png", "velodyne": ".bin", "calib": ".txt", "label_2": ".txt"}
 TYPES = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian", "cyclist": "Cyclist"}

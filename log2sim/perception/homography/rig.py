@@ -11,7 +11,7 @@ one bundle over the feet of boxes in all cameras finds where boxes end, and how 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
