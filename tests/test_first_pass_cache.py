@@ -35,8 +35,6 @@ TICKS = 6
 PART = 3
 # A part of the log, no second look at its pictures, and nothing that the cache has nothing to do with.
 QUICK = {"map": {"lanes": False}, "appearance": {"colors": False}, "calibration": {"check": False}, "stop_s": 0.55}
-
-
 STATED: dict[str, Any] = {"cache_key": "seeing 1", "before": lambda seeing: None}
 """What the detectors of a test state as their key, and what they do before they look at a picture."""
 

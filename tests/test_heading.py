@@ -34,11 +34,7 @@ from log2sim.datatypes.log_odds import probability_of
 from log2sim.perception.boxes import rotate
 
 T_NS = np.arange(20) * 100_000_000
-
-
 TIMELINE = Timeline(T_NS, 0)
-
-
 CAR_M = np.array([4.4, 1.8, 1.5])
 
 
@@ -241,8 +237,6 @@ def rows_of(poses, lengths_m=None, stands=None):
 
 
 CURB = [(6.0 * k, 0.0, np.pi * (k % 2)) for k in range(4)]
-
-
 LOT = [(0.1 * k, 2.7 * k, 0.0) for k in range(5)]
 
 

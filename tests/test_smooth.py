@@ -584,3 +584,9 @@ def test_drawn_motions_are_followed_as_well_as_is_possible(maneuvers: ModuleType
     """No estimator passes the posterior Cramer-Rao bound on average; one that knows neither noise nor motion nears it."""
     ratio = maneuvers.drawn_error_m(density, 0.1, seeds=8) / maneuvers.cramer_rao_m(density, 0.1)
     assert 0.85 < ratio < 1.1
+
+
+def test_maneuvers_are_followed_nearly_as_well_as_by_who_is_told_their_jerk(maneuvers: ModuleType) -> None:
+    error_m, constant_m, following_m = maneuvers.maneuver_bounds("turn", 0.3, seeds=3)
+    assert following_m < constant_m
+    assert 0.8 * constant_m < error_m < 1.2 * following_m

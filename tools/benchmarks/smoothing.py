@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import UnivariateSpline, make_smoothing_spline
+from scipy.signal import savgol_filter
 
 from benchmarks.table import markdown, optional, print_section
 from log2sim.agents.smooth.smoother import smooth_track
@@ -120,14 +122,9 @@ def errors_of(truth: Truth, xy_m: Array, velocity_mps: Array, yaw_rad: Array, cu
     def rms(values: Array) -> float:
         return float(np.sqrt(np.mean(values**2)))
 
-    return np.array(
-        [
-            rms(np.hypot(*(xy_m - truth.xy_m).T)),
-            rms(np.hypot(*(velocity_mps - truth.velocity_mps).T)),
-            rms(turned[moving]),
-            rms((curvature_1pm - truth.curvature_1pm)[moving]),
-        ]
-    )
+    bent = (curvature_1pm - truth.curvature_1pm)[moving]
+    off = [np.hypot(*(ours - true).T) for ours, true in ((xy_m, truth.xy_m), (velocity_mps, truth.velocity_mps))]
+    return np.array([rms(off[0]), rms(off[1]), rms(turned[moving]), rms(bent)])
 
 
 def rate_worlds(maneuver: str, rate_hz: int, sigma_m: float, seeds: int = 6) -> Iterator[tuple[Truth, Array, Array]]:
@@ -163,33 +160,18 @@ def log2sim(t: Array, xy: Array, sigma: float, *, told: bool = True) -> Result:
     return found.xy_m, found.velocity_mps, found.yaw_rad, found.curvature_1pm
 
 
-def smoothing_spline(t: Array, xy: Array, sigma: float, *, lam: float | None) -> Result:
-    """SciPy's smoothing spline, by generalized cross-validation or with a fixed penalty."""
-    from scipy.interpolate import make_smoothing_spline
-
-    return of_splines([make_smoothing_spline(t, z, lam=lam and lam * np.sqrt(sigma / 0.3)) for z in xy.T])
-
-
-def univariate_spline(t: Array, xy: Array, sigma: float) -> Result:
-    from scipy.interpolate import UnivariateSpline
-
-    return of_splines([UnivariateSpline(t, z, k=5, s=len(t) * sigma**2) for z in xy.T])
-
-
-def of_splines(splines: list[Any]) -> Result:
+def spline(t: Array, xy: Array, sigma: float, *, fit: Callable[[Array, Array, float], Any]) -> Result:
+    """A spline of SciPy."""
+    splines = [fit(t, z, sigma) for z in xy.T]
     values = [np.column_stack([s.derivative(k)(ALL_S) if k else s(ALL_S) for s in splines]) for k in range(3)]
     return of_derivatives(*values)
 
 
-def savgol(t: Array, xy: Array, _: float, *, window: int) -> Result:
-    from scipy.signal import savgol_filter
-
+def filtered(t: Array, xy: Array, _: float, *, window: int) -> Result:
+    """SciPy's Savitzky-Golay filter of cubics, or with a window of 0 differences."""
     filled = np.column_stack([np.interp(ALL_S, t, z) for z in xy.T])
-    return of_derivatives(*(savgol_filter(filled, window, 3, deriv=k, delta=PERIOD_S, axis=0) for k in range(3)))
-
-
-def differences(t: Array, xy: Array, _: float) -> Result:
-    filled = np.column_stack([np.interp(ALL_S, t, z) for z in xy.T])
+    if window:
+        return of_derivatives(*(savgol_filter(filled, window, 3, deriv=k, delta=PERIOD_S, axis=0) for k in range(3)))
     velocity = np.gradient(filled, PERIOD_S, axis=0)
     return of_derivatives(filled, velocity, np.gradient(velocity, PERIOD_S, axis=0))
 
@@ -219,15 +201,18 @@ def kalman(t: Array, xy: Array, sigma: float, *, density: float) -> Result:
 
 
 def smoothers() -> dict[str, Smoother]:
+    gcv = partial(spline, fit=lambda t, z, _: make_smoothing_spline(t, z))
+    fixed = partial(spline, fit=lambda t, z, sigma: make_smoothing_spline(t, z, lam=0.1 * np.sqrt(sigma / 0.3)))
     out: dict[str, Smoother] = {
         "log2sim": log2sim,
         "log2sim, noise not told": partial(log2sim, told=False),
-        "raw, differences": differences,
-        "SciPy make_smoothing_spline, GCV": partial(smoothing_spline, lam=None),
-        "SciPy make_smoothing_spline, fixed penalty": partial(smoothing_spline, lam=0.1),
-        "SciPy UnivariateSpline, s = n sigma^2": univariate_spline,
-        "SciPy savgol_filter 15/3": partial(savgol, window=15),
-        "SciPy savgol_filter 25/3": partial(savgol, window=25),
+        "raw, differences": partial(filtered, window=0),
+        "SciPy make_smoothing_spline, GCV": gcv,
+        "SciPy make_smoothing_spline, fixed penalty": fixed,
+        "SciPy UnivariateSpline, s = n sigma^2": partial(
+            spline, fit=lambda t, z, sigma: UnivariateSpline(t, z, k=5, s=len(t) * sigma**2)
+        ),
+        **{f"SciPy savgol_filter {window}/3": partial(filtered, window=window) for window in (15, 25)},
     }
     if optional("filterpy") is not None:
         out["filterpy Kalman + RTS, q = 1"] = partial(kalman, density=1.0)
@@ -252,10 +237,10 @@ def sections(*, quick: bool) -> tuple[str, str]:
     warnings.simplefilter("ignore")
     cases = {"0.1 m": (0.1, 0.0), "0.3 m": (0.3, 0.0), "0.6 m": (0.6, 0.0), "0.3 m, 3 % outliers": (0.3, 0.03)}
     found = {name: measure(*case, seeds=2 if quick else 8) for name, case in cases.items()}
-    rows = []
-    for method in found["0.3 m"]:
-        cells = [" / ".join(f"{v:.{d}f}" for v, d in zip(found[c][method], (3, 3, 2, 4))) for c in cases]
-        rows.append([method, f"{found['0.3 m'][method][4]:.2f}", *cells])
+    rows = [
+        [method, f"{found['0.3 m'][method][4]:.2f}", *(errors_text(found[c][method]) for c in cases)]
+        for method in found["0.3 m"]
+    ]
     told = (
         "Four maneuvers of 20 s at 10 Hz, a tenth of the samples missing. Root mean square errors over all 201 times, also"
         " the missing ones: position m / velocity m/s / yaw degrees / curvature 1/m, by the noise of the positions."
@@ -265,6 +250,11 @@ def sections(*, quick: bool) -> tuple[str, str]:
         f"{told}\n\n{markdown(['method', 'ms a track', *cases], rows)}\n\n{by_rate(seeds=2 if quick else 8)}\n\n"
         + by_bound(seeds=4 if quick else 30),
     )
+
+
+def errors_text(errors: Any) -> str:
+    """Errors as `errors_of` tells them, with as many digits as they need."""
+    return " / ".join(f"{v:.{d}f}" for v, d in zip(errors, (3, 3, 2, 4)))
 
 
 def by_rate(seeds: int) -> str:
@@ -282,13 +272,11 @@ def by_rate(seeds: int) -> str:
             for truth, t_s, xy_m in rate_worlds(QUEUE, rate_hz, sigma_m, seeds):
                 path = smooth_track(t_s, xy_m, sigma_m=sigma_m, at_s=truth.t_s)
                 verdicts.append(standing_verdicts(truth, path.velocity_mps))
-            cells.append(" / ".join(f"{v:.{d}f}" for v, d in zip(np.median(off, axis=0), (3, 3, 2, 4))))
+            cells.append(errors_text(np.median(off, axis=0)))
             cells += [f"{100 * share:.0f} %" for share in np.mean(verdicts, axis=0)]
         rows.append(cells)
-    head = [
-        "rate",
-        *(f"{c}, {s} m" for s in (0.1, 0.3) for c in ("errors", "standing found", "moving taken for standing")),
-    ]
+    figures = ("errors", "standing found", "moving taken for standing")
+    head = ["rate", *(f"{c}, {s} m" for s in (0.1, 0.3) for c in figures)]
     text = (
         "log2sim by rate of the observations, errors at 20 Hz between and at them. Standing: a queue that stands for 2, 3 and"
         " 5 s, rolls at 0.4 m/s and drives; shares of the time at which it stands, and at which it is faster than 0.2 m/s."
@@ -296,12 +284,12 @@ def by_rate(seeds: int) -> str:
     return f"{text}\n\n{markdown(head, rows)}"
 
 
-def white_jerk(density: float, period_s: float) -> tuple[Array, Array]:
+def white_jerk(density: float) -> tuple[Array, Array]:
     """Transition (3, 3) of position, velocity and acceleration along an axis, and covariance of what white jerk adds to them.
 
     The square root of the jerk's spectral density is in m/s^2.5.
     """
-    t = period_s
+    t = PERIOD_S
     transition = np.array([[1, t, t**2 / 2], [0, 1, t], [0, 0, 1]])
     return transition, density**2 * np.array(
         [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
@@ -313,31 +301,88 @@ START_SIGMAS, START_MPS = (10.0, 2.0, 0.5), 12.0
 DENSITIES = (0.1, 0.3, 1.0, 2.0)
 
 
-def cramer_rao_m(density: float, sigma_m: float) -> float:
-    """Least root mean square position error of any estimator of motions with white jerk that knows its density and the noise.
+def smooth_told(
+    densities: Array, yaw_rad: Array, xy: Array, valid: NDArray[np.bool_], sigma_m: float
+) -> tuple[Array, Array]:
+    """Positions (B, T, 2) of the Rauch-Tung-Striebel smoother that is told jerk densities (B, T-1, 2) along and across the way, and variances (B, T).
 
-    The posterior Cramer-Rao bound (Tichavsky, Muravchik & Nehorai, 1998), which for linear motion is the covariance of the Rauch-Tung-
-    Striebel smoother with the true parameters.
+    The variances, of both axes together, are the posterior Cramer-Rao bound (Tichavsky, Muravchik & Nehorai, 1998) of all motions
+    with such jerk about this way, which is linear. Positions (B, T, 2) count where they are `valid` (B, T).
     """
-    step, added = white_jerk(density, PERIOD_S)
-    covariance, filtered, predicted = np.diag(np.square(START_SIGMAS)), [], []
-    for k in range(FRAMES):
-        covariance = step @ covariance @ step.T + added if k else covariance
-        predicted.append(covariance)
-        gain = covariance[:, :1] / (covariance[0, 0] + sigma_m**2)
-        covariance = covariance - gain @ covariance[:1]
-        filtered.append(covariance)
-    variances = [covariance[0, 0]]
-    for k in range(FRAMES - 2, -1, -1):
-        gain = filtered[k] @ step.T @ np.linalg.inv(predicted[k + 1])
-        covariance = filtered[k] + gain @ (covariance - predicted[k + 1]) @ gain.T
-        variances.append(covariance[0, 0])
-    return float(np.sqrt(2 * np.mean(variances)))
+    step, unit = (np.kron(block, np.eye(2)) for block in white_jerk(1.0))
+    turn = np.moveaxis(np.array([[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]), 2, 0)
+    by_axis = np.einsum("tij,btj,tkj->btik", turn[1:], densities, turn[1:])
+    mean = np.concatenate([xy[:, 0], np.zeros((len(xy), 4))], axis=1)
+    mean[:, 2:4] = START_MPS * turn[0, :, 0]
+    covariance = np.tile(np.kron(np.diag(np.square(START_SIGMAS)), np.eye(2)), (len(xy), 1, 1))
+    filtered, predicted = [], []
+    for k in range(len(yaw_rad)):
+        if k:
+            mean, covariance = mean @ step.T, step @ covariance @ step.T + unit * np.tile(by_axis[:, k - 1], (1, 3, 3))
+        predicted.append((mean, covariance))
+        gain = (
+            covariance[:, :, :2]
+            @ np.linalg.inv(covariance[:, :2, :2] + sigma_m**2 * np.eye(2))
+            * valid[:, k, None, None]
+        )
+        mean = mean + np.einsum("bij,bj->bi", gain, xy[:, k] - mean[:, :2])
+        covariance = covariance - gain @ covariance[:, :2]
+        filtered.append((mean, covariance))
+    smoothed = [(mean, covariance)]
+    for (m, c), (ahead, spread) in zip(filtered[-2::-1], predicted[:0:-1], strict=True):
+        gain = c @ step.T @ np.linalg.inv(spread)
+        mean = m + np.einsum("bij,bj->bi", gain, mean - ahead)
+        covariance = c + gain @ (covariance - spread) @ np.swapaxes(gain, 1, 2)
+        smoothed.append((mean, covariance))
+    return tuple(
+        np.stack(columns[::-1], axis=1) for columns in zip(*((m[:, :2], c[:, 0, 0] + c[:, 1, 1]) for m, c in smoothed))
+    )  # type: ignore[return-value]
+
+
+def cramer_rao_m(density: float, sigma_m: float) -> float:
+    """Least root mean square position error of any estimator of motions with white jerk that knows its density and the noise."""
+    told = (
+        np.full((1, FRAMES - 1, 2), density**2),
+        np.zeros(FRAMES),
+        np.zeros((1, FRAMES, 2)),
+        np.ones((1, FRAMES), bool),
+    )
+    return float(np.sqrt(smooth_told(*told, sigma_m)[1].mean()))
+
+
+def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, float, float]:
+    """Root mean square position errors in m on a maneuver: of log2sim, and the bounds with constant jerk densities and with those that follow it.
+
+    Of the motions with white jerk those that have the maneuver's: the densities with which the smoother that is told them errs least on
+    the maneuver itself, constant along and across, or in proportion to the mean of the squared true jerk within some second.
+    """
+    cases = [world for world in worlds(sigma_m, seeds=seeds) if world.maneuver == maneuver]
+    truth = cases[0].truth
+    velocity = truth.velocity_mps
+    jerk = np.gradient(np.gradient(velocity, PERIOD_S, axis=0), PERIOD_S, axis=0)[1:]
+    cos, sin = np.cos(truth.yaw_rad[1:]), np.sin(truth.yaw_rad[1:])
+    squared = np.column_stack([jerk[:, 0] * cos + jerk[:, 1] * sin, jerk[:, 1] * cos - jerk[:, 0] * sin]) ** 2
+    nearby = np.exp(-0.5 * ((ALL_S[1:, None] - ALL_S[None, 1:]) / 0.5) ** 2)
+    following = nearby @ squared / nearby.sum(axis=1, keepdims=True)
+    each = 10.0 ** np.arange(-4, 2.5, 0.5)
+    constant = np.stack(np.meshgrid(each, each), axis=-1).reshape(-1, 1, 2) * np.ones((1, FRAMES - 1, 1))
+    families = constant, np.geomspace(0.1, 3.0, 7)[:, None, None] * following + 1e-4
+    xy, valid = np.array([w.xy_m for w in cases]), np.array([w.valid for w in cases])
+    bounds = []
+    for family in families:
+        rows, n = np.repeat(np.arange(len(cases)), len(family)), len(family)
+        found, variance = smooth_told(
+            np.tile(family, (len(cases), 1, 1)), truth.yaw_rad, xy[rows], valid[rows], sigma_m
+        )
+        off = ((found - truth.xy_m) ** 2).sum(axis=2).mean(axis=1).reshape(-1, n).mean(axis=0)
+        bounds.append(float(np.sqrt(variance.mean(axis=1).reshape(-1, n).mean(axis=0)[np.argmin(off)])))
+    ours = [log2sim(ALL_S[w.valid], w.xy_m[w.valid], sigma_m)[0] - truth.xy_m for w in cases]
+    return float(np.sqrt(np.mean(np.square(ours).sum(axis=2)))), bounds[0], bounds[1]
 
 
 def drawn_error_m(density: float, sigma_m: float, seeds: int) -> float:
     """Root mean square position error of log2sim on motions with white jerk."""
-    step, added = white_jerk(density, PERIOD_S)
+    step, added = white_jerk(density)
     factor, t_s, squares = np.linalg.cholesky(added), np.arange(FRAMES) * PERIOD_S, []
     for seed in range(seeds):
         rng = np.random.default_rng([seed, int(10 * density)])
@@ -366,7 +411,19 @@ def by_bound(seeds: int) -> str:
         f" the motion: {seeds} drawn motions of white jerk at 10 Hz, around 12 m/s; root mean square position errors in m."
     )
     head = ["jerk, m/s^2.5", *(f"{c}, {s} m" for s in (0.1, 0.3) for c in ("error", "bound", "ratio"))]
-    return f"{text}\n\n{markdown(head, rows)}"
+    drawn = f"{text}\n\n{markdown(head, rows)}"
+    rows = []
+    for maneuver in MANEUVERS:
+        rows.append([maneuver])
+        for sigma_m in (0.1, 0.3, 0.6):
+            error_m, constant_m, following_m = maneuver_bounds(maneuver, sigma_m, max(2, seeds // 4))
+            rows[-1] += [f"{error_m:.3f}", f"{error_m / constant_m:.2f} / {error_m / following_m:.2f}"]
+    text = (
+        "The maneuvers of the first table, and errors in proportion to the bounds of motions with as much white jerk along and across"
+        " the way: told how much there is in all / at every time."
+    )
+    head = ["maneuver", *(f"{c}, {s} m" for s in (0.1, 0.3, 0.6) for c in ("error", "ratios"))]
+    return f"{drawn}\n\n{text}\n\n{markdown(head, rows)}"
 
 
 def main(quick: bool = False, write: Path | None = None) -> None:
