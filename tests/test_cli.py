@@ -310,23 +310,24 @@ def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
     assert cached == {"found": 0, "kept": TICKS, "problem": None, "stages": []}
     out, cached = reconstruct(tiny_folder, tmp_path / "c.json")
     assert f"{TICKS} ticks known from earlier runs" in out
-    assert cached["stages"] == ["map-poses"]
+    assert cached["stages"] == ["map-poses", "appearance"]
     assert (tmp_path / "c.json").read_bytes() == (tmp_path / "a.json").read_bytes()
     shown = json.loads(run("cache", "--json").out)
-    size, of_ticks = (sum(p.stat().st_size for p in entries(folder) if name in p.name) for name in ("", "seeing"))
+    names = ("", "seeing", "appearance", "map-poses")
+    size, *sizes = (sum(p.stat().st_size for p in entries(folder) if name in p.name) for name in names)
     assert shown == {
         "folder": str(folder),
         "max_mb": 2048,
         "bytes": size,
-        "parts": TICKS // PART + 1,
+        "parts": TICKS // PART + 2,
         "detectors": [
-            {"name": "seeing", "parts": TICKS // PART, "bytes": of_ticks},
-            {"name": "map-poses", "parts": 1, "bytes": size - of_ticks},
+            {"name": name, "parts": parts, "bytes": of_name}
+            for name, parts, of_name in zip(names[1:], (TICKS // PART, 1, 1), sizes)
         ],
         "last_run": {"found": TICKS, "kept": 0},
     }
     assert f"{TICKS // PART} by seeing" in run("cache").out
-    assert run("cache", "--clear").out == f"{folder}: {TICKS // PART + 1} parts removed\n"
+    assert run("cache", "--clear").out == f"{folder}: {TICKS // PART + 2} parts removed\n"
     assert entries(folder) == []
 
 

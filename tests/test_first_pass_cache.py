@@ -151,7 +151,7 @@ def test_runs_with_and_without_the_cache_give_the_same(tiny_folder: Path, folder
     assert [r.report["detection_cache"] for r in (without, first, second)] == [
         None,
         {"found": 0, "kept": ticks, "problem": None, "stages": []},
-        {"found": ticks, "kept": 0, "problem": None, "stages": ["calibration", "map-poses", "map"]},
+        {"found": ticks, "kept": 0, "problem": None, "stages": ["calibration", "map-poses", "map", "appearance"]},
     ]
     for result in (first, second):
         assert result.scenario.to_dict() == without.scenario.to_dict()

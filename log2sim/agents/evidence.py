@@ -28,7 +28,7 @@ from log2sim.datatypes import (
 )
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.files.processes import map_in_processes
-from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
+from log2sim.geometry import NS_PER_S, Array, apply, inverse, median, project
 from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
 from log2sim.perception.lidar.measure import logit
 from log2sim.perception.sync import Schedule
@@ -242,7 +242,7 @@ def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded:
     if len(ticks) == 0:
         return 1.0
     # Not the time between detections: something that is detected at every fifth tick has a rate of a fifth.
-    period_s = max(float(np.median(np.diff(t_ns[first]) / NS_PER_S / ticks)), MIN_PERIOD_S)
+    period_s = max(median(np.diff(t_ns[first]) / NS_PER_S / ticks), MIN_PERIOD_S)
     recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
     hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
     return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))

@@ -220,9 +220,9 @@ def first_hits(met: Meetings, surfels: Surfels, count: int, rng: np.random.Gener
     stops[open_] = draws[met.ray[open_], met.range_m[open_].astype(np.int32) % 8] < share[open_]
     kept = np.flatnonzero(stops)
     ray, t = met.ray.take(kept), met.range_m.take(kept)
-    first = np.full(count, np.inf, np.float32)
-    np.minimum.at(first, ray, t)
-    depth = (t - first.take(ray)) * met.facing.take(kept)
+    first = np.full(count, np.inf)  # in double precision `ufunc.at` takes a twentieth of the time
+    np.minimum.at(first, ray, t.astype(np.float64))
+    depth = (t - first.take(ray).astype(np.float32)) * met.facing.take(kept)
     which = np.full(count, -1, np.int32)
     at = np.flatnonzero(depth == 0)
     which[ray[at]] = met.surfel[kept[at]]

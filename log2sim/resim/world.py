@@ -459,8 +459,8 @@ def _weighed(
             np.add.at(passed, column[met.surfel[through]], met.weight[through])
             # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
             nothing = np.isnan(shots.range_m)[met.ray]
-            nearest = np.full(len(shots.t_ns), np.inf, np.float32)
-            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing])
+            nearest = np.full(len(shots.t_ns), np.inf)
+            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing].astype(np.float64))
             first = nothing & (met.range_m == nearest[met.ray])
             np.add.at(lost, column[met.surfel[first]], met.weight[first])
     prior = PRIOR_RAYS * np.concatenate([world.background.share, *(world.agents[id].share for id in ids)])
