@@ -442,10 +442,13 @@ def synthesize(scene: Scene, *, seed: int = 0, observe: bool = True) -> tuple[Lo
         stamp, rng = int(raycast.sweep_stamps(spec, scene)[i]), np.random.default_rng([seed, 4, index, i])
         return raycast.cast_sweep(spec, moving, stamp, rng, _ground_reflectance(scene, seed))
 
+    def sweep_of(name: str, i: int) -> Sweep:
+        return cast(name, i).sweep
+
     streams = _image_streams(moving, cameras, seed)
     for spec in scene.lidar:
         stamps = raycast.sweep_stamps(spec, scene)
-        streams[spec.name] = Stream(spec.name, stamps, lambda i, name=spec.name: cast(name, i).sweep)
+        streams[spec.name] = Stream(spec.name, stamps, partial(sweep_of, spec.name))
     frames: dict[str, list[FrameVisibility]] = {}
     t_s = np.arange(0, scene.duration_s + 1e-9, TRUTH_STEP_S)
     visible = None
