@@ -34,6 +34,7 @@ from log2sim.datatypes import (
     RoadBorder,
     Scenario,
     Stream,
+    Sweep,
     Waypoints,
 )
 from log2sim.datatypes.color_names import name_of
