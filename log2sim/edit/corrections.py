@@ -73,15 +73,8 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     agent. Raises `ScenarioError` when they are of another log: its name differs, and none of them finds what it is
     about.
 
-    Parameters
-    ----------
-    corrections : mapping
-        A document of `schemas/corrections-1.json`, as `load_corrections` returns it.
-
-    Returns
-    -------
-    Corrected
-        The scenario, with the corrections that were applied and the digest of its source appended to `provenance["corrections"]`.
+    `corrections`: a document of `schemas/corrections-1.json`, as `load_corrections` returns it. Returns the scenario, with the
+    corrections that were applied and the digest of its source appended to `provenance["corrections"]`.
     """
     draft = _Draft(scenario, corrections.get("map_offset_m"))
     unmatched, applied = [], []
