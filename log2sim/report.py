@@ -21,8 +21,7 @@ from log2sim.localization.choice import GIVEN, PoseChoice
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.records import RecordSource
-from log2sim.perception.run_cache import StageCache
-from log2sim.perception.run_detectors import Detectors
+from log2sim.perception.run_detectors import Detectors, StageCache
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage, explain_missing_poses
 

@@ -116,7 +116,7 @@ def examine() -> dict[str, Any]:
         "program": sys.executable,
         "packages": packages,
         "extras": extras,
-        "models": (models | {"ssd-mobilenet-v2": state}),
+        "models": models | {"ssd-mobilenet-v2": state},
         "cache": str(cache),
         "cache_bytes": cache_bytes,
         "cores": os.cpu_count() or 1,

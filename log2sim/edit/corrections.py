@@ -15,7 +15,7 @@ import numpy as np
 
 from log2sim.datatypes import EGO, TYPICAL_SIZE_M, Agent, MapFeatures, Marking, RoadBorder, Scenario, Waypoints
 from log2sim.datatypes.agent import STANDSTILL_MPS, hermite, hermite_slope
-from log2sim.datatypes.map_features import BORDER_KINDS
+from log2sim.datatypes.scenario import BORDER_KINDS
 from log2sim.edit.edits import STEP_S, ground_at, insert_steps, new_id, resampled
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check, read_json

@@ -316,7 +316,6 @@ class Overlays:
     truth: datatypes.Scenario | None = None  # in the time and map of the scenario
     background: GroundMap | None = None  # A picture of the ground, drawn below everything
     predicted: PredictedPaths | None = None
-    title: str | None = None  # none for the name of the scenario
     span: TimeRange | None = None  # range of time that is shown; None for the whole scenario
     options: PlotOptions = NO_OPTIONS
 

@@ -73,7 +73,7 @@ def draw_base(
         parts.append("no ego")
     if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
         parts.append(f"origin {scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°")
-    layouts.write_title(layout, overlays.title or scenario.name or "scenario", " · ".join(parts))
+    layouts.write_title(layout, scenario.name or "scenario", " · ".join(parts))
     charts = None if timeline is None else draw_charts(layout, timeline, (span.start_s, span.stop_s), moving=moving)
     return layout, step_s, charts, labels
 
