@@ -298,7 +298,7 @@ def test_without_measurements_there_are_no_tracks() -> None:
     t_ns = stamps(5)
     assert track([Measurements.empty()] * 5, t_ns, **OPTIONS) == []
     assert track([], stamps(0), **OPTIONS) == []
-    assert stitch([], t_ns, max_gap_s=3.0) == []
+    assert stitch(Measurements.empty(), [], max_gap_s=3.0) == []
 
 
 def test_a_track_takes_what_is_likely_and_nothing_else() -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, RELATED_GROUPS, Measurements, Track
+from log2sim.datatypes import GROUP_OF, RELATED_GROUPS, Measurements
 from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs
 from log2sim.tracking.forward import (
     ACCELERATION_MPS2,
@@ -32,35 +33,40 @@ MIN_RIDER_SHARE = 0.25
 CATEGORY_END_MEASUREMENTS = 5
 
 
-def decide_category(m: Measurements, *, whole_boxes: bool = False) -> str:
-    """Decide the category of a track from its measurements, which are sorted by time.
+def decide_category(m: Measurements, rows: Any = slice(None), *, whole_boxes: bool = False) -> str:
+    """Decide the category of a track from its measurements, rows of `m` that are sorted by time.
 
     It is the one with most of the score of the group that has most of it; ties go to the first by name. Without `whole_boxes`, a
     pedestrian faster than people run is a cyclist whose bicycle the detector missed, and a bicycle that moves and sometimes shows
     a rider has one.
     """
-    category, groups = str(m.category[0]), np.array([GROUP_OF[c] for c in m.category.tolist()])
-    if (m.category != category).any():
-        group = _most_scored(groups, m.score)
+    shown = m.category[rows]
+    category = str(shown[0])
+    alike = shown == category
+    if not alike.all():
+        score, groups = m.score[rows], np.array([GROUP_OF[c] for c in shown.tolist()])
+        group = _most_scored(groups, score)
         voters = groups == group
         # A motorcycle, a bicycle and their riders have much the same points but look different.
-        with_image = voters & (m.camera != "")
+        with_image = voters & (m.camera[rows] != "")
         voters = with_image if group == "two_wheeler" and with_image.any() else voters
-        category = _most_scored(m.category[voters], m.score[voters])
+        category = _most_scored(shown[voters], score[voters])
     if whole_boxes:
         return category
     if category == "pedestrian":
         # The robust maximum of the speeds over a while.
-        t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+        t_ns, xy = m.t_ns[rows], m.center_m[rows, :2]
+        t = (t_ns - t_ns[0]) / NS_PER_S
         later = np.searchsorted(t, t + SPEED_BASELINE_S)
         start = np.flatnonzero(later < len(t))
         later = later[start]
-        speed_mps = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T) / (t[later] - t[start])
+        speed_mps = np.hypot(*(xy[later] - xy[start]).T) / (t[later] - t[start])
         if len(start) and float(np.quantile(speed_mps, SPEED_QUANTILE)) > MAX_PEDESTRIAN_SPEED_MPS:
             return "cyclist"
-    count = min(CATEGORY_END_MEASUREMENTS, len(m) // 2)
-    if category == "bicycle" and count and (m.category != category).mean() >= MIN_RIDER_SHARE:
-        first, last = np.median(m.center_m[:count, :2], axis=0), np.median(m.center_m[-count:, :2], axis=0)
+    count = min(CATEGORY_END_MEASUREMENTS, len(shown) // 2)
+    if category == "bicycle" and count and (shown != category).mean() >= MIN_RIDER_SHARE:
+        xy = m.center_m[rows, :2]
+        first, last = np.median(xy[:count], axis=0), np.median(xy[-count:], axis=0)
         if np.hypot(*(last - first)) > MIN_RIDDEN_M:
             return "cyclist"
     return category
@@ -101,15 +107,15 @@ class _Ends:
 
 
 def stitch(
-    tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False
-) -> list[Track]:
-    """Join tracks whose ends agree, by optimal assignment, until no pair is left.
+    m: Measurements, parts: Sequence[NDArray[np.intp]], *, max_gap_s: float, whole_boxes: bool = False
+) -> list[tuple[str, NDArray[np.intp]]]:
+    """Join tracks whose ends agree, by optimal assignment, until no pair is left; return the category and the rows of each.
 
-    Both ends are predicted to the middle of the gap and must agree there in position and velocity, within their
-    uncertainty.
+    `parts`: rows of `m` of each track, in the order of time. Both ends are predicted to the middle of the gap and must agree there in
+    position and velocity, within their uncertainty.
     """
-    current = list(tracks)
-    ends = _ends(current, whole_boxes=whole_boxes) if len(current) > 1 else None
+    current = [(decide_category(m, rows, whole_boxes=whole_boxes), rows) for rows in parts]
+    ends = _ends(m, current, whole_boxes=whole_boxes) if len(current) > 1 else None
     while ends is not None:
         i, j, cost = _joining_costs(ends, max_gap_s)
         chosen = choose_pairs(i, j, cost)
@@ -120,18 +126,13 @@ def stitch(
         for chain in chains:
             while chain[-1] in following:
                 chain.append(following[chain[-1]])
-        joined = []
-        for chain in chains:
-            if len(chain) > 1:
-                m = Measurements.join([current[k].measurements for k in chain])
-                ticks = np.concatenate([current[k].tick for k in chain])
-                joined.append(Track(decide_category(m, whole_boxes=whole_boxes), ticks, m))
+        joined = [np.concatenate([current[k][1] for k in chain]) for chain in chains if len(chain) > 1]
+        everyone = [*current, *((decide_category(m, rows, whole_boxes=whole_boxes), rows) for rows in joined)]
         # Only what was joined is filtered again.
-        number = iter(range(len(current), len(current) + len(joined)))
-        rows = [next(number) if len(c) > 1 else c[0] for c in chains]
-        everyone = [*current, *joined]
-        ends = ends.join(_ends(joined, whole_boxes=whole_boxes)).take(rows)
-        current = [everyone[k] for k in rows]
+        number = iter(range(len(current), len(everyone)))
+        kept = [next(number) if len(c) > 1 else c[0] for c in chains]
+        ends = ends.join(_ends(m, everyone[len(current) :], whole_boxes=whole_boxes)).take(kept)
+        current = [everyone[k] for k in kept]
     return current
 
 
@@ -194,32 +195,30 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     return a[possible], b[possible], cost[possible]
 
 
-def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
-    group = np.array([GROUP_OF[t.category] for t in tracks])
-    parts = [t.measurements for t in tracks]
+def _ends(m: Measurements, tracks: Sequence[tuple[str, NDArray[np.intp]]], *, whole_boxes: bool) -> _Ends:
+    group = np.array([GROUP_OF[category] for category, _ in tracks])
+    parts = [rows for _, rows in tracks]
     return _Ends(
-        np.array([m.t_ns[0] for m in parts]),
-        np.array([m.t_ns[-1] for m in parts]),
-        *_filtered([np.arange(len(m))[:END_MEASUREMENTS][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
-        *_filtered([np.arange(len(m))[-END_MEASUREMENTS:] for m in parts], parts, group, whole_boxes=whole_boxes),
+        m.t_ns[[rows[0] for rows in parts]],
+        m.t_ns[[rows[-1] for rows in parts]],
+        *_filtered(m, [rows[:END_MEASUREMENTS][::-1] for rows in parts], group, whole_boxes=whole_boxes),
+        *_filtered(m, [rows[-END_MEASUREMENTS:] for rows in parts], group, whole_boxes=whole_boxes),
         group,
     )
 
 
 def _filtered(
-    orders: Sequence[NDArray[np.intp]], parts: Sequence[Measurements], group: NDArray[np.str_], *, whole_boxes: bool
+    m: Measurements, orders: Sequence[NDArray[np.intp]], group: NDArray[np.str_], *, whole_boxes: bool
 ) -> tuple[Array, Array]:
     """Filter the rows of every track in the given orders; return the final states (A, 4) and covariances (A, 4, 4)."""
     count = np.array([len(o) for o in orders])
-    start = np.cumsum(count) - count
-    xy = np.concatenate([m.center_m[o, :2] for m, o in zip(parts, orders)])
-    t_ns = np.concatenate([m.t_ns[o] for m, o in zip(parts, orders)])
-    r = np.concatenate([m.covariance[o] for m, o in zip(parts, orders)])
-    r = measurement_noise(r, np.repeat(group, count), whole_boxes=whole_boxes)
-    axis = np.array([(m.yaw_rad if whole_boxes else m.box_yaw_rad)[o[0]] for m, o in zip(parts, orders)])
-    mean, covariance = np.zeros((len(parts), 4)), np.zeros((len(parts), 4, 4))
+    start, rows = np.cumsum(count) - count, np.concatenate(orders)
+    xy, t_ns = m.center_m[rows, :2], m.t_ns[rows]
+    r = measurement_noise(m.covariance[rows], np.repeat(group, count), whole_boxes=whole_boxes)
+    axis = (m.yaw_rad if whole_boxes else m.box_yaw_rad)[rows[start]]
+    mean, covariance = np.zeros((len(count), 4)), np.zeros((len(count), 4, 4))
     mean[:, :2], covariance[:, :2, :2] = xy[start], r[start]
-    bicycle = np.array([m.category[o[0]] == "bicycle" for m, o in zip(parts, orders)])
+    bicycle = m.category[rows[start]] == "bicycle"
     covariance[:, 2:, 2:] = first_velocity(axis, np.where(bicycle, "bicycle", group))
     noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
     for k in range(1, int(count.max())):

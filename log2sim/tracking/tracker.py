@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
 from log2sim.tracking.forward import track_forward
-from log2sim.tracking.stitch import decide_category, stitch
+from log2sim.tracking.stitch import stitch
 
 SWEEPS = ""
 """Represents the LiDARs among the cameras, as in the column `camera` of measurements."""
@@ -52,16 +52,17 @@ def track(
     after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     everything = Measurements.join(measurements)
-    first_row = np.cumsum([0, *(len(m) for m in measurements)])
-    tracks = []
-    for ticks, rows in track_forward(
-        measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps
-    ):
-        found = everything.take(first_row[ticks] + rows)
-        tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
-    tracks = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-    kept = [t for t in tracks if len(t) >= min_hits(t_ns, min_life_s)]
-    return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+    count = [len(m) for m in measurements]
+    tick, first_row = np.repeat(np.arange(len(count)), count), np.cumsum([0, *count])
+    found = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps)
+    parts = [first_row[ticks] + rows for ticks, rows in found]
+    least = min_hits(t_ns, min_life_s)
+    tracks = [
+        Track(category, tick[rows], everything.take(rows))
+        for category, rows in stitch(everything, parts, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
+        if len(rows) >= least
+    ]
+    return sorted(tracks, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
 def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:
