@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, RELATED_GROUPS, Measurements
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, RELATED_GROUPS, Measurements
 from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs
 from log2sim.tracking.forward import (
     ACCELERATION_MPS2,
@@ -83,6 +83,8 @@ MAX_POSITION_SIGMA_M = 2.0
 # A stationary object is joined across a gap of any length if its position stays within the offset.
 MAX_STATIONARY_MPS = 0.5
 MAX_STATIONARY_OFFSET_M = 1.0
+# Half the side of the square in which tracks that begin tell how many do.
+NEARBY_M = 10.0
 # Number of measurements from the end of a track that the filter uses; earlier ones no longer influence the state.
 END_MEASUREMENTS = 20
 
@@ -186,9 +188,17 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
         np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
         + other_group[near]
     )
+    # Minus twice the logarithm of how much likelier it is that this one goes on there than that another starts, of which as many start
+    # within `max_gap_s` as tracks do in a square and time around, in any direction.
+    begin_s = (ends.first_ns - ends.first_ns.min()) / NS_PER_S
+    around = np.column_stack([max_gap_s * ends.first[:, :2], NEARBY_M * begin_s])
+    begun = cKDTree(around).query_ball_point(around[other], max_gap_s * NEARBY_M, p=np.inf, return_length=True)
+    speed_mps = np.array([FIRST_SPEED_MPS[g] for g in ends.group[other].tolist()])
+    log_another = np.log(begun / (2 * (2 * NEARBY_M) ** 2) / (2 * np.pi * speed_mps**2))
+    log_odds = squared + np.log(np.linalg.det(2 * np.pi * covariance)) + 2 * log_another
     position_covariance = covariance[:, :2, :2]
     certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
-    good = certain & (squared <= CHI2_4DOF_999)
+    good = certain & (squared <= CHI2_4DOF_999) & (log_odds <= 0)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
     cost[near[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
     possible = np.isfinite(cost)
