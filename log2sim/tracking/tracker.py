@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S, Array, period_of
-from log2sim.tracking.forward import track_forward
+from log2sim.tracking.forward import MAX_MISSES, track_forward
 from log2sim.tracking.stitch import stitch
 
 SWEEPS = ""
@@ -55,7 +55,12 @@ def track(
     count = [len(m) for m in measurements]
     tick, first_row = np.repeat(np.arange(len(count)), count), np.cumsum([0, *count])
     found = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps)
-    parts = [first_row[ticks] + rows for ticks, rows in found]
+    # What the forward pass resumed after several misses is decided again by what is known on both sides.
+    parts = [
+        part
+        for ticks, rows in found
+        for part in np.split(first_row[ticks] + rows, np.flatnonzero(np.diff(ticks) > MAX_MISSES) + 1)
+    ]
     least = min_hits(t_ns, min_life_s)
     tracks = [
         Track(category, tick[rows], everything.take(rows))
