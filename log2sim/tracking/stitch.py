@@ -179,26 +179,28 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     near = np.flatnonzero(
         ~same_place & (gap_s <= max_gap_s) & (midpoint_offset_m <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
     )
+    groups = ends.group.tolist()
+    noise, speed_mps = (np.array([table[g] for g in groups]) for table in (ACCELERATION_MPS2, FIRST_SPEED_MPS))
     one, other, half_gap_s = a[near], b[near], gap_s[near] / 2
-    noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[one].tolist()])
-    forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise)
-    backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise)
+    forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise[one])
+    backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise[one])
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
     squared = (
         np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
         + other_group[near]
     )
+    agrees = np.flatnonzero(squared <= CHI2_4DOF_999)
+    near, other, squared, covariance = near[agrees], other[agrees], squared[agrees], covariance[agrees]
     # Minus twice the logarithm of how much likelier it is that this one goes on there than that another starts, of which as many start
     # within `max_gap_s` as tracks do in a square and time around, in any direction.
     begin_s = (ends.first_ns - ends.first_ns.min()) / NS_PER_S
     around = np.column_stack([max_gap_s * ends.first[:, :2], NEARBY_M * begin_s])
     begun = cKDTree(around).query_ball_point(around[other], max_gap_s * NEARBY_M, p=np.inf, return_length=True)
-    speed_mps = np.array([FIRST_SPEED_MPS[g] for g in ends.group[other].tolist()])
-    log_another = np.log(begun / (2 * (2 * NEARBY_M) ** 2) / (2 * np.pi * speed_mps**2))
+    log_another = np.log(begun / (2 * (2 * NEARBY_M) ** 2) / (2 * np.pi * speed_mps[other] ** 2))
     log_odds = squared + np.log(np.linalg.det(2 * np.pi * covariance)) + 2 * log_another
     position_covariance = covariance[:, :2, :2]
     certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
-    good = certain & (squared <= CHI2_4DOF_999) & (log_odds <= 0)
+    good = certain & (log_odds <= 0)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
     cost[near[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
     possible = np.isfinite(cost)
