@@ -21,7 +21,6 @@ from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
 LIDAR_FILE = Path(lidar.__file__).with_name("weights") / "vehicle.onnx"
-
 PAINTS = {"a": (160, 28, 30), "b": (232, 233, 232), "c": (28, 29, 31), "d": (40, 66, 140), "e": (90, 94, 98)}
 
 

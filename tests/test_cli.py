@@ -27,20 +27,8 @@ from log2sim.files.plugins import BUILT_IN
 from log2sim.logs.native.writer import write_log
 
 COMMANDS = [
-    "reconstruct",
-    "replay",
-    "edit",
-    "plot",
-    "view",
-    "detect",
-    "evaluate",
-    "bench",
-    "synth",
-    "inspect",
-    "validate",
-    "cache",
-    "config",
-]
+    "reconstruct", "replay", "edit", "plot", "view", "detect", "evaluate", "bench", "synth", "inspect", "validate", "cache", "config",
+]  # fmt: skip
 PNG = b"\x89PNG"
 
 
@@ -89,17 +77,8 @@ def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: 
     again = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", "--detector", "labels")
     assert again.code == 2
     assert "--overwrite" in again.line
-    quiet = run(
-        "reconstruct",
-        tiny_folder,
-        "--out",
-        tmp_path / "s.json",
-        "--detector",
-        "labels",
-        "--overwrite",
-        "--quiet",
-        *AGENTS_ONLY,
-    )
+    options = ("--detector", "labels", "--overwrite", "--quiet", *AGENTS_ONLY)
+    quiet = run("reconstruct", tiny_folder, "--out", tmp_path / "s.json", *options)
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
 
@@ -162,17 +141,8 @@ def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
 ) -> None:
     rows = (log_folder / "labels" / "boxes_3d.csv").read_text().splitlines()
     (tmp_path / "cars.csv").write_text("\n".join([rows[0], *(row for row in rows[1:] if ",car," in row)]))
-    ran = run(
-        "evaluate",
-        tiny_scenario,
-        "--truth",
-        log_folder,
-        "--labels",
-        tmp_path / "cars.csv",
-        "-v",
-        "-o",
-        tmp_path / "m.json",
-    )
+    labels = ("--labels", tmp_path / "cars.csv")
+    ran = run("evaluate", tiny_scenario, "--truth", log_folder, *labels, "-v", "-o", tmp_path / "m.json")
     assert ran.code == 0, ran.err
     assert max(len(line) for line in ran.out.splitlines() if str(tmp_path) not in line) <= 100
     metrics = read(tmp_path / "m.json")
@@ -180,7 +150,7 @@ def test_evaluate_takes_boxes_of_a_file_and_says_what_is_left_out(
     assert metrics["by_category"]["pedestrian"]["coverage"]["labeled"] == 0
     assert metrics["coverage"]["hit"] >= metrics["coverage"]["counted"] > 0
     truth = log_folder / "truth.json"
-    assert run("evaluate", tiny_scenario, "--truth", truth, "--labels", tmp_path / "cars.csv").code == 2
+    assert run("evaluate", tiny_scenario, "--truth", truth, *labels).code == 2
 
 
 def test_help_and_version() -> None:
@@ -316,8 +286,6 @@ def test_every_command_names_the_files_it_wrote(
 
 
 __all__ = ["folder", "made"]  # fixtures
-
-
 QUICK = ["map.lanes=false", "appearance.colors=false", "calibration.check=false", "stop_s=0.55"]
 
 
@@ -342,23 +310,24 @@ def test_a_second_run_says_what_it_knows_and_the_command_shows_it(
     assert cached == {"found": 0, "kept": TICKS, "problem": None, "stages": []}
     out, cached = reconstruct(tiny_folder, tmp_path / "c.json")
     assert f"{TICKS} ticks known from earlier runs" in out
-    assert cached["stages"] == ["map-poses"]
+    assert cached["stages"] == ["map-poses", "appearance"]
     assert (tmp_path / "c.json").read_bytes() == (tmp_path / "a.json").read_bytes()
     shown = json.loads(run("cache", "--json").out)
-    size, of_ticks = (sum(p.stat().st_size for p in entries(folder) if name in p.name) for name in ("", "seeing"))
+    names = ("", "seeing", "appearance", "map-poses")
+    size, *sizes = (sum(p.stat().st_size for p in entries(folder) if name in p.name) for name in names)
     assert shown == {
         "folder": str(folder),
         "max_mb": 2048,
         "bytes": size,
-        "parts": TICKS // PART + 1,
+        "parts": TICKS // PART + 2,
         "detectors": [
-            {"name": "seeing", "parts": TICKS // PART, "bytes": of_ticks},
-            {"name": "map-poses", "parts": 1, "bytes": size - of_ticks},
+            {"name": name, "parts": parts, "bytes": of_name}
+            for name, parts, of_name in zip(names[1:], (TICKS // PART, 1, 1), sizes)
         ],
         "last_run": {"found": TICKS, "kept": 0},
     }
     assert f"{TICKS // PART} by seeing" in run("cache").out
-    assert run("cache", "--clear").out == f"{folder}: {TICKS // PART + 1} parts removed\n"
+    assert run("cache", "--clear").out == f"{folder}: {TICKS // PART + 2} parts removed\n"
     assert entries(folder) == []
 
 

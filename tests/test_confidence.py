@@ -23,8 +23,6 @@ from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.perception.sync import Schedule
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
-
-
 DARK = [None] * len(TIMELINE.t_ns)
 
 

@@ -156,17 +156,9 @@ def test_a_changed_copy_is_checked() -> None:
 
 
 COLUMN = {"type": "array", "minItems": 1, "maxItems": 5, "items": {"type": "number", "minimum": -10, "maximum": 10}}
-
-
 FLAGS = {"type": "array", "items": {"type": "boolean"}}
-
-
 WHOLE = {"type": "array", "items": {"type": "integer", "minimum": 0}}
-
-
 ABOVE = {"type": "array", "items": {"type": "number", "exclusiveMinimum": 0}}
-
-
 NAMES = {"type": "array", "items": {"type": "string"}}
 
 

@@ -76,8 +76,6 @@ def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World
 
 
 UNIT = Unit(("pole",), (), np.zeros(3))
-
-
 ERROR = np.array([0.3, -0.35, 0.2, 0.01, -0.02, 0.025])
 
 

@@ -127,8 +127,6 @@ def test_the_order_of_boxes_does_not_matter() -> None:
 
 
 LOW_VOTES = np.array([-10.0, -10.0])
-
-
 CAR = (4.4, 1.8, 1.5)
 
 

@@ -16,7 +16,6 @@ from log2sim.geometry import Camera
 from log2sim.perception.detect.detectors import create_detector, detect_all
 
 onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
-
 WIDTH, HEIGHT = 96, 64  # of the input: 12*8 + 6*4 + 3*2 cells
 CELLS = 126
 IMAGE = np.zeros((128, 192, 3), dtype=np.uint8)  # twice the input

@@ -19,7 +19,6 @@ from log2sim.geometry import Camera, transform
 from log2sim.logs.kitti.labels import CATEGORY_OF, parse_labels
 
 pytestmark = pytest.mark.slow
-
 CAR = PROTOCOLS["kitti"].classes[0]
 NAMES = [d.name for d in DIFFICULTIES]
 

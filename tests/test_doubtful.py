@@ -35,8 +35,6 @@ from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
 THROUGH = Finding("passes_through", text="passes through parked at 1.2 s", start_s=1.0, end_s=1.5)
-
-
 NARROW = Finding("unlikely_size", text="2.8 m wide")
 
 

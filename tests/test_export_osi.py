@@ -16,7 +16,6 @@ from log2sim.export.exporters import export
 from log2sim.geometry import wrap_angle
 
 betterosi = pytest.importorskip("betterosi")
-
 SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
 
 

@@ -20,7 +20,6 @@ from log2sim.export.exporters import Options, export
 from log2sim.geometry import wrap_angle
 
 pytestmark = [pytest.mark.peers, pytest.mark.slow]
-
 SAMPLE = ROOT / "samples" / "crossing"
 PEERS = Path(os.environ.get("LOG2SIM_PEERS", ROOT / ".peers"))
 REVISIONS = ("1.0", "1.1", "1.2")

@@ -28,26 +28,12 @@ from log2sim.pipeline import reconstruct
 from log2sim.plan import make_plan, select_sensors
 
 T0_NS = 1_700_000_000_000_000_000
-
-
 STEP_NS = 100_000_000
-
-
 TICKS = 4
-
-
 SPEED_MPS = 5.0
-
-
 SOLIDS = (standing(16.0, 3.0, 30.0), standing(12.0, -4.0, 0.0, (0.7, 0.7, 1.75)))
-
-
 CATEGORIES = ("car", "pedestrian")
-
-
 EGO_T_LIDAR = transform(np.eye(3), np.array([0.0, 0.0, 1.9]))
-
-
 STAMPS = T0_NS + np.arange(TICKS) * STEP_NS
 
 
@@ -271,8 +257,6 @@ def test_a_black_picture_says_nothing_unless_something_is_found_in_it(finds):
 
 
 SIZE = (64, 48)
-
-
 K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1.0]])
 
 

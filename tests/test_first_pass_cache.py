@@ -35,8 +35,6 @@ TICKS = 6
 PART = 3
 # A part of the log, no second look at its pictures, and nothing that the cache has nothing to do with.
 QUICK = {"map": {"lanes": False}, "appearance": {"colors": False}, "calibration": {"check": False}, "stop_s": 0.55}
-
-
 STATED: dict[str, Any] = {"cache_key": "seeing 1", "before": lambda seeing: None}
 """What the detectors of a test state as their key, and what they do before they look at a picture."""
 
@@ -153,7 +151,7 @@ def test_runs_with_and_without_the_cache_give_the_same(tiny_folder: Path, folder
     assert [r.report["detection_cache"] for r in (without, first, second)] == [
         None,
         {"found": 0, "kept": ticks, "problem": None, "stages": []},
-        {"found": ticks, "kept": 0, "problem": None, "stages": ["calibration", "map-poses", "map"]},
+        {"found": ticks, "kept": 0, "problem": None, "stages": ["calibration", "map-poses", "map", "appearance"]},
     ]
     for result in (first, second):
         assert result.scenario.to_dict() == without.scenario.to_dict()

@@ -12,7 +12,6 @@ import pytest
 import run_notebook
 
 ROOT = Path(__file__).resolve().parents[1]
-
 NOTEBOOK = ROOT / "samples" / "first_steps.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
 MAX_BYTES = 500_000

@@ -251,8 +251,6 @@ def test_a_long_truck_of_which_ever_more_shows_stands_and_a_slow_one_does_not():
 
 
 SIZES = {"bus": (12.0, 2.55, 3.1), "car": (4.4, 1.85, 1.5)}
-
-
 SPAN_S = 6.0
 
 

@@ -145,8 +145,6 @@ def test_a_tunnel_keeps_the_given_poses_and_says_why() -> None:
 
 
 CAMERA = {"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [640, 400], "pitch_deg": -6.0}
-
-
 TURN = [[0.0, 0.0, 5.0], [8.0, 0.0, 5.0], [20.0, 6.0, 5.0]]
 
 

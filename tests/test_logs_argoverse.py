@@ -30,7 +30,6 @@ from log2sim.logs.argoverse import (
 from log2sim.logs.opening import open_log
 
 feather = pytest.importorskip("pyarrow.feather")
-
 SAMPLE = SHARED / "data" / "argoverse2" / "sensor" / "val" / "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 EARTH_M_PER_DEG = 111_000.0
 

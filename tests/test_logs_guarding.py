@@ -92,8 +92,6 @@ def broken_member(method: int) -> bytes:
 
 
 WIDE = "{'descr': '|V400000000', 'fortran_order': False, 'shape': (3, 3), }"
-
-
 BOMB = header("{'descr': '<f8', 'fortran_order': False, 'shape': (20000000, 64), }") + bytes(1000)
 
 

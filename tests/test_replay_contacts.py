@@ -21,8 +21,6 @@ from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
 SPACING_S = 0.05
-
-
 T_S = np.arange(0, 81) * SPACING_S
 
 

@@ -14,7 +14,6 @@ from replay_scenes import line, parked
 from log2sim.errors import MissingExtra
 
 gymnasium = pytest.importorskip("gymnasium")
-
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.json"
 
 

@@ -17,7 +17,7 @@ from log2sim.logs.opening import open_log
 from log2sim.resim.alignment import Alignment
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, all_shots, find_pattern, poses_of, rays_in_map, recorded_shots
-from log2sim.resim.sightings import sighting, with_sightings
+from log2sim.resim.sightings import Sighting, choose_sighting, sighting, thinned, with_sightings
 from log2sim.resim.simulate import Simulation, resimulate, seeing, simulate, with_sensors
 from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, smallest_axis
 from log2sim.resim.world import Seen, World, _add_sweep, body_of, build_world, ground_below
@@ -359,10 +359,12 @@ def test_what_was_not_recorded_is_told(recorded: tuple[Log, Scenario], tmp_path:
     far = replace(truth.others[0], id="far", waypoints=replace(w, x_m=w.x_m + 500))
     aside = replace(ego, waypoints=replace(ego.waypoints, y_m=ego.waypoints.y_m + 8))
     source, now = (replace(truth, agents=agents) for agents in ((*truth.agents, far), (aside, *truth.others)))
+    source = replace(source, provenance={"log": {"name": "elsewhere", "digest": "0" * 64}})
     notes = resimulate(short, source, now, tmp_path / "out")
     assert notes[0].startswith("no point of")
     assert "far" in notes[0]
-    assert "ego is 8.0 m from where anything was recorded" in notes[1]
+    assert "reconstructed from log 'elsewhere', whose data are not those" in notes[1]
+    assert "ego is 8.0 m from where anything was recorded" in notes[2]
 
 
 def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], world: World) -> None:
@@ -448,3 +450,37 @@ def test_legs_stay_apart_and_what_was_hidden_is_a_body(recorded: tuple[Log, Scen
     assert np.all(wide[np.isfinite(ended) & high] < 0.09)
     np.testing.assert_allclose(ended[np.isfinite(ended)], np.linalg.norm(at, axis=1)[np.isfinite(ended)], atol=0.02)
     assert np.isfinite(ended[(np.abs(at[:, 1]) < 0.05) & (np.abs(at[:, 2] + 0.7) < 0.1)]).all()
+
+
+def test_sightings_that_stay_are_those_that_differ() -> None:
+    """A person is seen from one place for long and from all around in a moment; the other one once."""
+    side = np.append(np.zeros(192), np.linspace(0, 2 * np.pi, 18, endpoint=False))
+    many = [
+        Sighting(
+            0.1 * k, np.array([10 * np.cos(a), 10 * np.sin(a), 0]), np.zeros((20, 3), np.float32),
+            np.ones(20, np.int8), np.ones(20, np.float32), 0.003, np.zeros(10),
+        )
+        for k, a in enumerate(side)
+    ]  # fmt: skip
+    of = {"often": list(many), "once": many[:1]}
+    size = sum(s.size for some in of.values() for s in some)
+    assert thinned(of, size) == 0
+    assert thinned(of, size // 2) == len(many) - len(of["often"]) > 0
+    assert sum(s.size for some in of.values() for s in some) <= size / 4
+    assert of["once"] == many[:1]
+    # Each side is still seen, and so is the whole time.
+    for a in side:
+        assert choose_sighting(of["often"], 0.0, 10 * np.array([np.cos(a), np.sin(a), 0])) is not None
+    assert np.diff([s.t_s for s in of["often"]]).max() < 3.0
+
+
+def test_a_surface_that_is_seen_for_long_takes_no_more_memory() -> None:
+    grid, rng, held = SurfelGrid(), np.random.default_rng(0), []
+    for _ in range(200):
+        points = rng.uniform(-1, 1, (1000, 3)) * [2, 1, 0]
+        grid.add(
+            points, np.tile(np.float32([0, 0, 1]), (1000, 1)), np.full(1000, 0.1, np.float32), np.ones(1000, np.float32)
+        )
+        held.append(len(grid._key) + sum(len(key) for key, _ in grid._pending))
+    assert max(held) < 30_000  # of 200 times 600
+    assert grid.surfels().center_m[:, 2] == pytest.approx(0)

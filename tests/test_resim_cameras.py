@@ -126,6 +126,24 @@ def test_pictures_are_refused_far_off_the_path_and_nothing_is_written(
 
 
 @pytest.mark.slow
+def test_how_much_of_pictures_is_made_up_is_told(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
+    """From 2 m aside and turned by 60 degrees, which no camera looked to."""
+    log, truth = recorded
+    short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:2]) for k, s in log.streams.items()})
+    ego = truth.ego
+    assert ego is not None
+    w = ego.waypoints
+    turned = replace(ego, waypoints=replace(w, y_m=w.y_m + 2, yaw_rad=w.yaw_rad + np.deg2rad(60)))
+    now = replace(truth, agents=(turned, *truth.others))
+    (note,) = (n for n in resimulate(short, truth, now, tmp_path / "out", sensors=[CAMERA]) if "recorded picture" in n)
+    masks = [
+        cv2.imread(str(m), cv2.IMREAD_GRAYSCALE) > 0 for m in sorted((tmp_path / "out" / MASKS / CAMERA).iterdir())
+    ]
+    assert f"shows {np.mean(masks):.0%} of what {CAMERA} sees" in note
+    assert np.mean(masks) > 0.4
+
+
+@pytest.mark.slow
 def test_a_log_with_pictures_has_a_mask_for_each(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
     log, truth = recorded
     short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:4]) for k, s in log.streams.items()})

@@ -6,20 +6,15 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from benchmarks.memory import loop_log
 from extremes import CASES, Case, outcome_of
 from plain_settings import AGENTS_ALONE
-from worlds import tiny_log
 
 from log2sim import Config, Scenario, open_log, reconstruct, replay
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.report import Result
 
 SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "crossing"
-
-
 RANGE_M = 40.0
 
 
@@ -99,18 +94,3 @@ BY_DEFAULT = [c for c in CASES if c.run_by == "tests"][::4]
 def test_extreme(case: Case) -> None:
     outcome = outcome_of(case)
     assert outcome.ok, f"{outcome.found}, error {outcome.error} {outcome.unit}; required: {case.required}"
-
-
-def test_a_looped_log_goes_on_where_it_ended() -> None:
-    log, _ = tiny_log()
-    long = loop_log(log, 3)
-    assert log.ego is not None
-    assert long.ego is not None
-    step = len(log.ego.t_ns) - 1
-    np.testing.assert_allclose(long.ego.map_T_ego[step, :3, 3], log.ego.map_T_ego[-1, :3, 3], atol=1e-9)
-    for name, stream in long.streams.items():
-        assert np.all(np.diff(stream.t_ns) > 0)
-        assert len(stream.t_ns) % 3 == 0
-        if name in log.lidars:
-            third = stream.read(2 * len(stream.t_ns) // 3)
-            assert third.stamp_ns == int(stream.t_ns[2 * len(stream.t_ns) // 3])

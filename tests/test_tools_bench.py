@@ -9,23 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks import map_repeatability, poses, projection, warnings
-from benchmarks.vehicle import SWITCH_MPS, Case, single_track_rates
+from benchmarks import poses, warnings
 from entry import commands_in, run_named
 from fits import late_fusion
-from ground_worlds import World, empty_scenario, world_log
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from mutants import MUTANTS
-from profile_ticks import Measured, Times, figures
+from profile_ticks import Measured, figures
 from worlds import tiny_toml
 
-from log2sim.config import MapConfig
 from log2sim.logs.native.writer import write_log
-from log2sim.road.builder import map_ground
-from log2sim.road.ground_map import GroundMap
 
 pytestmark = pytest.mark.slow
-
 PAPERS = ("zou2021", "two_stream")
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
@@ -77,16 +71,6 @@ def test_every_tool_can_be_imported() -> None:
         importlib.import_module(name.removesuffix(".__init__"))
 
 
-def test_log2sim_and_plain_numpy_find_the_same_points_in_boxes() -> None:
-    rng, views = np.random.default_rng(0), projection.make_views()
-    xyz, boxes = projection.make_sweep(6400, rng), [projection.make_boxes(rng) for _ in views]
-    ours = projection.with_log2sim(np.ascontiguousarray(xyz.T), views, boxes)
-    plain = projection.with_numpy(np.float64, xyz, views, boxes)
-    np.testing.assert_allclose(projection.with_opencv(xyz, views, boxes), plain, atol=1e-6)
-    np.testing.assert_array_equal(np.isnan(ours), np.isnan(plain))
-    assert np.nanmedian(np.abs(np.subtract(ours, plain))) < 1e-3
-
-
 def test_poses_are_compared_by_surfaces_and_parked_vehicles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sparse = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}
     log, _ = drive(HOUSES, BEND, duration_s=1.5, sigma_m=0.4, angle_deg=0.2, lidars=[sparse], observe=True)
@@ -97,22 +81,6 @@ def test_poses_are_compared_by_surfaces_and_parked_vehicles(tmp_path: Path, caps
     given, lidar = found["surfaces, sweeps 2 s apart, m"]
     assert lidar < given
     assert found["4 parked, median scatter, m"][0] == 0.0  # synthetic labels are exact
-
-
-def test_the_equations_of_vehicles_given_to_all_are_the_published_ones() -> None:
-    pytest.importorskip("vehiclemodels", reason="needs commonroad-vehicle-models, the published model")
-    from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
-    from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
-
-    rng, theirs = np.random.default_rng(4), parameters_vehicle2()
-    for speed in (0.0, 0.05, 0.2, 3.0, 30.0):
-        inputs = rng.uniform(-0.3, 0.3), rng.uniform(-5.0, 2.0)
-        state = [*rng.normal(0, 0.1, 3), speed, *rng.normal(0, 0.1, 3)]
-        ours = single_track_rates(Case("", 0.0, 0.0, 1.0, lambda t, exp, u=inputs: u), SWITCH_MPS)(0.0, state)
-        # Below the switch what moves is compared: their slip follows the steering by a formula of its own there.
-        count = 5 if speed < SWITCH_MPS else 7
-        expected = vehicle_dynamics_st(state, list(inputs), theirs)
-        np.testing.assert_allclose(ours[:count], expected[:count], rtol=1e-9, atol=1e-12)
 
 
 CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0
@@ -147,28 +115,11 @@ def test_pairs_of_labels_that_late_fusion_is_fitted_to_are_right(tmp_path: Path)
     assert (x[:, 3] > 0.3).all()
 
 
-def mapped(world: World) -> GroundMap:
-    log = world_log(world)
-    return map_ground(log, empty_scenario(log), MapConfig(cell_m=0.05))
-
-
-def test_an_injected_offset_of_maps_is_found() -> None:
-    # Pictures from farther left, taken as if from the middle, show everything farther right.
-    plain = mapped(World())
-    for shift_m in (0.03, 0.1):
-        offsets = map_repeatability.measure_offsets(plain, mapped(World(camera_shift_m=shift_m, seed=9)))
-        assert offsets is not None
-        assert len(offsets.xy) >= 10
-        np.testing.assert_allclose(np.median(offsets.vector_m, axis=0), [0.0, -shift_m], atol=0.006)
-        assert np.percentile(np.abs(offsets.offset_m - shift_m), 95) < 0.015
-
-
 def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread() -> None:
     def run(cpu_s: float) -> Measured:
-        stages = {"poses": Times(0.1, 0.1 * cpu_s), "detect": Times(1.0, 0.5 * cpu_s)}
-        return Measured(Times(cpu_s / 2, cpu_s), 10, stages)
+        return Measured((cpu_s / 2, cpu_s), 10, {"poses": (0.1, 0.1 * cpu_s), "detect": (1.0, 0.5 * cpu_s)})
 
-    floor = {1: [Times(0.5, 0.5)], 2: [Times(0.3, 0.6)]}
+    floor = {1: [(0.5, 0.5)], 2: [(0.3, 0.6)]}
     row, stages = figures("some", "labels", [run(1.0), run(9.0), run(2.0)], floor)
     assert row == ["some", "`labels`", "10", "10.00", "100", "200", "100", "50", "30", "4.00", "2.00"]
     assert "| detect | 100.0 | 100.0 |" in stages

@@ -1,4 +1,4 @@
-"""The tools about corrections: a person's corrections bring a scenario back to its truth, and are counted as what they were."""
+"""Corrections of a person bring a scenario back to its truth, and `tools/learn_corrections.py` counts them as what they were."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from test_edit import parked, scenario, straight
 from log2sim.datatypes import Finding, Scenario
 from log2sim.edit.corrections import correct
 from log2sim.evaluation.metrics.evaluator import evaluate
-from log2sim.geometry import wrap_angle
+from log2sim.geometry import NS_PER_S, wrap_angle
 
 
 @pytest.fixture(autouse=True)
@@ -39,38 +39,38 @@ def spoiled() -> Scenario:
     return scenario(ego, long, turned, first, last, ghost)
 
 
-def test_a_person_who_sees_the_truth_makes_every_agent_right() -> None:
-    from benchmarks.corrections import steps_of
-
-    steps = steps_of(spoiled(), truth(), None, np.random.default_rng(0))
-    made = [entry for own in steps for _, entry in own]
-    assert sorted(entry["kind"] for entry in made) == ["confirm", "delete", "flip", "merge", "size"]
-    after = correct(spoiled(), {"corrections": made})
-    assert after.unmatched == ()
-    before, found = (evaluate(s, truth()) for s in (spoiled(), after.scenario))
-    assert before["correctness"]["wrong"]["agents"] == 4
-    assert (found["correctness"]["wrong"]["share"], found["precision"], found["recall"]) == (0.0, 1.0, 1.0)
-
-
 def test_corrections_are_counted_and_confidence_is_compared_with_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import learn_corrections
-    from benchmarks.corrections import steps_of
 
-    made = [entry for own in steps_of(spoiled(), truth(), None, np.random.default_rng(0)) for _, entry in own]
-    spoiled().save(tmp_path / "s.json")
+    found = spoiled()
+
+    def place(name: str) -> dict[str, float]:
+        agent = found[name]
+        t_s = float(np.mean(agent.waypoints.t_s[[0, -1]]))
+        at = agent.at(t_s)
+        return {"t_ns": found.t0_ns + round(t_s * NS_PER_S), "x_m": float(at.x_m[0]), "y_m": float(at.y_m[0])}
+
+    made: list[dict[str, object]] = [
+        {"kind": kind, "agent": place(name)} for kind, name in (("confirm", "a"), ("flip", "b"), ("delete", "ghost"))
+    ]
+    made += [
+        {"kind": "size", "agent": place("a"), "size_m": list(truth()["a"].size_m)},
+        {"kind": "merge", "agent": place("c-1"), "other": place("c-2")},
+    ]
+    after = correct(found, {"corrections": made})
+    assert after.unmatched == ()
+    before, corrected = (evaluate(s, truth()) for s in (found, after.scenario))
+    assert before["correctness"]["wrong"]["agents"] == 4
+    assert (corrected["correctness"]["wrong"]["share"], corrected["precision"], corrected["recall"]) == (0.0, 1.0, 1.0)
+    found.save(tmp_path / "s.json")
     document = {"format": "log2sim-corrections", "version": 1, "corrections": made}
     (tmp_path / "s.corrections.json").write_text(json.dumps(document))
     learn_corrections.main([tmp_path / "s.json"])
     head, _, counts, *rest = capsys.readouterr().out.splitlines()
     kinds = dict(zip(head.split(" | ")[1:], counts.split(" | ")[1:]))
-    assert {k.strip(" |"): n.strip(" |") for k, n in kinds.items()} == {
-        "confirm": "1",
-        "size": "1",
-        "flip": "1",
-        "delete": "1",
-        "merge": "2",
-    }
+    counted = {"confirm": "1", "size": "1", "flip": "1", "delete": "1", "merge": "2"}
+    assert {k.strip(" |"): n.strip(" |") for k, n in kinds.items()} == counted
     # Five agents, all of them wrong: confidences 0.3, 1, 1, 1 and 0.45.
     assert rest[-1] == f"expected calibration error of those judged: {(0.3 + 1 + 1 + 1 + 0.45) / 5:.3f}"

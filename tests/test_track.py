@@ -32,7 +32,6 @@ from log2sim.tracking.tracker import min_hits, track
 PERIOD_S = 0.1
 START_NS = 1_700_000_000_000_000_000
 OPTIONS = {"birth_score": 0.4, "max_gap_s": 3.0, "min_life_s": 0.3}
-
 Way = Callable[[float], tuple[float, float]]
 
 

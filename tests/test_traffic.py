@@ -33,11 +33,7 @@ from log2sim.synth.traffic_picture import TrafficPainter
 from log2sim.synth.traffic_shapes import KINDS
 
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)
-
-
 EXACT = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0)
-
-
 FINE = LidarModel(elevation_deg=tuple(np.linspace(-30, 10, 41)), azimuth_step_deg=0.5, noise_m=0.0)
 
 
@@ -173,8 +169,6 @@ def test_beams_meet_the_housing_and_the_pole_and_no_other_return_moves() -> None
 
 
 CLEAR = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0, weather=Weather())
-
-
 SEE_THROUGH = (Material.GLASS, Material.LEAVES, Material.MESH)
 
 

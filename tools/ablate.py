@@ -7,9 +7,9 @@ Constants are numbers, or tables of numbers, that modules assign to names in cap
 and 1.3 times, and at the value that switches it off (0, infinite for an upper limit). Options are the other choices of settings.
 Rules are functions that are replaced by their neutral result: one that returns what it gets (`Track -> Track`) hands it on, one
 that answers yes or no always says no, and always yes, one that may find nothing (`X | None`) finds nothing, and one that returns a list an
-empty one. What no log calls is told without a run. Each variation runs in a process of its own; stages before the one that it
-belongs to are computed once. The noise of a figure in a log is what it does with other seeds and starts of the log. Rows are appended
-to the file as they come; what is there already is not measured again.
+empty one. Each variation runs in a process of its own; stages before the one that it belongs to are computed once. The noise of a figure
+in a log is what it does with other seeds and starts of the log. Rows are appended to the file as they come; what is there already is
+not measured again.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ import pkgutil
 import re
 import signal
 import sys
-import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 import typer
+from benchmarks.table import markdown
 from entry import run
 
 from log2sim import pipeline
@@ -86,7 +87,6 @@ Figures = dict[str, float | None]
 class Variation:
     """A change of the method: `value` takes the place of a constant, function or setting; settings have no module."""
 
-    kind: Literal["constants", "options", "rules"]
     stage: str
     module: str
     name: str
@@ -108,13 +108,16 @@ class Variation:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A log with its truth, what each function of the pipeline returned in it, and the code that ran."""
+    """A log with its truth, and what each function of the pipeline returned in it."""
 
     name: str
     log: Log
     truth: Scenario
     recorded: dict[str, list[Any]] = field(default_factory=dict)
-    called: set[CodeType] = field(default_factory=set)
+
+
+# Tasks hold what cannot be sent to a process; forked ones find them here.
+WORK: list[Any] = []
 
 
 def main(
@@ -122,43 +125,42 @@ def main(
     stages: str = ",".join(STAGES), idle: bool = False, detector: str = "labels",
 ) -> None:  # fmt: skip
     """Measure what is missing in the file, with `idle` only of what changes nothing beyond noise so far, and print its tables."""
+    rows = rows_of(out)
     if logs:
-        measure(logs, out, stages.split(","), Config.load(detect={"name": detector}), idle=idle)
-    print(tables(rows_of(out)))
+        config = Config.load(detect={"name": detector})
+        matter, done = matters(rows) if idle else set(), {(r["case"], r["label"], r["change"]) for r in rows}
+        chosen = [v for v in variations(config) if v.stage in stages.split(",") and v.label not in matter]
+        seeds = [Variation("localization", "", "seed", str(k), k) for k in range(SEEDS + 1)]
+        cases = [recorded(case_of(name, detector), config) for name in logs]
+        tasks = [(c, v) for v in (*seeds, *chosen) for c in cases if (c.name, v.label, v.change) not in done]
+        print(f"{len(chosen)} variations, {len(cases)} logs, {len(tasks)} runs", file=sys.stderr, flush=True)
+        WORK[:] = [config, Imports(method_modules()), tasks]
+        with (
+            multiprocessing.get_context("fork").Pool(maxtasksperchild=1) as pool,
+            out.open("a", encoding="utf-8") as file,
+        ):
+            for index, figures, outcome in pool.imap_unordered(run_one, range(len(tasks))):
+                case, v = tasks[index]
+                row = {"case": case.name, "label": v.label, "change": v.change, "stage": v.stage, "unit": v.unit}
+                rows.append({**row, "value": short(v.before), "figures": figures, "outcome": outcome})
+                print(json.dumps(rows[-1]), file=file, flush=True)
+    print(tables(rows))
 
 
-def measure(logs: Sequence[str], out: Path, stages: Sequence[str], config: Config, *, idle: bool) -> None:
-    """Append rows to the file."""
-    # Lists of the method's modules are complete before anything runs.
-    matter = matters(rows_of(out)) if idle else set()
-    chosen = [v for v in variations(config) if v.stage in stages and v.label not in matter]
-    done = {(r["case"], r["label"], r["change"]) for r in rows_of(out)}
-    cases = [recorded(case_of(name, config.detect.name), config) for name in logs]
-    called = set().union(*(case.called for case in cases))
-    graph = Imports(method_modules())
-    for v in chosen:
-        if v.module and not graph.is_called(v.module, v.name, called) and ("", v.label, v.change) not in done:
-            append(out, v, "", {}, "not called")
-            done |= {(case.name, v.label, v.change) for case in cases}
-    seeds = [Variation("options", "localization", "", "seed", str(k), k) for k in range(SEEDS + 1)]
-    tasks = [(c, v) for v in (*seeds, *chosen) for c in cases if (c.name, v.label, v.change) not in done]
-    print(f"{len(chosen)} variations, {len(cases)} logs, {len(tasks)} runs", file=sys.stderr, flush=True)
-    WORK[:] = [config, graph, tasks]
-    with multiprocessing.get_context("fork").Pool(maxtasksperchild=1) as pool:
-        for index, figures, outcome in pool.imap_unordered(run_one, range(len(tasks))):
-            case, v = tasks[index]
-            append(out, v, case.name, figures, outcome)
-
-
-# Tasks hold what cannot be sent to a process; forked ones find them here.
-WORK: list[Any] = []
+def rows_of(path: Path) -> list[dict[str, Any]]:
+    """Rows of the file."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
 def run_one(index: int) -> tuple[int, Figures, str]:
     """Run one task in a forked process; its outcome is a digest of the scenario or why there is none."""
     config, graph, tasks = WORK
     case, variation = tasks[index]
-    signal.signal(signal.SIGALRM, _out_of_time)
+
+    def out_of_time(*_: Any) -> None:
+        raise TimeoutError("runs for more than 300 s")
+
+    signal.signal(signal.SIGALRM, out_of_time)
     signal.alarm(300)
     try:
         if variation.name == "seed":
@@ -170,30 +172,13 @@ def run_one(index: int) -> tuple[int, Figures, str]:
         else:
             section, _, key = variation.name.partition(".")
             config = config.changed(**{section: {key: variation.value}})
-        figures, digest = figures_of(case, config, variation.stage)
+        return index, *figures_of(case, config, variation.stage)
     except (ConfigError, TimeoutError) as problem:
         return index, {}, f"refused: {problem}"
     except Exception as problem:
         return index, {}, f"fails: {type(problem).__name__}: {problem}"
     finally:
         signal.alarm(0)
-    return index, figures, digest
-
-
-def _out_of_time(*_: Any) -> None:
-    raise TimeoutError("runs for more than 300 s")
-
-
-def append(path: Path, v: Variation, case: str, figures: Figures, outcome: str) -> None:
-    """Append a row to the file."""
-    row = {"case": case, "label": v.label, "change": v.change, "kind": v.kind, "stage": v.stage, "unit": v.unit}
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps({**row, "value": short(v.before), "figures": figures, "outcome": outcome}) + "\n")
-
-
-def rows_of(path: Path) -> list[dict[str, Any]]:
-    """Rows of the file."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
 # Logs, and the pipeline with stages that are not computed again.
@@ -218,32 +203,21 @@ def place_of(name: str) -> tuple[Any, str]:
 
 
 def recorded(case: Case, config: Config) -> Case:
-    """The case with what the stages return in it and the code that runs."""
+    """The case with what the stages return in it."""
     usual = {name: getattr(*place_of(name)) for functions, _, _ in STAGES.values() for name in functions}
 
     def recording(name: str) -> Any:
         def call(*arguments: Any, **named: Any) -> Any:
-            out = usual[name](*arguments, **named)
-            case.recorded.setdefault(name, []).append(out)
+            case.recorded.setdefault(name, []).append(out := usual[name](*arguments, **named))
             return out
 
         return call
 
-    def profile(frame: Any, event: str, _: Any) -> None:
-        if event == "call":
-            case.called.add(frame.f_code)
-
     for name in usual:
         setattr(*place_of(name), recording(name))
-    threading.setprofile(profile)
-    sys.setprofile(profile)
-    try:
-        pipeline.reconstruct(case.log, config, cache=False)
-    finally:
-        sys.setprofile(None)
-        threading.setprofile(None)  # type: ignore[arg-type]
-        for name, function in usual.items():
-            setattr(*place_of(name), function)
+    pipeline.reconstruct(case.log, config, cache=False)
+    for name, function in usual.items():
+        setattr(*place_of(name), function)
     return case
 
 
@@ -324,7 +298,7 @@ def constants_in(module: ModuleType, stage: str) -> Iterator[Variation]:
         for name in (n for n in names_of(node) if n.isupper() and not n.startswith("_")):
             value = getattr(module, name)
             rows = list(value.values()) if isinstance(value, Mapping) else [value]
-            made = Variation("constants", stage, module.__name__, name, "", value, value)
+            made = Variation(stage, module.__name__, name, "", value, value)
             if rows and all(dataclasses.is_dataclass(r) for r in rows):
                 for column in (f.name for f in dataclasses.fields(rows[0]) if f.init):
                     numbers = [getattr(r, column) for r in rows]
@@ -392,24 +366,20 @@ def rules_in(module: ModuleType, stage: str) -> Iterator[Variation]:
     for name, function in vars(module).items():
         if not isinstance(function, FunctionType) or function.__module__ != module.__name__:
             continue
+        same_type = partial(re.sub, r"^(Sequence|Iterable|list)\[", "list[")  # all kinds of sequences are alike
         annotations = [str(p.annotation) for p in inspect.signature(function).parameters.values()]
         returns = str(function.__annotations__.get("return", ""))
-        made = Variation("rules", stage, module.__name__, name, "", None, "function")
+        made = Variation(stage, module.__name__, name, "", None, "function")
         changes: dict[str, Callable[..., Any]] = {}
         if returns == "bool":
             changes = {"off": lambda *_, **__: False, "always": lambda *_, **__: True}
         elif returns.endswith("| None"):
             changes = {"off": lambda *_, **__: None}
-        elif annotations and plain_of(annotations[0]) == plain_of(returns) and not PLAIN.match(returns):
+        elif annotations and same_type(annotations[0]) == same_type(returns) and not PLAIN.match(returns):
             changes = {"off": (lambda x, *_, **__: list(x)) if returns.startswith("list") else (lambda x, *_, **__: x)}
         elif returns.startswith("list"):
             changes = {"off": lambda *_, **__: []}
         yield from (replace(made, change=change, value=value) for change, value in changes.items())
-
-
-def plain_of(annotation: str) -> str:
-    """A type with all kinds of sequences alike."""
-    return re.sub(r"^(Sequence|Iterable|list)\[", "list[", annotation)
 
 
 def settings(config: Config) -> Iterator[Variation]:
@@ -418,13 +388,13 @@ def settings(config: Config) -> Iterator[Variation]:
     for section, model in config:
         for key, info in type(model).model_fields.items() if isinstance(model, Section) else ():
             value = getattr(model, key)
-            made = Variation("options", stages[section], "", f"{section}.{key}", "", value, value)
+            made = Variation(stages[section], "", f"{section}.{key}", "", value, value)
             if isinstance(value, bool):
                 yield replace(made, change=str(not value), value=not value)
             elif get_origin(info.annotation) is Literal:
                 yield from (replace(made, change=c, value=c) for c in get_args(info.annotation) if c != value)
             elif isinstance(value, (int, float)) and value:
-                yield from scalings(replace(made, kind="constants"))
+                yield from scalings(made)
 
 
 class Imports:
@@ -445,30 +415,6 @@ class Imports:
         for place, alias in found:
             found += [p for p in self._imported[place.__name__, alias] if p not in found]
         return found
-
-    def is_called(self, module: str, name: str, called: Iterable[CodeType]) -> bool:
-        """Whether code that ran names a constant or a function, or what is derived from it."""
-        seen, waiting = set(), [(module, name)]
-        while waiting:
-            for place, alias in self.places(*waiting.pop()):
-                if (place, alias) in seen:
-                    continue
-                seen.add((place, alias))
-                function = vars(place).get(alias)
-                if isinstance(function, FunctionType) and inspect.unwrap(function).__code__ in called:
-                    return True
-                for node in self._trees.get(place, ()):
-                    if isinstance(node, (ast.Import, ast.ImportFrom, ast.If)) or not mentions(node, alias):
-                        continue
-                    if isinstance(node, (ast.Assign, ast.AnnAssign)):
-                        waiting += [(place.__name__, n) for n in names_of(node)]
-                    elif isinstance(node, (ast.FunctionDef, ast.ClassDef)):
-                        span = range(node.lineno, (node.end_lineno or 0) + 1)
-                        if any(c.co_filename == place.__file__ and c.co_firstlineno in span for c in called):
-                            return True
-                    else:
-                        return True
-        return False
 
     def put(self, module: str, name: str, value: Any) -> None:
         """Give a name another value, in all modules that import it and in all that is derived from it."""
@@ -493,19 +439,18 @@ class Imports:
             exec(compile(ast.Module([node], []), str(place.__file__), "exec", dont_inherit=True), vars(place), scope)
             return [(place.__name__, n, scope[n]) for n in names_of(node) if n in scope and n != alias]
         for inner in ast.walk(node) if isinstance(node, (ast.FunctionDef, ast.ClassDef)) else ():
-            if isinstance(inner, ast.FunctionDef) and any(mentions(d, alias) for d in defaults_of(inner)):
+            if not isinstance(inner, ast.FunctionDef):
+                continue
+            positional, keyword = inner.args.defaults, inner.args.kw_defaults
+            defaults = [*positional, *(d for d in keyword if d is not None)]
+            if any(mentions(d, alias) for d in defaults):
                 owner = vars(place)[node.name]
                 function = inspect.unwrap(owner if inner is node else getattr(owner, inner.name))
-                new = [eval(compile(ast.Expression(d), "default", "eval"), vars(place)) for d in defaults_of(inner)]
+                new = [eval(compile(ast.Expression(d), "default", "eval"), vars(place)) for d in defaults]
                 function.__defaults__ = tuple(new[: len(inner.args.defaults)]) or None
                 keys = [a.arg for a, d in zip(inner.args.kwonlyargs, inner.args.kw_defaults) if d is not None]
                 function.__kwdefaults__ = dict(zip(keys, new[len(inner.args.defaults) :])) or None
         return []
-
-
-def defaults_of(function: ast.FunctionDef) -> list[ast.expr]:
-    """Defaults of positional arguments, then of those by name."""
-    return [*function.args.defaults, *(d for d in function.args.kw_defaults if d is not None)]
 
 
 def mentions(node: ast.AST, name: str) -> bool:
@@ -525,12 +470,9 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
             by_label[row["stage"], row["label"]][row["change"]][row["case"]] = row
     out = []
     for stage in STAGES:
-        lines, idle, uncalled = [], [], []
+        lines, idle = [], []
         for (_, label), changes in ((k, c) for k, c in by_label.items() if k[0] == stage):
             one = next(iter(next(iter(changes.values())).values()))
-            if all(set(cases) == {""} for cases in changes.values()):
-                uncalled.append(label)
-                continue
             told = {change: effect(cases, usual, noise) for change, cases in changes.items()}
             score = min(s for s, _ in told.values())
             if all(text == "same" for _, text in told.values()):
@@ -538,12 +480,12 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
                 continue
             others = "; ".join(f"{c}: {t}" for c, (_, t) in told.items() if c not in ("x0.7", "x1.3", "off"))
             cells = [told[c][1] if c in told else "" for c in ("x0.7", "x1.3", "off")]
-            lines.append((score, f"| {label} | {one['unit']} | {one['value']} | {' | '.join(cells)} | {others} |"))
-        if lines or idle or uncalled:
-            head = "| name | unit | value | -30 % | +30 % | off | other |\n| --- | --- | --- | --- | --- | --- | --- |"
-            body = "\n".join(line for _, line in sorted(lines))
-            out.append(f"## {stage}\n\n{head}\n{body}\n\nThe same scenarios without: {', '.join(idle) or 'none'}.\n\n"
-                       f"Not called in these logs: {', '.join(uncalled) or 'none'}.")  # fmt: skip
+            lines.append((score, [label, one["unit"], one["value"], *cells, others]))
+        if lines or idle:
+            table = markdown(
+                ["name", "unit", "value", "-30 %", "+30 %", "off", "other"], [row for _, row in sorted(lines)]
+            )
+            out.append(f"## {stage}\n\n{table}\n\nThe same scenarios without: {', '.join(idle) or 'none'}.")
     return "\n\n".join(out)
 
 

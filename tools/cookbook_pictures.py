@@ -77,16 +77,11 @@ def prepare(work: Path) -> Path:
         if not (work / f"{name}.json").exists():
             log2sim(f"reconstruct {log} --out {work / f'{name}.json'}")
     if not (work / "yawed").is_dir():
-        from dataclasses import replace
+        from extremes.logs import sample, yawed_lidar
 
-        from extremes.sensors import yawed
-
-        from log2sim import open_log
         from log2sim.logs.native.writer import write_log
 
-        log = open_log(ROOT / "samples/crossing")
-        turned = {name: replace(one, mount_T_lidar=yawed(one.mount_T_lidar, 3.0)) for name, one in log.lidars.items()}
-        write_log(log.changed(lidars=turned), work / "yawed")
+        write_log(yawed_lidar(sample()[0], 3.0), work / "yawed")
     return work / "sample.json"
 
 

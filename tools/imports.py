@@ -12,8 +12,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from entry import SAMPLES, run
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 MAX_PARAMETERS = 5
 Graph = Mapping[str, set[str]]
@@ -90,22 +93,13 @@ def room_graph(modules: Graph) -> dict[str, set[str]]:
 
 def cycles(graph: Graph) -> list[set[str]]:
     """Groups of two or more nodes that import each other, directly or through others."""
-    reach = {node: _reachable(graph, node) for node in graph}
-    groups: list[set[str]] = []
-    for node in graph:
-        group = {other for other in reach[node] if node in reach.get(other, set())}
-        if group - {node} and group not in groups:
-            groups.append(group)
-    return groups
-
-
-def _reachable(graph: Graph, start: str) -> set[str]:
-    found, todo = set[str](), [start]
-    while todo:
-        new = graph.get(todo.pop(), set()) - found
-        found |= new
-        todo += new
-    return found
+    names = sorted({*graph, *(t for targets in graph.values() for t in targets)})
+    at = {name: k for k, name in enumerate(names)}
+    edges = np.array([(at[n], at[t]) for n, targets in graph.items() for t in targets], dtype=int).reshape(-1, 2)
+    matrix = coo_array((np.ones(len(edges)), edges.T), shape=(len(names), len(names)))
+    group = connected_components(matrix, connection="strong")[1]
+    groups = [{names[k] for k in np.flatnonzero(group == g)} for g in range(group.max(initial=-1) + 1)]
+    return [nodes for nodes in groups if len(nodes) > 1]
 
 
 def long_signatures(package: Path) -> Iterator[str]:

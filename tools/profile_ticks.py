@@ -22,7 +22,6 @@ from benchmarks.table import markdown
 from entry import run
 
 from log2sim.config import Config
-from log2sim.datatypes import Log
 from log2sim.errors import Log2SimError
 from log2sim.files.stages import cpu_seconds
 from log2sim.logs.opening import open_log
@@ -39,12 +38,7 @@ HEAD = [
 ]  # fmt: skip
 
 
-@dataclass
-class Times:
-    """Seconds on the wall and of the processor."""
-
-    wall_s: float
-    cpu_s: float
+Times = tuple[float, float]  # seconds on the wall and of the processor
 
 
 @dataclass
@@ -60,11 +54,11 @@ def times_of(call: Callable[[], Any]) -> tuple[Any, Times]:
     """What a call returns, and its times."""
     wall, cpu = time.perf_counter(), cpu_seconds()
     out = call()
-    return out, Times(time.perf_counter() - wall, cpu_seconds() - cpu)
+    return out, (time.perf_counter() - wall, cpu_seconds() - cpu)
 
 
-def records_of(schedule: Schedule) -> list[tuple[str, int]]:
-    """The records that the ticks use, each once, in the order of the ticks."""
+def floor_of(path: Path, schedule: Schedule, threads: int) -> Times:
+    """Times to read and decode the records that the ticks use, each once and in the order of the ticks, with some threads."""
     found: dict[tuple[str, int], None] = {}
     for tick in range(len(schedule)):
         for name, index in schedule.frames.items():
@@ -72,12 +66,7 @@ def records_of(schedule: Schedule) -> list[tuple[str, int]]:
         for name, rows in schedule.sweeps.items():
             for i in rows[:, tick].tolist():
                 found[name, i] = None
-    return [(name, i) for name, i in found if i >= 0]
-
-
-def floor_of(log: Log, wanted: Sequence[tuple[str, int]], threads: int) -> Times:
-    """Times to read and decode records with some threads."""
-    records = RecordSource(log)
+    wanted, records = [record for record in found if record[1] >= 0], RecordSource(open_log(path))
 
     def read_all() -> None:
         with ThreadPoolExecutor(threads) as pool:
@@ -97,7 +86,7 @@ def measure(path: Path, config: Config) -> tuple[Measured, Schedule]:
         return run
 
     run, times = times_of(reconstruct)
-    stages = {name: Times(seconds, run.clock.cpu_seconds[name]) for name, seconds in run.clock.seconds.items()}
+    stages = {name: (seconds, run.clock.cpu_seconds[name]) for name, seconds in run.clock.seconds.items()}
     return Measured(times, len(run.schedule), stages), run.schedule
 
 
@@ -119,7 +108,7 @@ def profile(path: Path, detectors: Sequence[str], repeats: int) -> Iterator[tupl
             measured, schedule = measure(path, config)
             runs[name].append(measured)
             for count, of in floors[name].items():
-                of.append(floor_of(open_log(path), records_of(schedule), count))
+                of.append(floor_of(path, schedule, count))
     for name, of_name in runs.items():
         yield figures(log.name, name, of_name, floors[name])
 
@@ -127,15 +116,12 @@ def profile(path: Path, detectors: Sequence[str], repeats: int) -> Iterator[tupl
 def figures(log: str, detector: str, runs: list[Measured], floors: dict[int, list[Times]]) -> tuple[list[str], str]:
     """Medians of the runs and floors of one detector: a row of the table, and a table of its stages."""
 
-    def ms(times: Sequence[Times]) -> tuple[float, float]:
-        per_tick = 1e3 / runs[0].ticks
-        return per_tick * statistics.median(t.wall_s for t in times), per_tick * statistics.median(
-            t.cpu_s for t in times
-        )
+    def ms(times: Sequence[Times]) -> list[float]:
+        return [1e3 / runs[0].ticks * statistics.median(of) for of in zip(*times)]
 
     (wall, cpu), floor, most = ms([r.times for r in runs]), ms(floors[1])[1], ms(floors[max(floors)])[0]
     stages = {name: ms([r.stages[name] for r in runs]) for name in runs[0].stages}
-    detecting = stages.get("detect", (0.0, 0.0))[1]
+    detecting = stages.get("detect", [0.0, 0.0])[1]
     row = [
         log, f"`{detector}`", str(runs[0].ticks), f"{1e3 / wall:.2f}", *(f"{v:.0f}" for v in (wall, cpu, detecting, floor, most)),
         f"{cpu / floor:.2f}", f"{(cpu - detecting) / floor:.2f}",

@@ -188,19 +188,22 @@ def extend_static(
         if len(near):
             inside, through, _ = count_at(boxes.take(near), 0, cloud.origin, cloud.free)
             free[near, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
-    out = list(agents)
+    out = [*agents, *([] if ego is None else [ego])]
+    low, high = (
+        np.array([[f(a.waypoints.x_m), f(a.waypoints.y_m)] for a in out], dtype=np.float64) for f in (np.min, np.max)
+    )
+    half_m = np.array([np.hypot(*a.size_m[:2]) for a in out]) / 2
     # The surest first: what it takes, the others cannot have.
     for n in sorted(range(len(rows)), key=lambda n: -agents[rows[n]].confidence):
         agent, w = agents[rows[n]], agents[rows[n]].waypoints
-        others = [a for k, a in enumerate(out) if k != rows[n]] + ([] if ego is None else [ego])
-        (length, width), taken = agent.size_m[:2], free[n].copy()
-        place = np.array([w.x_m[0], w.y_m[0], length, width, w.yaw_rad[0]])
-        for other in others:  # in its place
-            reach_m, v = (np.hypot(length, width) + np.hypot(*other.size_m[:2])) / 2, other.waypoints
-            if np.hypot(v.x_m - place[0], v.y_m - place[1]).min() > reach_m + np.hypot(np.ptp(v.x_m), np.ptp(v.y_m)):
-                continue
-            there = AgentTable.of([other], t_s)
-            near = np.flatnonzero(np.hypot(*(there.xy_m[0] - place[:2]).T) <= reach_m)
+        taken, reach_m = free[n].copy(), half_m[rows[n]] + half_m
+        place = np.array([w.x_m[0], w.y_m[0], *agent.size_m[:2], w.yaw_rad[0]])
+        away_m = np.hypot(*np.maximum(np.maximum(low - place[:2], place[:2] - high), 0.0).T)
+        may_meet = away_m <= reach_m + np.hypot(*(high - low).T)
+        may_meet[rows[n]] = False
+        for k in np.flatnonzero(may_meet).tolist():  # in its place
+            there = AgentTable.of([out[k]], t_s)
+            near = np.flatnonzero(np.hypot(*(there.xy_m[0] - place[:2]).T) <= reach_m[k])
             shared = overlap_of_smaller(np.tile(place, (len(near), 1)), there.rectangles(0, near))
             taken[near] |= shared > TOUCHING
         before, after = np.flatnonzero(t_s < w.t_s[0]), np.flatnonzero(t_s > w.t_s[-1])
@@ -211,4 +214,4 @@ def extend_static(
             seen = np.concatenate([np.zeros(len(before), bool), w.observed, np.zeros(len(after), bool)])
             life_s = np.concatenate([t_s[before], w.t_s, t_s[after]])
             out[rows[n]] = replace(agent, waypoints=replace(w.take(index), t_s=life_s, observed=seen))
-    return out
+    return out[: len(agents)]

@@ -28,7 +28,7 @@ from log2sim.datatypes import (
 )
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.files.processes import map_in_processes
-from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
+from log2sim.geometry import NS_PER_S, Array, apply, inverse, median, project
 from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
 from log2sim.perception.lidar.measure import logit
 from log2sim.perception.sync import Schedule
@@ -93,7 +93,9 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int
         return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
     jobs = useful_jobs((c.track for c in candidates), jobs)
     most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(candidates) // jobs)) or 1
-    shares = [candidates[k : k + most] for k in range(0, len(candidates), most)]
+    # Those that are there at the same time together, so that each cloud is looked at by few shares of a long log.
+    order = sorted(range(len(candidates)), key=lambda k: float(candidates[k].agent.waypoints.t_s[0]))
+    shares = [[candidates[i] for i in order[k : k + most]] for k in range(0, len(order), most)]
 
     def columns_of(share: int) -> Table:
         rows = [_own_columns(c, recording.timeline) for c in shares[share]]
@@ -101,7 +103,7 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int
         return own | _sensed_columns(shares[share], recording)
 
     parts = list(map_in_processes(columns_of, range(len(shares)), jobs))
-    table = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    table = {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}
     table["no_image"] *= table["no_image"].min() == 0
     return table | {
         "missing": missing_nats(table["shown_ticks"], table["image_ticks"]),
@@ -242,7 +244,7 @@ def detection_rate(t_ns: NDArray[np.int64], tick: NDArray[np.int64], unrecorded:
     if len(ticks) == 0:
         return 1.0
     # Not the time between detections: something that is detected at every fifth tick has a rate of a fifth.
-    period_s = max(float(np.median(np.diff(t_ns[first]) / NS_PER_S / ticks)), MIN_PERIOD_S)
+    period_s = max(median(np.diff(t_ns[first]) / NS_PER_S / ticks), MIN_PERIOD_S)
     recorded = ticks - (np.searchsorted(unrecorded, tick[1:]) - np.searchsorted(unrecorded, tick[:-1], side="right"))
     hidden_ticks = max(HIDDEN_S / 2 / period_s, 2.0)
     return len(tick) / (1 + float(np.where(recorded * period_s > HIDDEN_S, hidden_ticks, recorded).sum()))

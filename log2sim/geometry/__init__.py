@@ -49,6 +49,7 @@ from log2sim.geometry.statistics import (
     CHI2_4DOF_999,
     choose_pairs,
     fit_windows,
+    median,
     weighted_quantile,
 )
 from log2sim.geometry.transforms import (
@@ -75,7 +76,7 @@ __all__ = [
     "CHI2_2DOF_99", "CHI2_2DOF_999", "CHI2_4DOF_999", "DISTORTION_LENGTHS", "MIN_DEPTH_M", "NS_PER_S", "SPACING_M", "Array", "Camera", "Mount", "Polyline", "PoseTrack", "ProjectedBoxes",
     "Projection", "RollingShutter", "apply", "apply_homography", "box_corners", "box_corners_bev", "box_iou", "box_lines", "choose_pairs",
     "cos_sin", "cross_slab", "crossings", "distort", "fit_windows", "fold_radius", "ground_homography", "homography_jacobian", "inverse", "line_stamps_ns", "line_time_s",
-    "nearest_index", "nearest_rotation", "outline", "overlap_of_smaller", "period_of", "points_in_box", "project",
+    "median", "nearest_index", "nearest_rotation", "outline", "overlap_of_smaller", "period_of", "points_in_box", "project",
     "project_boxes", "project_moving", "quaternion_from_rotation", "rectangle_iou", "rectangle_overlap",
     "rectangles_overlap", "rotation_from_quaternion", "rotation_from_rpy", "separating_axes", "shift_poses", "slerp",
     "transform", "undistort", "upright_box_iou", "weighted_quantile", "whole_kilometers", "wrap_angle", "yaw_of",

@@ -51,6 +51,13 @@ def choose_pairs(
     return np.sort(np.concatenate(chosen))
 
 
+def median(values: NDArray[Any]) -> float:
+    """Return the median of values (N,), N > 0, none of them NaN: `np.median`, which takes ten times as long for a few hundred."""
+    k = len(values) // 2
+    ordered = np.partition(values, k)
+    return float(ordered[k]) if len(values) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
+
+
 def weighted_quantile(values: Array, weight: Array, share: float) -> float:
     """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
     order = np.argsort(values, kind="stable")

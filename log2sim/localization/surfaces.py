@@ -17,6 +17,7 @@ from log2sim.geometry import (
     PoseTrack,
     apply,
     inverse,
+    median,
     quaternion_from_rotation,
     rotation_from_quaternion,
     transform,
@@ -217,7 +218,7 @@ def _match(first: Surfaces, second: Surfaces, second_T_first: Array, within_m: f
         return None
     (x, y, z), (u, v, w) = second.middles[index[found]].T, normals[found].T
     residual = u * (x - at[found, 0]) + v * (y - at[found, 1]) + w * (z - at[found, 2])
-    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), MIN_SCALE_M)
+    scale = max(MAD_TO_SIGMA * median(np.abs(residual)), MIN_SCALE_M)
     jacobian = np.stack([u, v, w, y * w - z * v, z * u - x * w, x * v - y * u])
     weighted = jacobian / (scale**2 + (residual / CAUCHY) ** 2)
     return _Match(len(found), scale, weighted @ jacobian.T, weighted @ residual)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, Measurements
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, median, wrap_angle
 
 SEARCH_STEP_RAD = np.deg2rad(2.0)
 # Distances to an edge below the noise of a LiDAR score alike.
@@ -222,16 +222,11 @@ def subsample(points: NDArray[Any], max_count: int) -> NDArray[Any]:
 
 def azimuth_step_rad(xy: Array) -> float:
     """Return the angle between neighboring columns of points (n, 2), seen from the origin; 0 where they are one column."""
-    middle = xy.mean(axis=0)
-    turned = rotate(xy, -float(np.arctan2(middle[1], middle[0])))
-    steps = np.diff(np.sort(np.arctan2(turned[:, 1], turned[:, 0])))
+    place = np.ascontiguousarray(xy, dtype=np.float64).view(np.complex128)[:, 0]
+    turned = place * place.mean().conjugate()
+    steps = np.diff(np.sort(np.arctan2(turned.imag, turned.real)))
     steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
-    if not len(steps):
-        return 0.0
-    # The median; `np.median` takes several times as long for a few hundred.
-    k = len(steps) // 2
-    ordered = np.partition(steps, k)
-    return float(ordered[k]) if len(steps) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
+    return median(steps) if len(steps) else 0.0
 
 
 def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:

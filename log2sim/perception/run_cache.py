@@ -31,7 +31,7 @@ MAX_NAME_CHARACTERS = 48
 # Modules of log2sim between a record and what is kept of it, relative to the package; a change of any of them makes other
 # keys, so that nobody has to remember to raise a version.
 SOURCES = ("datatypes/*.py", "files/packing.py", "geometry/*.py", "logs/**/*.py", "perception/**/*.py", "plan.py")
-STAGE_SOURCES = (*SOURCES, "localization/*.py", "road/*.py")
+STAGE_SOURCES = (*SOURCES, "localization/*.py", "road/*.py", "road/weights/*.onnx")
 
 Made = TypeVar("Made")
 

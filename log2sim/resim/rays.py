@@ -18,6 +18,7 @@ Floats = NDArray[np.float32]
 
 SAMPLED_SWEEPS = 6
 POSE_STEP_NS = 200_000  # a vehicle at 30 m/s moves 6 mm meanwhile, less than a LiDAR resolves
+MAX_STEPS = 1_000_000  # 200 s
 MIN_PATTERN_RANGE_M = 4.0  # nearer, the lasers of a spinning LiDAR are seen not to start at one point
 MAX_TILT_RAD = np.deg2rad(4.0)
 ELEVATION_BIN_RAD = np.deg2rad(0.02)
@@ -89,7 +90,13 @@ def poses_of(log: Log, name: str, t_ns: NDArray[np.int64]) -> tuple[Array, NDArr
         Of each stamp.
     valid : (K,) bool
     """
-    moments, index = np.unique(t_ns // POSE_STEP_NS, return_inverse=True)
+    step = t_ns // POSE_STEP_NS
+    first = int(step.min(initial=np.iinfo(np.int64).max))
+    if 0 <= int(step.max(initial=-1)) - first < MAX_STEPS:  # of one sweep: no need to sort
+        seen = np.bincount(step - first) > 0
+        moments, index = first + np.flatnonzero(seen), (np.cumsum(seen) - 1).take(step - first)
+    else:
+        moments, index = np.unique(step, return_inverse=True)
     map_T_sensor, valid = log.map_T_sensor(name, moments * POSE_STEP_NS + POSE_STEP_NS // 2)
     return map_T_sensor, index, valid
 
@@ -293,7 +300,8 @@ def rays_in_map(shots: Shots, map_T_sensor: Array, moment: NDArray[np.intp]) -> 
     nearest[empty] = known[np.abs(wrap_angle((empty[:, None] - known) * 2 * np.pi / TIME_BINS)).argmin(axis=1)]
     poses = local[np.rint(of_moment[nearest]).astype(np.intp)]
     origin = local[moment, :3, 3]
-    spread = np.linalg.norm(origin - poses[bins, :3, 3], axis=1)
+    some = slice(None, None, max(1, len(bins) // 4096))
+    spread = np.linalg.norm(origin[some] - poses[bins[some], :3, 3], axis=1)
     return Rays(
         azimuth, elevation, origin.astype(np.float32), direction, shots.t_ns, shift, inverse(poses),
         begin + np.rint(mean[nearest]).astype(np.int64), float(np.quantile(spread, 0.99)),

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.resim.caster import Meetings
+from log2sim.resim.caster import Meetings, met_of
 from log2sim.resim.rays import Floats, Rays, bin_of
 from log2sim.resim.surfels import Surfels, joined
 
@@ -56,6 +56,11 @@ class Sighting:
     intensity: Floats
     step_rad: float
     line_rad: Array
+
+    @property
+    def size(self) -> int:
+        """Return the bytes that it takes."""
+        return self.point_m.nbytes + self.state.nbytes + self.intensity.nbytes + self.line_rad.nbytes
 
     def angles(self, offset: Array | Floats) -> Array:
         """Return azimuth and elevation (N, 2) of vectors (N, 3) from a sensor, in steps between rays."""
@@ -130,6 +135,38 @@ def choose_sighting(sightings: Sequence[Sighting], t_s: float, view_m: Array) ->
     return min(alike, key=lambda s: abs(s.t_s - t_s), default=None)
 
 
+def thinned(of: Mapping[str, list[Sighting]], most_bytes: int) -> int:
+    """Halve the sightings of those who have most, in place, until all of them take half of so many bytes; return how many go.
+
+    Nothing goes while they take less. Of each, those stay that differ most from each other: by side, by distance, and, as
+    limbs move, by time, of which the whole life counts as much as a side that is no longer alike (farthest-point sampling,
+    Gonzalez 1985). Its first and its only sighting stay.
+    """
+    size = {id: sum(s.size for s in some) for id, some in of.items()}
+    gone, left = 0, sum(size.values())
+    while left > most_bytes / 2 and (gone or left > most_bytes):
+        id = max(size, key=lambda i: size[i] if len(of[i]) > 1 else 0)
+        some = of[id]
+        if len(some) < 2:
+            break
+        away = np.linalg.norm([s.view_m for s in some], axis=1)
+        t_s = np.array([s.t_s for s in some])
+        side = np.array([s.view_m for s in some]) / away[:, None] / np.sqrt(2 - 2 * MIN_TURN_COS)
+        far = np.log(away) / np.log(MAX_FARTHER)
+        place = np.column_stack([side, far, (t_s - t_s[0]) / max(float(np.ptp(t_s)), 1e-9)])
+        kept, apart = [0], np.linalg.norm(place - place[0], axis=1)
+        while len(kept) < (len(some) + 1) // 2:
+            kept.append(int(apart.argmax()))
+            apart = np.minimum(apart, np.linalg.norm(place - place[kept[-1]], axis=1))
+            apart[kept] = -1  # of two that are alike in all either may stay, once
+        gone += len(some) - len(kept)
+        some[:] = [some[k] for k in sorted(kept)]
+        left -= size[id]
+        size[id] = sum(s.size for s in some)
+        left += size[id]
+    return gone
+
+
 def with_sightings(
     met: Meetings, surfels: Surfels, *, first: NDArray[np.int64], ids: Sequence[str], rays: Rays, scenario: Scenario,
     sightings: Mapping[str, Sequence[Sighting]],
@@ -140,10 +177,11 @@ def with_sightings(
     sighting gets a disc of its own, after the others.
     """
     bounds = np.searchsorted(met.surfel, first)
-    keep = np.ones(len(met.ray), dtype=bool)
-    parts, discs, total = [], [], len(surfels)
+    parts, discs, total = [met.take(slice(bounds[1]))], [], len(surfels)
     for k, id in enumerate(ids):
         some = sightings.get(id, ())
+        body = met.take(slice(bounds[k + 1], bounds[k + 2]))
+        parts.append(body)
         if not some:
             continue
         agent = scenario[id]
@@ -172,8 +210,7 @@ def with_sightings(
         state = np.append(chosen.state, np.int8(PASSED))[near]
         hidden = np.zeros(len(rays.direction), dtype=bool)
         hidden[ray[state == HIDDEN]] = True
-        own = slice(bounds[k + 1], bounds[k + 2])
-        keep[own] = hidden[met.ray[own]]
+        parts[-1] = body.take(hidden[body.ray])
         stops = (state == ENDED) | (state == LOST)
         ray, near = ray[stops], near[stops]
         one = np.ones(len(ray), np.float32)
@@ -184,8 +221,4 @@ def with_sightings(
         discs.append(
             Surfels(chosen.point_m[near], np.zeros((len(ray), 3), np.float32), one, chosen.intensity[near], one, back)
         )
-    if not parts:
-        return met, surfels
-    kept = np.flatnonzero(keep)
-    columns = {k: [getattr(met, k)[kept], *(getattr(p, k) for p in parts)] for k in Meetings.__dataclass_fields__}
-    return Meetings(**{k: np.concatenate(v) for k, v in columns.items()}), joined([surfels, *discs])
+    return met_of(parts), joined([surfels, *discs])

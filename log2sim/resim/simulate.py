@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,8 @@ SAME_PATH_M, SAME_YAW_RAD = 0.02, np.deg2rad(0.2)
 MAX_OFF_PATH_M = 6.0
 # At 3 m beside it pictures of `samples/crossing.toml` have lost 8 dB of those at half a meter, and 13 % of them is made up.
 MAX_PICTURES_OFF_M = 3.0
+# What no recorded picture shows is then as much as at 3 m beside the path.
+TOLD_SHARE = 0.13
 MASKS = (
     "masks"  # folder of a log: by camera a mask for each picture, white where no recorded picture shows what is there
 )
@@ -341,7 +343,12 @@ def resimulate(
         refuse_far(off_path_m(log, ego_poses(log, scenario)))
     simulation = simulate(log, source, scenario, sensors=sensors, cameras=cameras, seed=seed, progress=progress)
     off_m, when_s = off_path_m(log, simulation.driven.ego)
-    notes = list(simulation.world.notes)
+    notes, of = list(simulation.world.notes), source.provenance.get("log")
+    if isinstance(of, Mapping) and of.get("digest", log.digest) != log.digest:
+        notes.append(
+            f"scenario '{source.name}' was reconstructed from log '{of.get('name')}', whose data are not those of '{log.name}': "
+            "where poses or agents differ, surfaces are wrong"
+        )
     if off_m > MAX_OFF_PATH_M:
         notes.append(
             f"at {when_s:.1f} s the ego is {off_m:.1f} m from where anything was recorded; sweeps lack what was hidden"
@@ -354,6 +361,16 @@ def resimulate(
         for file, data in masks.items():
             (folder / MASKS / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / MASKS / file).write_bytes(data)
+    shares: dict[str, list[float]] = {}
+    for file, data in masks.items():
+        unknown = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE))
+        shares.setdefault(file.rsplit("/", 1)[0], []).append(float(np.mean(unknown > 0)))
+    for name, made_up in shares.items():
+        if max(made_up) > TOLD_SHARE:
+            notes.append(
+                f"no recorded picture shows {np.mean(made_up):.0%} of what {name} sees, of one picture {max(made_up):.0%}: "
+                f"it is drawn or filled in, see {MASKS}/{name}"
+            )
     then(simulation)
     return tuple(notes)
 

@@ -172,7 +172,7 @@ class SurfelGrid:
     The columns of a cell are sums: of points, center, normal, planes, radius, intensities, and how many of these there are.
     """
 
-    PENDING_ROWS = 2_000_000
+    PENDING_ROWS = 20_000
 
     def __init__(self) -> None:
         self._key = np.zeros(0, np.int64)
@@ -188,7 +188,8 @@ class SurfelGrid:
             [one, points, normal, normal.any(axis=1), radius_m, known_intensity, known.astype(float)]
         )
         self._pending.append(_summed(_keys(points, level), sums))
-        if sum(len(k) for k, _ in self._pending) > self.PENDING_ROWS:
+        # As many as there are cells: each is sorted a few times, and an agent seen for long takes no more than its surface.
+        if sum(len(k) for k, _ in self._pending) > max(self.PENDING_ROWS, len(self._key)):
             self._join()
 
     def _join(self) -> None:

@@ -34,7 +34,7 @@ from log2sim.resim.rays import (
     rays_in_map,
     recorded_shots,
 )
-from log2sim.resim.sightings import Sighting, frame_at, is_non_rigid, sighting
+from log2sim.resim.sightings import Sighting, frame_at, is_non_rigid, sighting, thinned
 from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
 from log2sim.synth import shapes
 
@@ -49,6 +49,8 @@ MIN_SHARE = 0.2
 SAME_PLACE_M = 0.5
 # Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
 AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
+MOST_SIGHTINGS_BYTES = 256 << 20  # 64,000 sightings of 4 kB: ten minutes with ten people in sight all the time
+SIGHTINGS_EVERY = 50  # sweeps, after which they are counted
 PRIOR_RAYS, PRIOR_UNSEEN = 2.0, 0.15  # that end on a disc before any is counted; share of them for one that nobody saw
 BODY_DISC_M = 0.08  # radius of the discs of a body that nobody saw
 
@@ -209,10 +211,11 @@ def build_world(
     scale, top, whole = np.nan, 0.0, False
     background = SurfelGrid()
     seen = {agent.id: Seen(SurfelGrid(), Alignment(agent), []) for agent in scenario.others}
+    sightings = {id: s.sightings for id, s in seen.items()}
     refined = refine_poses(log)
     surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
-    done, total = 0, sum(len(log.streams[name].t_ns) for name in lidars)
+    done, gone, total = 0, 0, sum(len(log.streams[name].t_ns) for name in lidars)
     for name in lidars:
         pattern, noise, far = find_pattern(log, name), [], 1.0
         for i in range(len(log.streams[name].t_ns)):
@@ -230,6 +233,8 @@ def build_world(
             far = max(far, float(shots.range_m.max()))
             noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, seen))
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
+            if done % SIGHTINGS_EVERY == 0:
+                gone += thinned(sightings, MOST_SIGHTINGS_BYTES)
         if name in models:
             level = float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
             models[name] = replace(models[name], noise_m=level, max_range_m=far)
@@ -240,12 +245,15 @@ def build_world(
     surfaces = {id: s.alignment.centered(s.surfaces.surfels()) for id, s in seen.items()}
     agents = {agent.id: completed(agent, surfaces[agent.id]) for agent in scenario.others}
     unseen = [id for id, surfels in surfaces.items() if not len(surfels)]
-    notes = (f"no point of {', '.join(unseen)} was recorded: each is a body of its category",) if unseen else ()
+    notes = [f"no point of {', '.join(unseen)} was recorded: each is a body of its category"] if unseen else []
+    if gone:
+        kept = sum(len(some) for some in sightings.values())
+        notes.append(f"of {gone + kept} sightings of people and riders {kept} are kept, by side, distance and time")
     standing = background.surfels()
     standing = joined([standing, *(ground_below(a, standing, shift) for a in scenario.others if a.static)])
     given = log.ego if refined is not None else None
-    sightings, alignments = {id: s.sightings for id, s in seen.items()}, {id: s.alignment for id, s in seen.items()}
-    world = World(shift, given, refined, standing, agents, sightings, alignments, models, notes)
+    alignments = {id: s.alignment for id, s in seen.items()}
+    world = World(shift, given, refined, standing, agents, sightings, alignments, models, tuple(notes))
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
     for _ in range(2):
@@ -459,8 +467,8 @@ def _weighed(
             np.add.at(passed, column[met.surfel[through]], met.weight[through])
             # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
             nothing = np.isnan(shots.range_m)[met.ray]
-            nearest = np.full(len(shots.t_ns), np.inf, np.float32)
-            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing])
+            nearest = np.full(len(shots.t_ns), np.inf)
+            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing].astype(np.float64))
             first = nothing & (met.range_m == nearest[met.ray])
             np.add.at(lost, column[met.surfel[first]], met.weight[first])
     prior = PRIOR_RAYS * np.concatenate([world.background.share, *(world.agents[id].share for id in ids)])

@@ -60,7 +60,7 @@ def describe(
             builder = GroundMapBuilder(drawn, scenario, settings, records)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
-    look = partial(_appearance, scenario, log, plan, observations, records)
+    look = partial(_appearance, scenario, log, plan, observations, records, earlier)
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         if builder is not None:
             draw, of = partial(_draw, builder, records, clock, progress), [*builder.inputs(), drawn.ego]
@@ -72,7 +72,9 @@ def describe(
             with clock.stage("lanes", progress):
                 lanes, notes = infer_lanes(features.markings, features.borders, scenario)
                 features = replace(features, lanes=lanes, notes=(*features.notes, *notes))
-        colors, uncolored, signals, seen_lights = appearance()
+        (colors, uncolored, signals, seen_lights), known = appearance()
+        if earlier is not None:  # which the process in the background did not tell
+            earlier.found = [*dict.fromkeys([*earlier.found, *known])]
     agents = tuple(replace(agent, color=colors.get(agent.id, agent.color)) for agent in scenario.agents)
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
     colored = sum(agent.color is not None for agent in described.others)
@@ -109,13 +111,27 @@ def _draw(
 
 
 def _appearance(
-    scenario: Scenario, log: Log, plan: Plan, observations: Observations, records: RecordSource
-) -> tuple[dict[str, dict[str, Any]], tuple[str, ...], tuple[Signal, ...], str]:
-    """Return the colors of vehicles by id and which have none, and the traffic lights and how many were seen."""
-    colors, uncolored = dict[str, dict[str, Any]](), tuple[str, ...]()
-    if plan.keeps(Stage.COLORS):
-        sampler = ColorSampler(log, scenario)
-        give_pictures(records, [sampler])
-        colors, uncolored = sampler.colors(), sampler.notes()
-    signals = find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
-    return colors, uncolored, *signals
+    scenario: Scenario,
+    log: Log,
+    plan: Plan,
+    observations: Observations,
+    records: RecordSource,
+    earlier: StageCache | None,
+) -> tuple[tuple[dict[str, dict[str, Any]], tuple[str, ...], tuple[Signal, ...], str], list[str]]:
+    """Return the colors of vehicles by id and which have none, the traffic lights and how many were seen; and what stages were known."""
+
+    def look() -> tuple[dict[str, dict[str, Any]], tuple[str, ...], tuple[Signal, ...], str]:
+        colors, uncolored = dict[str, dict[str, Any]](), tuple[str, ...]()
+        if plan.keeps(Stage.COLORS):
+            sampler = ColorSampler(log, scenario)
+            give_pictures(records, [sampler])
+            colors, uncolored = sampler.colors(), sampler.notes()
+        signals = find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
+        return colors, uncolored, *signals
+
+    keeps = [plan.keeps(stage) for stage in (Stage.COLORS, Stage.SIGNALS)]
+    if earlier is None or not any(keeps):
+        return look(), []
+    of = [keeps, scenario.t0_ns, scenario.duration_s, scenario.agents, observations.lights]
+    of.append([records.watch.known(name) for name in log.cameras])
+    return earlier.known("appearance", log, of, (Signal,), look), earlier.found

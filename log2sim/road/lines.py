@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
 
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.paint import Pieces, log_odds_of_line
 from log2sim.road.ridges import Mask
@@ -38,7 +38,7 @@ class Chain:
 
     def corners(self, pieces: Pieces) -> Array:
         """List the ends of all pieces in order, (2 K, 2), m."""
-        ends = pieces.ends(self.members)
+        ends = pieces.ends[self.members]
         ends[self.flipped] = ends[self.flipped][:, ::-1]
         return ends.reshape(-1, 2)
 
@@ -91,18 +91,24 @@ def _beside(pieces: Pieces, end: int, inner: int) -> bool:
 def dashed_chains(pieces: Pieces, chains: list[Chain]) -> list[Chain]:
     """Join chains across the gaps of dashed lines, short gaps first."""
     # Directions become surer the longer the chains, so the longest gaps are tried again.
+    known = dict[Chain, list[list[float]]]()
     for gap_m in (4.0, MAX_GAP_M, MAX_GAP_M):
-        chains = _join(pieces, chains, gap_m, MIN_RADIUS_OF_GAPS_M, LONG_BASE_M)
+        chains = _join(pieces, chains, gap_m, MIN_RADIUS_OF_GAPS_M, LONG_BASE_M, known)
     return chains
 
 
 def _join(
-    pieces: Pieces, chains: list[Chain], max_gap_m: float, min_radius_m: float, base_m: float = BASE_M
+    pieces: Pieces,
+    chains: list[Chain],
+    max_gap_m: float,
+    min_radius_m: float,
+    base_m: float = BASE_M,
+    known: dict[Chain, list[list[float]]] | None = None,
 ) -> list[Chain]:
-    """Join ends that continue each other best, each end with one other at most."""
+    """Join ends that continue each other best, each end with one other at most; `known` keeps the ends of chains that stay."""
     if len(chains) < 2:
         return chains
-    ends = _ends_of(pieces, chains, base_m)
+    ends = _ends_of(pieces, chains, base_m, {} if known is None else known)
     first, second, cost = _candidates(ends, max_gap_m, min_radius_m)
     partner: dict[int, int] = {}
     joined = DisjointSet(range(len(chains)))
@@ -129,23 +135,24 @@ def _join(
     return out
 
 
-def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float) -> _Ends:
+def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float, known: dict[Chain, list[list[float]]]) -> _Ends:
     contrasts = np.where(np.isfinite(pieces.color), pieces.color, np.nan_to_num(pieces.reflected))
     if all(len(chain.members) == 1 for chain in chains):
         return _ends_of_single(pieces, chains, contrasts)
-    rows = []
     for chain in chains:
-        corners = chain.corners(pieces)
+        if chain in known:
+            continue
+        corners, rows = chain.corners(pieces), list[list[float]]()
         length = float(np.linalg.norm(corners[-1] - corners[0]))
-        width = float(np.median(pieces.width_m[chain.members]))
-        contrast = float(np.median(contrasts[chain.members]))
+        width, contrast = median(pieces.width_m[chain.members]), median(contrasts[chain.members])
         for ordered in (corners[::-1], corners):
             tip = ordered[-1]
             near = ordered[np.linalg.norm(ordered - tip, axis=1) <= base_m]
             angle, base = _direction(near if len(near) > 1 else ordered[-2:])
             sigma = POSITION_SIGMA_M * 2 / max(base, 0.3)
             rows.append([*tip, angle, sigma, width, contrast, length])
-    t = np.array(rows)
+        known[chain] = rows
+    t = np.array([row for chain in chains for row in known[chain]])
     return _Ends(t[:, :2], t[:, 2], t[:, 3], t[:, 4], t[:, 5], t[:, 6])
 
 
@@ -153,7 +160,7 @@ def _ends_of_single(pieces: Pieces, chains: list[Chain], contrasts: Array) -> _E
     """Return the ends of chains of one piece each, all at once."""
     member = np.array([chain.members[0] for chain in chains], dtype=np.int64)
     flipped = np.array([chain.flipped[0] for chain in chains], dtype=bool)
-    ends = pieces.ends(member)
+    ends = pieces.ends[member]
     ends[flipped] = ends[flipped][:, ::-1]
     chord = ends[:, 1] - ends[:, 0]
     length = np.hypot(chord[:, 0], chord[:, 1])
@@ -273,7 +280,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             continue
         own = pieces.take(chain.members)
         curve = fit_curve(corners)
-        traced, s = trace(ground, curve, float(np.median(own.width_m))), curve.s
+        traced, s = trace(ground, curve, median(own.width_m)), curve.s
         nearest = s[cKDTree(curve.xy).query(own.xy)[1]]
         for stretch in stretches_of(traced.strokes()):
             begin, end = stretch.begin_m, min(stretch.end_m, float(s[-1]))
@@ -282,8 +289,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
                 continue
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
             odds = log_odds_of_line(member, traced.painted_m(begin, end), dashes=stretch.dashes)
-            width_m = float(np.median(member.width_m))
-            out.append(PaintedLine(xy, stretch.kind, width_m, member, stretch.dashes, odds))
+            out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
     return _in_context(drop_repeats(out))
 
 

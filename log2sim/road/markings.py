@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Marking, RoadBorder
-from log2sim.geometry import Array
+from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.lines import Chain, PaintedLine, color_of, dashed_chains, find_lines, sources_of, touching_chains
 from log2sim.road.paint import Pieces, at_height, find_pieces, fit_lines, log_odds_of_line, no_pieces, probability
@@ -104,7 +104,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
 
 
 def _bar_of(ground: GroundMap, pieces: Pieces, chain: Chain) -> _Bar | None:
-    width = float(np.median(pieces.width_m[chain.members]))
+    width = median(pieces.width_m[chain.members])
     corners = chain.corners(pieces)
     chord = corners[-1] - corners[0]
     length = float(np.linalg.norm(chord))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.ridges import Layer, RidgePoints, Samples, sample
 
@@ -76,11 +77,11 @@ class Pieces:
         """Choose pieces by a mask or by indices."""
         return Pieces(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
-    def ends(self, chosen: NDArray[np.int64]) -> Array:
-        """Return both ends (K, 2, 2), m, of some pieces (K,)."""
-        angle, xy = self.direction[chosen], self.xy[chosen]
-        half = np.stack([np.cos(angle), np.sin(angle)], 1) * self.length_m[chosen, None] / 2
-        return np.stack([xy - half, xy + half], 1)
+    @cached_property
+    def ends(self) -> Array:
+        """Both ends (N, 2, 2), m."""
+        half = np.stack([np.cos(self.direction), np.sin(self.direction)], 1) * self.length_m[:, None] / 2
+        return np.stack([self.xy - half, self.xy + half], 1)
 
 
 def no_pieces(count: int, **known: Array) -> Pieces:
@@ -233,10 +234,10 @@ def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bo
     by_camera = bool(np.isfinite(pieces.color).any())
     if by_camera:
         odds += _by_shape(pieces, alone=alone)
-    width = float(np.median(pieces.width_m))
+    width = median(pieces.width_m)
     by_width = 0.0 if MIN_WIDTH_M <= width <= MAX_WIDTH_M else WIDTH_UNUSUAL
     if len(pieces) >= 3:
-        varies = float(np.median(np.abs(pieces.width_m - width))) / width
+        varies = median(np.abs(pieces.width_m - width)) / width
         by_width += WIDTH_VARIES * float(np.clip((varies - 0.2) / 0.3, 0, 1))
     odds += by_width
     if alone and dashes > 1 and width > MAX_DASH_WIDTH_M:
@@ -258,7 +259,7 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
     if len(bright) and alone:
         share = float(np.mean(bright > MIN_OUTSHINING * contrast[np.isfinite(pieces.outshines)]))
         odds += NOT_BRIGHTEST * float(np.clip((0.5 - share) / 0.4, 0, 1))
-    width, edge = float(np.median(pieces.width_m)), _median_known(pieces.edge_m)
+    width, edge = median(pieces.width_m), _median_known(pieces.edge_m)
     if width > FADING_WIDTH_M and edge > max(FADING_FROM_M, FADING_SHARE * width):
         odds += FADING
     typical = _median_known(pieces.color)
@@ -271,8 +272,8 @@ def by_lidar(pieces: Pieces) -> float:
     if np.count_nonzero(known) < MIN_REFLECTING:
         return 0.0
     values = pieces.reflected[known]
-    mean = float(np.median(values))
-    error = float(np.median(pieces.reflected_sigma[known]) / np.sqrt(len(values)))
+    mean = median(values)
+    error = float(median(pieces.reflected_sigma[known]) / np.sqrt(len(values)))
 
     def log_density(of: tuple[float, float]) -> float:
         sigma = float(np.hypot(of[1], error))

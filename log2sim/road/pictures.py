@@ -193,11 +193,11 @@ def find_hidden(view: View, warp: Warp, hiding: Array) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore"):
         column, row = np.floor(uv / DEPTH_SHRINK).T
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    nearest = np.full(height * width, NOTHING_M, np.float32)
-    cell = (row[inside] * width + column[inside]).astype(np.int64)
-    np.minimum.at(nearest, cell, depth[inside].astype(np.float32))
+    nearest = np.full(height * width, NOTHING_M)  # in double precision `ufunc.at` takes a twentieth of the time
+    np.minimum.at(nearest, (row[inside] * width + column[inside]).astype(np.int64), depth[inside])
     # Between two rings of points there is the same object.
-    image = np.asarray(cv2.erode(nearest.reshape(height, width), np.ones((3, 1), np.uint8)), np.float32)
+    near = nearest.reshape(height, width).astype(np.float32)
+    image = np.asarray(cv2.erode(near, np.ones((3, 1), np.uint8)), np.float32)
     shown = sample_nearest(image, warp, DEPTH_SHRINK, np.float32(NOTHING_M))
     return np.asarray(warp.depth_m > shown * (1 + MIN_HIDDEN_BY) + MIN_HIDDEN_BY_M)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.ridges import sample
 
@@ -227,7 +227,7 @@ def stretches_of(strokes: Array) -> list[Stretch]:
     # Dashed lines become solid before a junction: much longer strokes begin or end there.
     length = strokes[:, 1] - strokes[:, 0]
     short = length[length <= MAX_DASH_M]
-    dash = float(np.median(short)) if len(short) else 0.0
+    dash = median(short) if len(short) else 0.0
     long = (length > SOLID_DASHES * dash) & (length > LONG_M) if len(short) > 1 else length > MAX_DASH_M
     for part in np.split(strokes, np.flatnonzero(np.diff(long)) + 1) if len(strokes) else ():
         if part[0, 1] - part[0, 0] <= MAX_DASH_M and is_dashed(part):
@@ -235,7 +235,7 @@ def stretches_of(strokes: Array) -> list[Stretch]:
             solid = []
             # Where several dashes are missing in a row, the line ends before a junction and begins again behind it.
             gaps = part[1:, 0] - part[:-1, 1]
-            usual = float(np.median(gaps) if len(gaps) > FEW_GAPS else gaps.min(initial=np.inf))
+            usual = median(gaps) if len(gaps) > FEW_GAPS else float(gaps.min(initial=np.inf))
             pieces = np.split(part, np.flatnonzero(gaps > max(JUNCTION_M, LONG_GAPS * usual)) + 1)
             out += [Stretch(float(p[0, 0]), float(p[-1, 1]), "dashed", len(p)) for p in pieces]
         else:

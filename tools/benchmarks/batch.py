@@ -15,13 +15,13 @@ import os
 import resource
 import shutil
 import time
-from collections.abc import Sequence
+from collections import Counter
 from pathlib import Path
 
 from benchmarks.tag_worlds import traffic
 from log2sim.batch import plan_batch, run_batch
 from log2sim.batch.discovery import SCENARIO
-from log2sim.batch.folder import SCENARIO_FILE, Row, sum_up
+from log2sim.batch.folder import SCENARIO_FILE, sum_up
 from log2sim.batch.run import local_workers
 from log2sim.cli.progress import progress
 from log2sim.config import Config
@@ -47,11 +47,7 @@ SCENE = {
     "gnss": {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0},
 }  # fmt: skip
 SETTINGS = ("map.lanes=false", "appearance.colors=false", "appearance.signals=false")
-STEP_NS, STEP_M = 10**12, 7.0
-"""Between a log and the next one."""
-SHIFTED = {"t_ns": STEP_NS, "x_m": STEP_M, "y_m": -STEP_M}
-
-
+SHIFTED = {"t_ns": 10**12, "x_m": 7.0, "y_m": -7.0}  # between a log and the next one
 DAMAGED, DIFFERENT = 10, 100
 
 
@@ -98,16 +94,14 @@ def shifted(table: str, steps: int) -> str:
     """Return a table of CSV with stamps and places that are so many steps later and farther."""
     head, *lines = table.splitlines()
     names = head.split(",")
-    rows = [
-        ",".join(_moved(name, text, steps) for name, text in zip(names, line.split(","), strict=True)) for line in lines
-    ]
+
+    def moved(name: str, text: str) -> str:
+        if name not in SHIFTED:
+            return text
+        return str((int if name == "t_ns" else float)(text) + steps * SHIFTED[name])
+
+    rows = [",".join(map(moved, names, line.split(","))) for line in lines]
     return "\n".join([head, *rows]) + "\n"
-
-
-def _moved(name: str, text: str, steps: int) -> str:
-    if name not in SHIFTED:
-        return text
-    return str(int(text) + steps * STEP_NS) if name == "t_ns" else repr(float(text) + steps * SHIFTED[name])
 
 
 def measure(root: Path, out: Path, jobs: int, format: str) -> dict[str, str]:
@@ -115,17 +109,23 @@ def measure(root: Path, out: Path, jobs: int, format: str) -> dict[str, str]:
     began = time.perf_counter()
     batch = plan_batch(root, out, Config.load(None, SETTINGS, detect={"name": "lidar:labels"}), format=format)
     found_s, missing = time.perf_counter() - began, {job.name for job in batch.missing}
-    before = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
+
+    def spent() -> list[float]:
+        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return [time.perf_counter(), *(u.ru_utime + u.ru_stime for u in used)]
+
+    before = spent()
     with progress(quiet=False) as report:
         rows = run_batch(batch, lambda: local_workers(jobs), progress=lambda done, total: report("logs", done, total))
-    after = time.perf_counter(), _cpu(resource.RUSAGE_SELF), _cpu(resource.RUSAGE_CHILDREN)
-    wall, own, workers = (b - a for a, b in zip(before, after))
+    wall, own, workers = (b - a for a, b in zip(before, spent()))
     rows = [row for row in rows if row.name in missing]
     count, sums = len(rows), sum_up(rows)
     in_logs = sum(row.cpu_s or 0.0 for row in rows)
     peaks = [row.peak_memory_mib for row in rows if row.peak_memory_mib is not None]
+    kinds = Counter(row.error_kind for row in rows if not row.is_done)
+    failed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none"
     return {
-        "logs run": f"{count}, {sums['done']:.0f} done, {sums['failed']:.0f} failed ({_kinds(rows)})",
+        "logs run": f"{count}, {sums['done']:.0f} done, {sums['failed']:.0f} failed ({failed})",
         "run twice": str(sum(row.attempts > 1 for row in rows)),
         "agents a log": ", ".join(map(str, sorted({row.agents for row in rows if row.agents is not None}))),
         "finding the logs": f"{found_s:.1f} s",
@@ -137,13 +137,3 @@ def measure(root: Path, out: Path, jobs: int, format: str) -> dict[str, str]:
         "memory of client and scheduler": f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB",
         "memory of a worker": f"{max(peaks[: len(peaks) // 10 or 1]):.0f} MiB in the first tenth, {max(peaks):.0f} MiB in all",
     }
-
-
-def _kinds(rows: Sequence[Row]) -> str:
-    kinds = [row.error_kind for row in rows if not row.is_done]
-    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds))) or "none"
-
-
-def _cpu(who: int) -> float:
-    used = resource.getrusage(who)
-    return used.ru_utime + used.ru_stime

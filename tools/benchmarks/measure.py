@@ -8,17 +8,17 @@ the squared error over its covariance and dimensions: 1 where the covariance is 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from benchmarks.table import markdown
 from log2sim import Config, Scenario, open_log
-from log2sim.datatypes import GROUP_OF, Log, Measurements
+from log2sim.datatypes import GROUP_OF, Agent, Measurements
 from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.files.stages import StageClock
+from log2sim.geometry import Array
 from log2sim.perception.boxes import provisional_sizes
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.first_pass import observe
@@ -36,68 +36,48 @@ def main(logs: list[Path]) -> None:
     for path in logs:
         log = open_log(path)
         truth = Scenario.load(path / "truth.json") if (path / "truth.json").exists() else truth_from_log(log)
+        vehicles = [a for a in truth.others if GROUP_OF[a.category] == "vehicle"]
         rows = []
         for mode in ("paper", "robust"):
-            errors = list(_errors(_measured(log, mode), truth))
+            config = Config.load(detect={"name": "labels"}, measure={"mode": mode})
+            schedule = synchronize(log, tuple(log.cameras))
+            plan = make_plan(log, config, select_sensors(log, config), schedule.t_ns)
+            detectors = Detectors(create_detector("labels", log), None)
+            seen = observe(log, schedule, plan, detectors=detectors, config=config, clock=StageClock()).measurements
+            errors = np.array([
+                error_of(m, i, vehicles, truth.t0_ns) for m in seen for i in range(len(m))
+                if m.source[i] == "lidar" and GROUP_OF[str(m.category[i])] == "vehicle"
+            ]).reshape(-1, 6)  # fmt: skip
             for low, high in RANGES_M:
-                rows.append([mode, f"{low:g}-{high:g}", *_figures([e for e in errors if low <= e["range_m"] < high])])
+                within = errors[(errors[:, 0] >= low) & (errors[:, 0] < high), 1:]
+                rows.append([mode, f"{low:g}-{high:g}", *figures(within)])
         print(f"{log.name}: boxes of the log, vehicles\n{markdown(['mode', 'range m', *COLUMNS], rows)}\n")
 
 
-def _measured(log: Log, mode: str) -> Sequence[Measurements]:
-    config = Config.load(detect={"name": "labels"}, measure={"mode": mode})
-    cameras = tuple(log.cameras)
-    schedule = synchronize(log, cameras)
-    detector = create_detector(config.detect.name, log)
-    plan = make_plan(log, config, select_sensors(log, config), schedule.t_ns)
-    detectors = Detectors(detector, None)
-    return observe(log, schedule, plan, detectors=detectors, config=config, clock=StageClock()).measurements
-
-
-def _errors(measured: Sequence[Measurements], truth: Scenario) -> Iterator[dict[str, Any]]:
-    agents = [a for a in truth.others if GROUP_OF[a.category] == "vehicle"]
-    for rows in measured:
-        for i in range(len(rows)):
-            if rows.source[i] == "lidar" and GROUP_OF[str(rows.category[i])] == "vehicle":
-                yield _error(rows, i, agents, truth.t0_ns)
-
-
-def _error(rows: Measurements, i: int, agents: Sequence[Any], t0_ns: int) -> dict[str, Any]:
-    """Errors of one row; of none but the range where no labeled object is near."""
+def error_of(rows: Measurements, i: int, agents: Sequence[Agent], t0_ns: int) -> list[float]:
+    """Range of a row, and the errors of its place, depth, size and yaw and its NEES, which are NaN where no labeled object is near."""
     place = rows.center_m[i, :2]
     toward = place - rows.sensor_m[i, :2]
-    out: dict[str, Any] = {"range_m": float(np.hypot(*toward)), "found": False}
-    best = NEAREST_M
+    away = float(np.hypot(*toward))
+    best, out = NEAREST_M, [np.nan] * 5
     for agent in agents:
         state = agent.at((rows.t_ns[i] - t0_ns) / 1e9, margin_s=0.1)
-        if not state.valid[0]:
-            continue
         error = place - [state.x_m[0], state.y_m[0]]
-        if np.hypot(*error) < best:
+        if state.valid[0] and np.hypot(*error) < best:
             best = float(np.hypot(*error))
             size = np.abs(provisional_sizes(rows)[i] - agent.size_m[:2])
             turn = (rows.yaw_rad[i] - state.yaw_rad[0] + np.pi / 2) % np.pi - np.pi / 2
-            out |= {
-                "found": True, "error_m": best, "depth_m": float(error @ toward) / out["range_m"],
-                "size_m": float(np.mean(size)), "yaw_deg": float(np.degrees(abs(turn))),
-                "nees": float(error @ np.linalg.solve(rows.covariance[i], error)) / 2,
-            }  # fmt: skip
-    return out
+            nees = float(error @ np.linalg.solve(rows.covariance[i], error)) / 2
+            out = [best, float(error @ toward) / away, float(np.mean(size)), float(np.degrees(abs(turn))), nees]
+    return [away, *out]
 
 
-def _figures(rows: Sequence[dict[str, Any]]) -> list[str]:
-    found = [r for r in rows if r["found"]]
-    if not found:
-        return [str(len(rows)), "0", *["-"] * (len(COLUMNS) - 2)]
-    column = {k: np.array([r[k] for r in found]) for k in ("error_m", "depth_m", "size_m", "yaw_deg", "nees")}
-    return [
-        str(len(rows)),
-        f"{len(found) / len(rows):.2f}",
-        f"{np.median(column['error_m']):.2f}",
-        f"{np.sqrt(np.mean(column['error_m'] ** 2)):.2f}",
-        f"{np.median(column['depth_m']):+.2f}",
-        f"{np.median(column['size_m']):.2f}",
-        f"{np.median(column['yaw_deg']):.1f}",
-        f"{np.mean(column['nees']):.1f}",
-        f"{np.median(column['nees']):.2f}",
-    ]
+def figures(errors: Array) -> list[str]:
+    """A row of the table from the errors (N, 5) of some measurements."""
+    found = errors[np.isfinite(errors[:, 0])]
+    if not len(found):
+        return [str(len(errors)), "0", *["-"] * (len(COLUMNS) - 2)]
+    place, depth, size, yaw, nees = np.median(found, axis=0)
+    rmse, mean = np.sqrt(np.mean(found[:, 0] ** 2)), np.mean(found[:, 4])
+    shares = f"{len(found) / len(errors):.2f}", f"{place:.2f}", f"{rmse:.2f}", f"{depth:+.2f}", f"{size:.2f}"
+    return [str(len(errors)), *shares, f"{yaw:.1f}", f"{mean:.1f}", f"{nees:.2f}"]

@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,56 +32,39 @@ MIN_LABELS, MIN_SEEN_S = 10, 1.0
 MAX_STANDING_MPS = 0.3
 
 
-def rigid(source: Array, target: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) and translation (3,) that lay points (N, 3) on others best (Kabsch)."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    rotation = nearest_rotation(b.T @ a)
-    return rotation, target.mean(axis=0) - rotation @ source.mean(axis=0)
-
-
 def path_errors(estimated: PoseTrack, given: PoseTrack) -> str:
     """ATE and RPE at the stamps of the estimated poses, in words."""
     at, known = given.at(estimated.t_ns)
     ours, theirs = estimated.map_T_ego[known], at[known]
     xyz, reference = ours[:, :3, 3], theirs[:, :3, 3]
-    rotation, shift = rigid(xyz, reference)
+    # Points are laid on others best by the method of Kabsch.
+    rotation = nearest_rotation((reference - reference.mean(axis=0)).T @ (xyz - xyz.mean(axis=0)))
+    laid = (xyz - xyz.mean(axis=0)) @ rotation.T + reference.mean(axis=0)
     off = inverse(inverse(theirs[:-1]) @ theirs[1:]) @ (inverse(ours[:-1]) @ ours[1:])
     angle = np.arccos(np.clip((np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-    ate, placed, rpe = (
-        rms(np.linalg.norm(v, axis=1)) for v in (xyz @ rotation.T + shift - reference, xyz - reference, off[:, :3, 3])
-    )
+    apart = (laid - reference, xyz - reference, off[:, :3, 3])
+    ate, placed, rpe = (rms(np.linalg.norm(v, axis=1)) for v in apart)
     path_m = float(np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum())
     return f"path {path_m:.2f} m, ATE {ate:.3f} m (as placed {placed:.3f} m), RPE {rpe:.3f} m, {np.rad2deg(rms(angle)):.3f} degrees"
 
 
-def standing_vehicles(sources: dict[str, Labels]) -> dict[str, dict[str, float]]:
-    """Scatter in m by pose source of each labeled vehicle that stands, by track."""
-    stamps = [set(zip(labels.track_id.tolist(), labels.t_ns.tolist())) for labels in sources.values()]
-    common, out = set.intersection(*stamps), {}
-    first = next(iter(sources.values()))
-    vehicles = {t for t, c in zip(first.track_id.tolist(), first.category.tolist()) if GROUP_OF.get(c) == "vehicle"}
-    for track in sorted(vehicles):
-        tables = {}
-        for name, labels in sources.items():
-            rows = [
-                k for k in np.flatnonzero(labels.track_id == track).tolist() if (track, int(labels.t_ns[k])) in common
-            ]
-            tables[name] = (labels.t_ns[rows] * 1e-9, labels.center_m[rows, :2])
-        t_s, _ = next(iter(tables.values()))
-        if len(t_s) < MIN_LABELS or np.ptp(t_s) < MIN_SEEN_S:
-            continue
-        if min(drift_mps(*table) for table in tables.values()) < MAX_STANDING_MPS:
-            out[track] = {
-                name: float(np.sqrt(np.mean(np.sum((xy - xy.mean(axis=0)) ** 2, axis=1))))
-                for name, (_, xy) in tables.items()
-            }
+def standing_vehicles(sources: Sequence[Labels]) -> list[list[float]]:
+    """Scatter in m by pose source of each labeled vehicle that stands."""
+    stamps = [set(zip(labels.track_id.tolist(), labels.t_ns.tolist())) for labels in sources]
+    common, out = set.intersection(*stamps), []
+    named = zip(sources[0].track_id.tolist(), sources[0].category.tolist())
+    for track in sorted({t for t, c in named if GROUP_OF.get(c) == "vehicle"}):
+        scatter, drift_mps, t_s = [], [], np.zeros(0)
+        for labels in sources:
+            rows = [k for k in np.flatnonzero(labels.track_id == track) if (track, int(labels.t_ns[k])) in common]
+            t_s, xy = labels.t_ns[rows] * 1e-9, labels.center_m[rows, :2]
+            if len(rows) >= MIN_LABELS and np.ptp(t_s) >= MIN_SEEN_S:
+                since, off = t_s - t_s.mean(), xy - xy.mean(axis=0)
+                drift_mps.append(float(np.hypot(*(since @ off / (since @ since)))))
+                scatter.append(float(np.sqrt(np.mean(np.sum(off**2, axis=1)))))
+        if scatter and min(drift_mps) < MAX_STANDING_MPS:
+            out.append(scatter)
     return out
-
-
-def drift_mps(t_s: Array, xy_m: Array) -> float:
-    """Speed of the line through positions (T, 2)."""
-    since = t_s - t_s.mean()
-    return float(np.hypot(*(since @ (xy_m - xy_m.mean(axis=0)) / (since @ since))))
 
 
 def rms(values: Array) -> float:
@@ -106,18 +90,11 @@ def main(path: Path, source: str = "lidar") -> None:
     if lidar is not None:
         both = {"given": log.ego, choice.source: localized.ego}
         found = compare_poses(log, lidar, both, localized.ego.t_ns)
-        rows += [
-            [f"surfaces, sweeps {name}, m", *(f"{rms(values):.3f}" for values in columns)]
-            for name, columns in (
-                ("in succession", [s.neighbors_m for s in found.values()]),
-                ("2 s apart", [s.apart_m for s in found.values()]),
-            )
-        ]
-    if log.labels is not None and localized.labels is not None:
-        parked = standing_vehicles({"given": log.labels, choice.source: localized.labels})
-        if parked:
-            scatter = np.median([list(row.values()) for row in parked.values()], axis=0)
-            rows.append([f"{len(parked)} parked, median scatter, m", *(f"{v:.3f}" for v in scatter)])
+        for name, of in (("in succession", "neighbors_m"), ("2 s apart", "apart_m")):
+            rows.append([f"surfaces, sweeps {name}, m", *(f"{rms(getattr(s, of)):.3f}" for s in found.values())])
+    labels = [labels for labels in (log.labels, localized.labels) if labels is not None]
+    if parked := standing_vehicles(labels) if len(labels) == 2 else []:
+        rows.append([f"{len(parked)} parked, median scatter, m", *(f"{v:.3f}" for v in np.median(parked, axis=0))])
     print(markdown(["", "given", choice.source], rows))
     auto = localize(log, Config.load(poses={"source": "auto"}))[1].to_dict()
     print(f"auto takes {auto['source']}: {auto['reason']}")

@@ -21,6 +21,7 @@ from log2sim.synth.actors import RoundedPath
 
 Array = NDArray[np.float64]
 TICK_S, DURATION_S, WARM_UP_S = 0.1, 20.0, 15.0
+TICKS_S = np.arange(round(DURATION_S / TICK_S) + 1) * TICK_S
 # Intelligent driver model (Treiber, Hennecke, Helbing 2000), city values: drivers differ by a fifth.
 ACCELERATION_MPS2, DECELERATION_MPS2, HEADWAY_S, GAP_M = 1.5, 2.0, 1.4, 2.0
 # Comfortable lateral acceleration in turns, and how the speed of a free driver wanders.
@@ -46,16 +47,13 @@ def courses(seed: int) -> list[Course]:
     rng = np.random.default_rng(seed)
     out = []
     for k in range(3):
-        turned = rng.uniform(0, 2 * np.pi)
+        angle = rng.uniform(0, 2 * np.pi)
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         lane = _route(ROUTES[(seed + k) % len(ROUTES)], rng)
-        out += _queue(lane @ _rotation(turned).T + rng.normal(0, 60.0, 2), "car", CARS_A_LANE, rng)
+        out += _queue(lane @ turn + rng.normal(0, 60.0, 2), "car", CARS_A_LANE, rng)
         if k < CYCLISTS:
-            out += _queue(_route(ROUTES[(seed + k + 1) % 4], rng) @ _rotation(turned).T, "cyclist", 1, rng)
+            out += _queue(_route(ROUTES[(seed + k + 1) % 4], rng) @ turn, "cyclist", 1, rng)
     return [*out, *(_stroll(rng) for _ in range(PEDESTRIANS))]
-
-
-def _rotation(angle: float) -> Array:
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def _route(kind: str, rng: np.random.Generator) -> Array:
@@ -147,28 +145,10 @@ def smoothed_scenario(found: list[Course], seed: int) -> Scenario:
     """The scenario that a reconstruction makes of noisy positions: smoothed over the whole log."""
     agents = []
     for k, course in enumerate(found):
-        measured = noisy(course, k, seed)
-        path = smooth_track(times(course), measured, sigma_m=SIGMA_M[course.category], motion=_motion(course))
-        agents.append(_smoothed_agent(k, course, path))
+        path = smooth_track(TICKS_S, noisy(course, k, seed), sigma_m=SIGMA_M[course.category], motion=_motion(course))
+        sigma = np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2)
+        agents.append(_agent(k, course, path.xy_m, np.hypot(*path.velocity_mps.T), path.yaw_rad, sigma))
     return _scenario(agents)
-
-
-def times(course: Course) -> Array:
-    """Times (T,) of a course."""
-    return np.arange(len(course.xy_m)) * TICK_S
-
-
-def causal_states(course: Course, k: int, seed: int, ticks: Array) -> tuple[Array, Array]:
-    """Positions and velocities (K, 2) at ticks (K,), each smoothed over what was measured up to then."""
-    measured, t = noisy(course, k, seed), times(course)
-    xy, velocity = np.full((len(ticks), 2), np.nan), np.full((len(ticks), 2), np.nan)
-    for row, n in enumerate(ticks.astype(int)):
-        past = slice(max(0, n - 50), n + 1)
-        path = smooth_track(
-            t[past], measured[past], sigma_m=SIGMA_M[course.category], motion=_motion(course), at_s=t[n : n + 1]
-        )
-        xy[row], velocity[row] = path.xy_m[0], path.velocity_mps[0]
-    return xy, velocity
 
 
 def noisy(course: Course, k: int, seed: int) -> Array:
@@ -181,15 +161,9 @@ def _motion(course: Course) -> MotionModel:
     return MotionModel(holonomic=course.category == "pedestrian")
 
 
-def _smoothed_agent(k: int, course: Course, path) -> Agent:
-    speed = np.hypot(*path.velocity_mps.T)
-    sigma = np.sqrt(np.trace(path.covariance, axis1=1, axis2=2) / 2)
-    return _agent(k, course, path.xy_m, speed, path.yaw_rad, sigma)
-
-
 def _agent(k: int, course: Course, xy: Array, speed: Array, yaw: Array, sigma: Array) -> Agent:
     n = len(xy)
-    w = Waypoints(times(course), xy[:, 0], xy[:, 1], np.zeros(n), wrap_angle(yaw), speed, np.ones(n, bool), sigma)
+    w = Waypoints(TICKS_S, xy[:, 0], xy[:, 1], np.zeros(n), wrap_angle(yaw), speed, np.ones(n, bool), sigma)
     return Agent(f"{course.category}_{k}", course.category, SIZE_M[course.category], w)
 
 
@@ -218,9 +192,8 @@ def main(seeds: int = 4, past: bool = False) -> None:
             start = time.process_time()
             found = predict_table(table, leads_of(3.0))
             spent, count = spent + time.process_time() - start, count + len(found.row)
-            moves = (np.abs(truth.velocity_mps[found.row, found.tick]) > MOVING_MPS) & (
-                truth.t_s[found.tick] >= BEGIN_S
-            )
+            moves = np.abs(truth.velocity_mps[found.row, found.tick]) > MOVING_MPS
+            moves &= truth.t_s[found.tick] >= BEGIN_S
             for (method, forecast), lead in itertools.product(found.forecasts.items(), LEADS_S):
                 later, h = truth.later(round(lead / truth.tick_s))[0], 2 * lead - 1
                 error = (forecast.position_m[:, h] - later[found.row, found.tick]) * forecast.course[:, h].conj()
@@ -238,17 +211,20 @@ def main(seeds: int = 4, past: bool = False) -> None:
     print(f"{count} agent-ticks, {len(METHODS)} methods: {1e4 * spent / count:.2f} s for 10,000")
 
 
-def causal_table(truth: MotionTable, courses, seed: int) -> MotionTable:
-    """States smoothed at each tick over what was measured up to then."""
+def causal_table(truth: MotionTable, courses: list[Course], seed: int) -> MotionTable:
+    """States smoothed at each tick over what was measured in the 5 s up to then."""
     position, velocity = np.empty_like(truth.position_m), np.empty_like(truth.velocity_mps)
-    ticks = np.arange(len(truth.t_s))
     for k, course in enumerate(courses):
-        xy, v = causal_states(course, k, seed, ticks)
-        position[k], velocity[k] = xy @ [1, 1j], v @ [1, 1j]
+        measured, sigma_m, motion = noisy(course, k, seed), SIGMA_M[course.category], _motion(course)
+        for n in range(len(TICKS_S)):
+            past = slice(max(0, n - 50), n + 1)
+            at_s = TICKS_S[n : n + 1]
+            path = smooth_track(TICKS_S[past], measured[past], sigma_m=sigma_m, motion=motion, at_s=at_s)
+            position[k, n], velocity[k, n] = path.xy_m[0] @ [1, 1j], path.velocity_mps[0] @ [1, 1j]
     return _with(truth, position, velocity, courses)
 
 
-def difference_table(truth: MotionTable, courses, seed: int) -> MotionTable:
+def difference_table(truth: MotionTable, courses: list[Course], seed: int) -> MotionTable:
     """Measured positions, with the differences to the ones before as velocities."""
     position = np.array([noisy(course, k, seed) @ [1, 1j] for k, course in enumerate(courses)])
     velocity = np.diff(position, axis=1, prepend=position[:, :1]) / truth.tick_s
@@ -256,7 +232,7 @@ def difference_table(truth: MotionTable, courses, seed: int) -> MotionTable:
     return _with(truth, position, velocity, courses)
 
 
-def _with(truth: MotionTable, position, velocity, courses) -> MotionTable:
+def _with(truth: MotionTable, position: np.ndarray, velocity: np.ndarray, courses: list[Course]) -> MotionTable:
     sigma = np.array([SIGMA_M[c.category] for c in courses])[:, None] * np.ones(position.shape)
     center = np.stack([position.real, position.imag, 0.0 * sigma], axis=-1)
     states = truth.t_s, center, np.angle(velocity), np.abs(velocity)

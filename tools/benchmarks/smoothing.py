@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import UnivariateSpline, make_smoothing_spline
+from scipy.signal import savgol_filter
 
 from benchmarks.table import markdown, optional, print_section
 from log2sim.agents.smooth.smoother import smooth_track
@@ -120,14 +122,9 @@ def errors_of(truth: Truth, xy_m: Array, velocity_mps: Array, yaw_rad: Array, cu
     def rms(values: Array) -> float:
         return float(np.sqrt(np.mean(values**2)))
 
-    return np.array(
-        [
-            rms(np.hypot(*(xy_m - truth.xy_m).T)),
-            rms(np.hypot(*(velocity_mps - truth.velocity_mps).T)),
-            rms(turned[moving]),
-            rms((curvature_1pm - truth.curvature_1pm)[moving]),
-        ]
-    )
+    bent = (curvature_1pm - truth.curvature_1pm)[moving]
+    off = [np.hypot(*(ours - true).T) for ours, true in ((xy_m, truth.xy_m), (velocity_mps, truth.velocity_mps))]
+    return np.array([rms(off[0]), rms(off[1]), rms(turned[moving]), rms(bent)])
 
 
 def rate_worlds(maneuver: str, rate_hz: int, sigma_m: float, seeds: int = 6) -> Iterator[tuple[Truth, Array, Array]]:
@@ -163,33 +160,18 @@ def log2sim(t: Array, xy: Array, sigma: float, *, told: bool = True) -> Result:
     return found.xy_m, found.velocity_mps, found.yaw_rad, found.curvature_1pm
 
 
-def smoothing_spline(t: Array, xy: Array, sigma: float, *, lam: float | None) -> Result:
-    """SciPy's smoothing spline, by generalized cross-validation or with a fixed penalty."""
-    from scipy.interpolate import make_smoothing_spline
-
-    return of_splines([make_smoothing_spline(t, z, lam=lam and lam * np.sqrt(sigma / 0.3)) for z in xy.T])
-
-
-def univariate_spline(t: Array, xy: Array, sigma: float) -> Result:
-    from scipy.interpolate import UnivariateSpline
-
-    return of_splines([UnivariateSpline(t, z, k=5, s=len(t) * sigma**2) for z in xy.T])
-
-
-def of_splines(splines: list[Any]) -> Result:
+def spline(t: Array, xy: Array, sigma: float, *, fit: Callable[[Array, Array, float], Any]) -> Result:
+    """A spline of SciPy."""
+    splines = [fit(t, z, sigma) for z in xy.T]
     values = [np.column_stack([s.derivative(k)(ALL_S) if k else s(ALL_S) for s in splines]) for k in range(3)]
     return of_derivatives(*values)
 
 
-def savgol(t: Array, xy: Array, _: float, *, window: int) -> Result:
-    from scipy.signal import savgol_filter
-
+def filtered(t: Array, xy: Array, _: float, *, window: int) -> Result:
+    """SciPy's Savitzky-Golay filter of cubics, or with a window of 0 differences."""
     filled = np.column_stack([np.interp(ALL_S, t, z) for z in xy.T])
-    return of_derivatives(*(savgol_filter(filled, window, 3, deriv=k, delta=PERIOD_S, axis=0) for k in range(3)))
-
-
-def differences(t: Array, xy: Array, _: float) -> Result:
-    filled = np.column_stack([np.interp(ALL_S, t, z) for z in xy.T])
+    if window:
+        return of_derivatives(*(savgol_filter(filled, window, 3, deriv=k, delta=PERIOD_S, axis=0) for k in range(3)))
     velocity = np.gradient(filled, PERIOD_S, axis=0)
     return of_derivatives(filled, velocity, np.gradient(velocity, PERIOD_S, axis=0))
 
@@ -219,15 +201,18 @@ def kalman(t: Array, xy: Array, sigma: float, *, density: float) -> Result:
 
 
 def smoothers() -> dict[str, Smoother]:
+    gcv = partial(spline, fit=lambda t, z, _: make_smoothing_spline(t, z))
+    fixed = partial(spline, fit=lambda t, z, sigma: make_smoothing_spline(t, z, lam=0.1 * np.sqrt(sigma / 0.3)))
     out: dict[str, Smoother] = {
         "log2sim": log2sim,
         "log2sim, noise not told": partial(log2sim, told=False),
-        "raw, differences": differences,
-        "SciPy make_smoothing_spline, GCV": partial(smoothing_spline, lam=None),
-        "SciPy make_smoothing_spline, fixed penalty": partial(smoothing_spline, lam=0.1),
-        "SciPy UnivariateSpline, s = n sigma^2": univariate_spline,
-        "SciPy savgol_filter 15/3": partial(savgol, window=15),
-        "SciPy savgol_filter 25/3": partial(savgol, window=25),
+        "raw, differences": partial(filtered, window=0),
+        "SciPy make_smoothing_spline, GCV": gcv,
+        "SciPy make_smoothing_spline, fixed penalty": fixed,
+        "SciPy UnivariateSpline, s = n sigma^2": partial(
+            spline, fit=lambda t, z, sigma: UnivariateSpline(t, z, k=5, s=len(t) * sigma**2)
+        ),
+        **{f"SciPy savgol_filter {window}/3": partial(filtered, window=window) for window in (15, 25)},
     }
     if optional("filterpy") is not None:
         out["filterpy Kalman + RTS, q = 1"] = partial(kalman, density=1.0)
@@ -252,10 +237,10 @@ def sections(*, quick: bool) -> tuple[str, str]:
     warnings.simplefilter("ignore")
     cases = {"0.1 m": (0.1, 0.0), "0.3 m": (0.3, 0.0), "0.6 m": (0.6, 0.0), "0.3 m, 3 % outliers": (0.3, 0.03)}
     found = {name: measure(*case, seeds=2 if quick else 8) for name, case in cases.items()}
-    rows = []
-    for method in found["0.3 m"]:
-        cells = [" / ".join(f"{v:.{d}f}" for v, d in zip(found[c][method], (3, 3, 2, 4))) for c in cases]
-        rows.append([method, f"{found['0.3 m'][method][4]:.2f}", *cells])
+    rows = [
+        [method, f"{found['0.3 m'][method][4]:.2f}", *(errors_text(found[c][method]) for c in cases)]
+        for method in found["0.3 m"]
+    ]
     told = (
         "Four maneuvers of 20 s at 10 Hz, a tenth of the samples missing. Root mean square errors over all 201 times, also"
         " the missing ones: position m / velocity m/s / yaw degrees / curvature 1/m, by the noise of the positions."
@@ -265,6 +250,11 @@ def sections(*, quick: bool) -> tuple[str, str]:
         f"{told}\n\n{markdown(['method', 'ms a track', *cases], rows)}\n\n{by_rate(seeds=2 if quick else 8)}\n\n"
         + by_bound(seeds=4 if quick else 30),
     )
+
+
+def errors_text(errors: Any) -> str:
+    """Errors as `errors_of` tells them, with as many digits as they need."""
+    return " / ".join(f"{v:.{d}f}" for v, d in zip(errors, (3, 3, 2, 4)))
 
 
 def by_rate(seeds: int) -> str:
@@ -282,13 +272,11 @@ def by_rate(seeds: int) -> str:
             for truth, t_s, xy_m in rate_worlds(QUEUE, rate_hz, sigma_m, seeds):
                 path = smooth_track(t_s, xy_m, sigma_m=sigma_m, at_s=truth.t_s)
                 verdicts.append(standing_verdicts(truth, path.velocity_mps))
-            cells.append(" / ".join(f"{v:.{d}f}" for v, d in zip(np.median(off, axis=0), (3, 3, 2, 4))))
+            cells.append(errors_text(np.median(off, axis=0)))
             cells += [f"{100 * share:.0f} %" for share in np.mean(verdicts, axis=0)]
         rows.append(cells)
-    head = [
-        "rate",
-        *(f"{c}, {s} m" for s in (0.1, 0.3) for c in ("errors", "standing found", "moving taken for standing")),
-    ]
+    figures = ("errors", "standing found", "moving taken for standing")
+    head = ["rate", *(f"{c}, {s} m" for s in (0.1, 0.3) for c in figures)]
     text = (
         "log2sim by rate of the observations, errors at 20 Hz between and at them. Standing: a queue that stands for 2, 3 and"
         " 5 s, rolls at 0.4 m/s and drives; shares of the time at which it stands, and at which it is faster than 0.2 m/s."
@@ -296,12 +284,12 @@ def by_rate(seeds: int) -> str:
     return f"{text}\n\n{markdown(head, rows)}"
 
 
-def white_jerk(density: float, period_s: float) -> tuple[Array, Array]:
+def white_jerk(density: float) -> tuple[Array, Array]:
     """Transition (3, 3) of position, velocity and acceleration along an axis, and covariance of what white jerk adds to them.
 
     The square root of the jerk's spectral density is in m/s^2.5.
     """
-    t = period_s
+    t = PERIOD_S
     transition = np.array([[1, t, t**2 / 2], [0, 1, t], [0, 0, 1]])
     return transition, density**2 * np.array(
         [[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]]
@@ -321,7 +309,7 @@ def smooth_told(
     The variances, of both axes together, are the posterior Cramer-Rao bound (Tichavsky, Muravchik & Nehorai, 1998) of all motions
     with such jerk about this way, which is linear. Positions (B, T, 2) count where they are `valid` (B, T).
     """
-    step, unit = (np.kron(block, np.eye(2)) for block in white_jerk(1.0, PERIOD_S))
+    step, unit = (np.kron(block, np.eye(2)) for block in white_jerk(1.0))
     turn = np.moveaxis(np.array([[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]), 2, 0)
     by_axis = np.einsum("tij,btj,tkj->btik", turn[1:], densities, turn[1:])
     mean = np.concatenate([xy[:, 0], np.zeros((len(xy), 4))], axis=1)
@@ -394,7 +382,7 @@ def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, f
 
 def drawn_error_m(density: float, sigma_m: float, seeds: int) -> float:
     """Root mean square position error of log2sim on motions with white jerk."""
-    step, added = white_jerk(density, PERIOD_S)
+    step, added = white_jerk(density)
     factor, t_s, squares = np.linalg.cholesky(added), np.arange(FRAMES) * PERIOD_S, []
     for seed in range(seeds):
         rng = np.random.default_rng([seed, int(10 * density)])

@@ -60,10 +60,6 @@ class Vehicle:
     changes: list[tuple[float, int, int]]  # time at which the center crosses, lane before and after
     brakes: list[float] = field(default_factory=list)
 
-    def lane(self) -> np.ndarray:
-        """Lane (K,) that the center is in."""
-        return np.clip((self.d / LANE_M).round().astype(int), 0, LANES - 1)
-
 
 def quintic(u: np.ndarray) -> np.ndarray:
     """Rise from 0 to 1 without jerk at the ends (Papadimitriou and Tomizuka 2003)."""
@@ -102,9 +98,9 @@ def traffic(seed: int, *, rate_hz: float = 10.0, bend_1pm: float = 0.0, keeps_ri
                 changes.append((at + lasts / 2, now, to))
                 now = to
             free = at + lasts + 1.0
-        new = Vehicle(name, s, d, speed, changes, brakes)
-        if speed.min() > 5.0 and not any(_touch(new, old) for old in vehicles):
-            vehicles.append(new)
+        apart = [(np.abs(s - old.s) >= CAR[0] + 2.0) | (np.abs(d - old.d) >= CAR[1] + 0.5) for old in vehicles]
+        if speed.min() > 5.0 and np.all(apart):
+            vehicles.append(Vehicle(name, s, d, speed, changes, brakes))
     sign = 1.0 if keeps_right else -1.0
     agents = tuple(
         _agent(v.id, *_on_road(v.s, sign * v.d, bend_1pm), t, v.speed, rate_hz, noise_m, rng) for v in vehicles
@@ -140,10 +136,6 @@ def motorway(seed: int) -> Scene:
         "lidar": [{"name": "roof", "position_m": [1.2, 0.0, 1.9], "elevation_deg": [-16.0, 4.0], "channels": 40, "rate_hz": rates[kind],
                    "offset_s": 0.08, "range_m": 100.0}],
     })  # fmt: skip
-
-
-def _touch(a: Vehicle, b: Vehicle) -> bool:
-    return bool(((np.abs(a.s - b.s) < CAR[0] + 2.0) & (np.abs(a.d - b.d) < CAR[1] + 0.5)).any())
 
 
 def _on_road(s: np.ndarray, d: np.ndarray, bend: float) -> tuple[np.ndarray, np.ndarray]:
@@ -209,9 +201,9 @@ def route(points: Sequence[tuple[float, float]], radius_m: float) -> np.ndarray:
     return np.column_stack([line.real, line.imag])
 
 
-def along(line: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def along(line: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
     """Places x, y (K,) at stations of a route."""
-    return tuple(np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T)
+    return [np.interp(s, np.arange(len(line)) * 0.05, c) for c in line.T]
 
 
 @dataclass
@@ -225,9 +217,10 @@ class Stage:
     duration_s: float = 12.0
     agents: list[Agent] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        """Set the fine times."""
-        self.t = np.arange(0.0, self.duration_s + FINE_S / 2, FINE_S)
+    @property
+    def t(self) -> np.ndarray:
+        """The fine times."""
+        return np.arange(0.0, self.duration_s + FINE_S / 2, FINE_S)
 
     def add(self, id: str, line: np.ndarray, speed: np.ndarray | float, start_m: float = 0.0, category: str = "car",
             size: tuple = CAR, begin_s: float = 0.0) -> np.ndarray:  # fmt: skip
@@ -345,7 +338,6 @@ def wait_at_light(stage: Stage) -> World:
     stops = brakes + v / decel
     goes = stops + rng.uniform(2.0, 3.0)
     stage.duration_s = goes + 4.0
-    stage.__post_init__()
     speed = np.where(stage.t < goes, ramp(stage.t, brakes, -decel, 0.0, v, v), ramp(stage.t, goes, 1.8, 0.0, 12.0, 0.0))
     way = float(np.cumsum(speed)[np.searchsorted(stage.t, stops)] * FINE_S)
     line = route([(-300, 0), (300, 0)], 5.0)
@@ -438,7 +430,6 @@ def _near(value: float, limit: float) -> bool:
 
 def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
     """Yield the maneuvers by the definitions: a lane change crosses where the center does, ahead of the nearest one there."""
-    lane = {v.id: v.lane() for v in vehicles}
     for v in vehicles:
         for at in v.brakes:
             yield Event("hard_braking", v.id, None, at)
@@ -447,7 +438,9 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
             if lanes:
                 yield Event("lane_change", v.id, None, at)
             for tag, target in (("cut_in", two), ("cut_out", one)):
-                behind = [o for o in vehicles if o is not v and o.s[n] < v.s[n] and _in(o, lane, n, target)]
+                # Who is in the lane, or crosses its edge about then.
+                there = [o for o in vehicles if abs(o.d[n] - target * LANE_M) < LANE_M / 2 + 0.3]
+                behind = [o for o in there if o is not v and o.s[n] < v.s[n]]
                 for k, o in enumerate(sorted(behind, key=lambda o: -o.s[n])):
                     headway = (v.s[n] - o.s[n] - CAR[0]) / o.speed[n]
                     # Who changes lanes as well may be called either.
@@ -459,8 +452,7 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
                     elif headway < 4.4:
                         yield Event(tag, v.id, o.id, at, sure=False)
     for a, b in itertools.permutations(vehicles, 2):
-        ahead = a.s - b.s
-        reach = CAR[0]
+        ahead, reach = a.s - b.s, CAR[0]
         ups = np.flatnonzero((ahead[1:] > reach) & (ahead[:-1] <= reach)) + 1
         for n in ups.tolist():
             before = np.flatnonzero(ahead[:n] < -reach)
@@ -470,11 +462,6 @@ def _road_events(vehicles: Sequence[Vehicle], t: np.ndarray, *, lanes: bool):
                 # Passing ends too near to the end of the log to be told from driving beside.
                 sure = beside < 2.1 * LANE_M and t[n] < t[-1] - 0.2 and t[before[-1]] > 0.2
                 yield Event("overtaking", a.id, b.id, middle, sure)
-
-
-def _in(o: Vehicle, lane: dict[str, np.ndarray], n: int, target: int) -> bool:
-    """Whether a vehicle is in a lane, or crosses its edge about then."""
-    return abs(o.d[n] - target * LANE_M) < LANE_M / 2 + 0.3
 
 
 def variants(count: int, noise_m: float, first: int = 0):

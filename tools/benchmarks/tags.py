@@ -18,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import tag_worlds
 from benchmarks.table import markdown
-from benchmarks.tag_worlds import World, motorway, scripted, variants
+from benchmarks.tag_worlds import World, scripted, variants
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import AgentTable, Scenario, Tag
 from log2sim.scenarios.tagging import find_tags
@@ -32,15 +33,6 @@ WITHIN_S = 1.5  # of a tag's moment and the true one's
 # What has a begin and an end of its own, and what lasts for as long as it is so.
 MANEUVERS = ("lane_change", "cut_in", "cut_out", "merging", "overtaking", "turning", "u_turn", "stopping", "starting")
 LASTING = ("following", "approaching", "standing", "standing_at_light", "standing_at_crosswalk", "oncoming_in_lane")
-
-
-def reconstructed(seed: int, folder: Path) -> tuple[Scenario, Scenario]:
-    """Render a motorway below a folder, unless it is there, and return what is reconstructed of it and its truth."""
-    log = folder / f"motorway_{seed}"
-    if not log.exists():
-        write_synthetic(motorway(seed), log, seed=seed)
-    made = reconstruct(open_log(log), Config.load(detect={"name": "lidar:vehicle"})).scenario
-    return made, Scenario.load(log / "truth.json")
 
 
 def score(worlds: Sequence[World], found: Sequence[Sequence[Tag]]) -> dict[str, tuple[int, int, int, float, list[str]]]:
@@ -95,21 +87,16 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[tuple[int, s
         """Median distance of an agent from a true one over times at which both are there, or nearly."""
         if one is None or two is None:
             return 0.0 if one is two else np.inf
-        a, b = (
-            AgentTable.of([of[id]], np.unique(times), margin_s=UNSEEN_S).center_m[0]
-            for of, id in zip(agents, (one, two))
-        )
+        own = [of[id] for of, id in zip(agents, (one, two))]
+        a, b = (AgentTable.of([agent], np.unique(times), margin_s=UNSEEN_S).center_m[0] for agent in own)
         away = np.hypot(*(a - b)[:, :2].T)
         return float(np.median(away[np.isfinite(away)])) if np.isfinite(away).any() else np.inf
 
     def same(g: Tag, e: Tag) -> bool:
         times = (g.start_s, g.t_s, g.end_s, e.t_s)
         shared = (g.start_s <= e.end_s and g.end_s >= e.start_s) or abs(g.t_s - e.t_s) <= WITHIN_S
-        return (
-            g.tag == e.tag
-            and shared
-            and all(apart_m(*pair, times) < 3.0 for pair in ((g.agent, e.agent), (g.other, e.other)))
-        )
+        pairs = ((g.agent, e.agent), (g.other, e.other))
+        return g.tag == e.tag and shared and all(apart_m(*pair, times) < 3.0 for pair in pairs)
 
     def shown(e: Tag) -> int:
         ways = [agents[1][id].waypoints for id in (e.agent, e.other) if id]
@@ -117,10 +104,6 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[tuple[int, s
         during = [w.visible[(w.t_s >= e.start_s - EDGE_S) & (w.t_s <= e.end_s + EDGE_S)].any() for w in known]
         then = [w.visible[np.abs(w.t_s - e.t_s).argmin()] for w in known]
         return int(all(during)) + int(all(during) and all(then))
-
-    def is_cut(g: Tag) -> bool:
-        first, last = g.start_s if g.tag in MANEUVERS else g.t_s, g.t_s if g.tag in LASTING else g.end_s
-        return min(first, last_s - last, last_s - g.t_s) < EDGE_S
 
     def reason(e: Tag) -> str:
         if shown(e) < 2:
@@ -130,12 +113,13 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[tuple[int, s
             sure = [agents[0][id].confidence for id in (doubted[0].agent, doubted[0].other) if id]
             return f"found with {doubted[0].probability}, confidences {sure}"
         times = (e.start_s, e.t_s, e.end_s)
-        gone = [
-            id
-            for id in (e.agent, e.other)
-            if id and min((apart_m(k, id, times) for k in agents[0]), default=np.inf) >= 3.0
-        ]
+        away = {id: [apart_m(k, id, times) for k in agents[0]] for id in (e.agent, e.other) if id}
+        gone = [id for id, of_id in away.items() if min(of_id, default=np.inf) >= 3.0]
         return f"not reconstructed: {', '.join(gone)}" if gone else "other motion"
+
+    def is_cut(g: Tag) -> bool:
+        first, last = g.start_s if g.tag in MANEUVERS else g.t_s, g.t_s if g.tag in LASTING else g.end_s
+        return min(first, last_s - last, last_s - g.t_s) < EDGE_S
 
     out: dict[str, list[list[tuple[int, str]]]] = defaultdict(lambda: [[], [], []])
     left = list(theirs)
@@ -151,14 +135,8 @@ def compare(made: Scenario, truth: Scenario) -> dict[str, list[list[tuple[int, s
     return out
 
 
-def main(
-    worlds: int = 48,
-    noise: float = 0.0,
-    write: Path | None = None,
-    pair: list[str] = [],
-    motorway: list[int] = [],
-    wrong: bool = False,
-) -> None:
+def main(worlds: int = 48, noise: float = 0.0, write: Path | None = None, pair: list[str] = [], motorway: list[int] = [],
+         wrong: bool = False) -> None:  # fmt: skip
     """Print a table of random worlds and of a quarter as many of each scripted scene, whose places have noise, m; `wrong` lists what was wrong."""
     drawn = [*variants(worlds, noise), *scripted(worlds // 4, noise)]
     for k, world in enumerate(drawn if write is not None else ()):
@@ -169,7 +147,12 @@ def main(
         truth = Scenario.load(of) if of.suffix == ".json" else synthesize(load_scene(of), observe=False)[1]
         pairs.append((made.name, Scenario.load(made), truth))
     with tempfile.TemporaryDirectory() as temporary:
-        pairs += [(f"motorway {seed}", *reconstructed(seed, write or Path(temporary))) for seed in motorway]
+        for seed in motorway:
+            log = (write or Path(temporary)) / f"motorway_{seed}"
+            if not log.exists():
+                write_synthetic(tag_worlds.motorway(seed), log, seed=seed)
+            found = reconstruct(open_log(log), Config.load(detect={"name": "lidar:vehicle"})).scenario
+            pairs.append((f"motorway {seed}", found, Scenario.load(log / "truth.json")))
     for name, made, truth in pairs:
         for tag, lists in compare(made, truth).items():
             sums[tag] = [[*a, *((seen, f"{name}: {line}") for seen, line in b)] for a, b in zip(sums[tag], lists)]

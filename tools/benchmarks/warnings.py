@@ -48,7 +48,8 @@ def main(paths: list[Path]) -> None:
         plain += sum(ttc_s <= PLAIN_TTC_S for ttc_s in least)
         print(f"{name:40} {found.driven_s:6.1f} s driven, {len(warned)} warnings")
         for w in warned:
-            ttc_s, pet_s = near_misses(result, w.agent)
+            near = [e for e in result.metrics["conflicts"] if {EGO, w.agent} == set(e["agents"])][:1]
+            ttc_s, pet_s = (next((e[k] for e in near if e[k] is not None), np.inf) for k in ("min_ttc_s", "pet_s"))
             true = w.collision_s is not None or ttc_s <= CONFLICT_TTC_S or pet_s <= CONFLICT_PET_S
             counts[true] += 1
             print(f"  {w.agent:24} at {w.warned.t_s:6.1f} s, p {w.probability:.2f}, gap {w.warned.distance_m:5.1f} m; "
@@ -69,14 +70,6 @@ def scenarios(path: Path) -> Iterator[tuple[str, Scenario]]:
         yield from kitti_tracking(path)
     else:
         yield path.name, labeled_log(path)
-
-
-def near_misses(result: object, agent: str) -> tuple[float, float]:
-    """Least time to collision and post-encroachment time of the ego and an agent, s; infinite without."""
-    for entry in result.metrics["conflicts"]:
-        if {EGO, agent} == set(entry["agents"]):
-            return tuple(float("inf") if entry[k] is None else entry[k] for k in ("min_ttc_s", "pet_s"))
-    return float("inf"), float("inf")
 
 
 PERIOD_S = 0.1

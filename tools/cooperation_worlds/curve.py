@@ -9,13 +9,15 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from benchmarks.table import cell, markdown
 
-from cooperation_worlds.runs import Found, agents_near
+from cooperation_worlds.runs import NAMES, agents_near, perceive
 from cooperation_worlds.world import (
     ROAD_LIDAR,
     ROAD_RANGE_M,
     Array,
     Builder,
+    Log,
     World,
     agents_touch,
     first_that_keeps,
@@ -27,7 +29,7 @@ GAP_M = 0.05  # between all at least
 FROM_M, TO_M = 46.0, 13.0  # distances between ego and target that a variant covers, from 46 m or more to 13 m or less
 
 
-def draw_range(seed: int) -> World:
+def draw(seed: int) -> World:
     """Draw a variant that keeps what the test promises."""
     return first_that_keeps("range", 1, seed, _drawn, keeps_promise)
 
@@ -127,28 +129,26 @@ EDGES_M = np.arange(10.0, 51.0, 5.0)
 AROUND_30_M = (27.5, 32.5)
 
 
-def perceived(world: World, found: Found) -> Array:
+def measured(world: World, log: Log, way: str) -> list[Array]:
     """Rows (T, 2) of times from the first tick to the last one: distance of the target, and whether it was perceived."""
+    found = perceive(log, way, world.scene.start_ns)
     t_s = np.arange(world.period_s, world.scene.duration_s - world.period_s, COMPARED_S)
     target = world.target_actor
     xy, seen = target.at(t_s).center_m[:, :2], np.zeros(len(t_s), bool)
     for agent in agents_near(found.scenario, target.spec.category):
         state, there = found.at(agent, t_s)
         seen |= there & (np.linalg.norm(state[:, :2] - xy, axis=1) < MATCH_M)
-    return np.column_stack([world.distances_m(t_s), seen])
+    return [np.column_stack([world.distances_m(t_s), seen])]
 
 
-def figures(rows: Sequence[Array]) -> dict[str, object]:
-    """Recall by distance over all variants, and the range up to which the target is perceived at least half of the time."""
-    table = np.concatenate(rows)
-    by_bin = {}
-    for low, high in itertools.pairwise(EDGES_M):
-        inside = (table[:, 0] >= low) & (table[:, 0] < high)
-        by_bin[f"{low:.0f}-{high:.0f}"] = float(table[inside, 1].mean()) if inside.any() else None
-    inside = (table[:, 0] >= AROUND_30_M[0]) & (table[:, 0] < AROUND_30_M[1])
-    reached = float(EDGES_M[0])
-    for high, recall in zip(EDGES_M[1:], by_bin.values()):
-        if recall is not None and recall < 0.5:
-            break
-        reached = float(high)
-    return {"range_m": reached, "recall_30m": float(table[inside, 1].mean()), "recall_by_distance": by_bin}
+def table(_: Sequence[World], rows: dict[str, list[Array]]) -> str:
+    """Recall by distance over all variants, and the range up to which the target is perceived at least half of the time, by way."""
+    spans = list(itertools.pairwise(EDGES_M))
+    lines = []
+    for way, of_way in rows.items():
+        away, seen = np.concatenate(of_way).T
+        within = [seen[(away >= low) & (away < high)] for low, high in [AROUND_30_M, *spans]]
+        around, *recalls = (float(v.mean()) if len(v) else None for v in within)
+        reached = next((low for (low, _), v in zip(spans, recalls) if v is not None and v < 0.5), EDGES_M[-1])
+        lines.append([NAMES[way], f"{reached:.0f}", cell(around), *map(cell, recalls)])
+    return markdown(["", "range m", "recall at 30 m", *(f"{low:.0f}-{high:.0f} m" for low, high in spans)], lines)

@@ -8,8 +8,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from benchmarks.table import cell, markdown
 from numpy.typing import NDArray
 
+from cooperation_worlds.runs import NAMES, detect
 from cooperation_worlds.world import ROAD_LIDAR, ROAD_LINES, VEHICLE_LIDAR, Array, Parts
 from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.evaluation.detection.boxes import SceneBoxes
@@ -52,7 +54,7 @@ class HiddenTraffic:
     pole: LidarModel
     place: SensorState  # of the pole's LiDAR
     ego_parts: Parts  # shape of the ego, as the pole sees it
-    ego_size: tuple[float, float, float]  # shape of the ego, as the pole sees it
+    ego_size: tuple[float, float, float]
     late_s: float  # of the pole's sweeps after those of the vehicle
 
     def vehicle_returns(self, t_s: float, index: int) -> Returns:
@@ -75,18 +77,24 @@ def _solid(parts: Parts, position: Array, yaw: float, speed: float) -> Solid:
     return Solid(parts, position, yaw, speed * np.array([np.cos(yaw), np.sin(yaw)]))
 
 
-def draw_hidden_traffic(seed: int) -> HiddenTraffic:
+def draw(seed: int) -> SeenTraffic:
     """Draw a scene in which many vehicles hide from the LiDAR of the one that records, and a pole that may see them."""
     for attempt in range(MAX_TRIES):
-        traffic = _drawn(seed, attempt)
-        truth, hidden = truth_at(_first_sweeps(traffic), START_NS + round(PERIOD_S * NS_PER_S), "vehicle")
+        traffic = drawn(seed, attempt)
+        # The first sweep of each end alone decides, without a log.
+        first = {
+            VEHICLE_LIDAR: [traffic.vehicle_returns(PERIOD_S / 2, 0)],
+            ROAD_LIDAR: [traffic.road_returns(PERIOD_S / 2, 0)],
+        }
+        one = SeenTraffic(traffic, Log("", "", {}, {}, {}, None), first)
+        truth, hidden = truth_at(one, START_NS + round(PERIOD_S * NS_PER_S), "vehicle")
         counted = ~truth.ignored
         if (hidden & counted).sum() >= MIN_HIDDEN_SHARE * max(counted.sum(), MIN_COUNTED):
-            return traffic
+            return seen(traffic)
     raise RuntimeError(f"hidden traffic, seed {seed}: none of {MAX_TRIES} scenes hides enough vehicles")
 
 
-def _drawn(seed: int, attempt: int) -> HiddenTraffic:
+def drawn(seed: int, attempt: int) -> HiddenTraffic:
     """Draw a scene and a pole beside its road, 10 to 35 m from the vehicle."""
     rng = np.random.default_rng([seed, 11, attempt])
     model = LIDAR_MODELS[str(rng.choice(VEHICLE_MODELS))]
@@ -101,12 +109,8 @@ def _drawn(seed: int, attempt: int) -> HiddenTraffic:
     rotation = rotation_from_rpy(lean[0], lean[1], direction + float(rng.uniform(-np.pi, np.pi)))
     ground = scene.surface.elevation(np.append(xy, 0.0))
     lines = int(rng.choice(ROAD_LINES))
-    pole = LidarModel(
-        name="pole",
-        elevation_deg=tuple(np.linspace(-35.0 if height > 4 else -25.0, 5.0, lines).tolist()),
-        azimuth_step_deg=0.3,
-        range_m=100.0,
-    )
+    elevation = np.linspace(-35.0 if height > 4 else -25.0, 5.0, lines)
+    pole = LidarModel(name="pole", elevation_deg=tuple(elevation.tolist()), azimuth_step_deg=0.3, range_m=100.0)
     size, parts = car(rng)
     while size[2] > scene.sensor.position_m[2] - 0.1 or size[0] > 5.2:
         size, parts = car(rng)
@@ -139,35 +143,20 @@ def seen(traffic: HiddenTraffic) -> SeenTraffic:
     for name, all_returns in returns.items():
         sweeps = []
         for middle, r in zip(stamps[name], all_returns):
-            xyz, frame = (r.xyz_m, "map") if name == VEHICLE_LIDAR else (_local(r.xyz_m, map_T_pole), "lidar")
+            local = ((r.xyz_m - map_T_pole[:3, 3]) @ map_T_pole[:3, :3]).astype(np.float32)
+            xyz, frame = (r.xyz_m, "map") if name == VEHICLE_LIDAR else (local, "lidar")
             t_ns = middle + np.rint(r.t_s.astype(np.float64) * NS_PER_S).astype(np.int64)
             sweeps.append(Sweep(int(middle + PERIOD_S / 2 * NS_PER_S), xyz, frame, t_ns))  # type: ignore[arg-type]
         streams[name] = Stream(name, np.array([s.stamp_ns for s in sweeps]), sweeps.__getitem__)
     t_s = np.arange(-0.1, SWEEPS * PERIOD_S + 0.2, 0.02)
+    lidars = {
+        VEHICLE_LIDAR: Lidar(VEHICLE_LIDAR, "ego", ego_T_lidar), ROAD_LIDAR: Lidar(ROAD_LIDAR, "map", map_T_pole),
+    }  # fmt: skip
     log = Log(
-        name=f"hidden_traffic_{traffic.seed}",
-        format="synthetic",
-        cameras={},
-        lidars={
-            VEHICLE_LIDAR: Lidar(VEHICLE_LIDAR, "ego", ego_T_lidar),
-            ROAD_LIDAR: Lidar(ROAD_LIDAR, "map", map_T_pole),
-        },
-        streams=streams,
-        ego=poses_of(traffic.run, ego_T_lidar, t_s),
-        ego_vehicle=EgoVehicle(traffic.ego_size, REAR_AXLE_OFFSET_M),
-    )
+        name=f"hidden_traffic_{traffic.seed}", format="synthetic", cameras={}, lidars=lidars, streams=streams,
+        ego=poses_of(traffic.run, ego_T_lidar, t_s), ego_vehicle=EgoVehicle(traffic.ego_size, REAR_AXLE_OFFSET_M),
+    )  # fmt: skip
     return SeenTraffic(traffic, log, returns)
-
-
-def _first_sweeps(traffic: HiddenTraffic) -> SeenTraffic:
-    """Cast the first sweep of each end alone, without a log."""
-    vehicle, road = traffic.vehicle_returns(PERIOD_S / 2, 0), traffic.road_returns(PERIOD_S / 2, 0)
-    nothing = Log("", "", {}, {}, {}, None)
-    return SeenTraffic(traffic, nothing, {VEHICLE_LIDAR: [vehicle], ROAD_LIDAR: [road]})
-
-
-def _local(xyz: NDArray[np.float32], map_T_lidar: Array) -> NDArray[np.float32]:
-    return ((xyz - map_T_lidar[:3, 3]) @ map_T_lidar[:3, :3]).astype(np.float32)
 
 
 def points_of(view: SeenTraffic, name: str, index: int) -> NDArray[np.int64]:
@@ -188,10 +177,9 @@ def truth_at(view: SeenTraffic, stamp_ns: int, kind: str) -> tuple[SceneBoxes, N
     scene = view.traffic.run.at(middle_s)
     vehicle, road = (points_of(view, name, index) for name in (VEHICLE_LIDAR, ROAD_LIDAR))
     rows = [k for k, o in enumerate(scene.objects) if _is(o.category, kind)]
-    boxes = np.array(
-        [_box(scene.objects[k].position_m, scene.objects[k].size_m, scene.objects[k].yaw_rad) for k in rows]
-    )
-    boxes = boxes.reshape(-1, 7)
+    of = [scene.objects[k] for k in rows]
+    boxes = [[*o.position_m[:2], o.position_m[2] + o.size_m[2] / 2, *o.size_m, o.yaw_rad] for o in of]
+    boxes = np.array(boxes).reshape(-1, 7)
     ego = _ego_xy(scene)
     away = np.hypot(*(boxes[:, :2] - ego).T)
     few = (vehicle + road)[rows] < MIN_POINTS
@@ -218,6 +206,11 @@ def found_at(view: SeenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> Sce
 
 # By kind: found boxes of a sweep, true ones, and which of these hide from the vehicle.
 BoxesOfSweep = dict[str, tuple[SceneBoxes, SceneBoxes, NDArray[np.bool_]]]
+
+
+def measured(view: SeenTraffic, log: Log, way: str) -> list[BoxesOfSweep]:
+    """Boxes of each sweep beside the true ones, of all road users that both ends together have points of."""
+    return sweeps(view, *detect(log, way, min_score=MIN_SCORE))
 
 
 def sweeps(view: SeenTraffic, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> list[BoxesOfSweep]:
@@ -250,6 +243,15 @@ def figures(rows: dict[str, list[BoxesOfSweep]]) -> dict[str, Any]:
     return {"ap": ap, "recall": recall, "vehicles": count, "hidden_from_vehicle": share}
 
 
+def table(_: Sequence[SeenTraffic], rows: dict[str, list[BoxesOfSweep]]) -> str:
+    """The figures, by way."""
+    found = figures(rows)
+    lines = [[kind, *(cell(ap[w] and 100 * ap[w], 1) for w in rows)] for kind, ap in found["ap"].items()]
+    lines += [[f"recall, vehicles {what}", *(cell(of[w]) for w in rows)] for what, of in found["recall"].items()]
+    share = f"{found['vehicles']} vehicles, {100 * found['hidden_from_vehicle']:.0f} % hidden from the vehicle"
+    return markdown(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in rows)], lines) + "\n\n" + share
+
+
 @cache
 def _at(run: TrafficRun, t_s: float) -> TrafficScene:
     return run.at(t_s)
@@ -257,10 +259,6 @@ def _at(run: TrafficRun, t_s: float) -> TrafficScene:
 
 def _is(category: str, kind: str) -> bool:
     return bool(category) and (category == kind or GROUP_OF.get(category) == kind)
-
-
-def _box(position: Array, size: tuple[float, float, float], yaw: float) -> Array:
-    return np.array([*position[:2], position[2] + size[2] / 2, *size, yaw])
 
 
 def _ego_xy(scene: TrafficScene) -> Array:

@@ -6,17 +6,18 @@ Measures are the paper's and IoU. Frame: the ego drives along x at y = 0.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from benchmarks.table import markdown
 from numpy.typing import NDArray
 
-from cooperation_worlds.runs import ALONE, Found, agents_near
+from cooperation_worlds.runs import ALONE, NAMES, agents_near, detect, perceive
 from cooperation_worlds.world import (
     ROAD_LIDAR,
     VEHICLE_LIDAR,
     Array,
     Builder,
+    Log,
     World,
     agents_touch,
     first_that_keeps,
@@ -32,7 +33,7 @@ NEAR_M, FAR_M = 6.0, 17.5  # of the target's center from the ego's, whose LiDAR 
 MIN_VIEW_ANGLE_RAD = np.deg2rad(50)  # between the views of both ends, at the target
 
 
-def draw_overlap(seed: int) -> World:
+def draw(seed: int) -> World:
     """Draw a variant that keeps what the test promises."""
     return first_that_keeps("overlap", 3, seed, _drawn, keeps_promise)
 
@@ -43,17 +44,14 @@ def keeps_promise(world: World) -> bool:
     away = world.distances_m(t_s)
     if agents_touch(world, t_s, GAP_M) or things_touch(world, t_s, GAP_M):
         return False
-    if away.min() < NEAR_M or away.max() > FAR_M or _view_angle(world, t_s).min() < MIN_VIEW_ANGLE_RAD:
-        return False
-    return all((visible_share(world, lidar, t_s) > 0.35).all() for lidar in (VEHICLE_LIDAR, ROAD_LIDAR))
-
-
-def _view_angle(world: World, t_s: np.ndarray) -> np.ndarray:
     ego, xy = world.moving.ego, world.target_actor.at(t_s).center_m[:, :2]
     assert ego is not None
     views = [ego.at(t_s).center_m[:, :2] - xy, np.array(world.scene.lidar[1].position_m[:2]) - xy]
     cross = views[0][:, 0] * views[1][:, 1] - views[0][:, 1] * views[1][:, 0]
-    return np.abs(np.arctan2(cross, (views[0] * views[1]).sum(1)))
+    angle = np.abs(np.arctan2(cross, (views[0] * views[1]).sum(1)))
+    if away.min() < NEAR_M or away.max() > FAR_M or angle.min() < MIN_VIEW_ANGLE_RAD:
+        return False
+    return all((visible_share(world, lidar, t_s) > 0.35).all() for lidar in (VEHICLE_LIDAR, ROAD_LIDAR))
 
 
 def _drawn(out: Builder) -> World:
@@ -104,8 +102,14 @@ def target_boxes(world: World, t_s: Array) -> Array:
     return np.column_stack([states.center_m[:, :2], size, states.yaw_rad])
 
 
-def of_scenario(world: World, found: Found) -> Array:
+def measured(world: World, log: Log, way: str) -> list[tuple[Array, Array]]:
+    """Overlap and IoU (F, 2) and (T, 2) of the target, sweep by sweep and in the scenario."""
+    return [(from_boxes(world, *detect(log, way)), of_scenario(world, log, way))]
+
+
+def of_scenario(world: World, log: Log, way: str) -> Array:
     """Overlap and IoU (T, 2) of the agent at the target's place, 0 where there is none."""
+    found = perceive(log, way, world.scene.start_ns)
     t_s = np.arange(MARGIN_S, world.scene.duration_s - MARGIN_S, STEP_S)
     truth = target_boxes(world, t_s)
     category = world.target_actor.spec.category
@@ -130,11 +134,8 @@ def from_boxes(world: World, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D], 
             continue
         truth = target_boxes(world, t_s)
         group = np.array([GROUP_OF[c] == GROUP_OF[category] for c in found.category], bool)
-        near = (
-            group
-            & (np.linalg.norm(found.center_m[:, :2] - truth[:, :2], axis=1) < MATCH_M)
-            & (found.score >= min_score)
-        )
+        away = np.linalg.norm(found.center_m[:, :2] - truth[:, :2], axis=1)
+        near = group & (away < MATCH_M) & (found.score >= min_score)
         if not near.any():
             out.append(np.zeros(2))
             continue
@@ -151,30 +152,35 @@ def shares(found: Array, truth: Array) -> Array:
     return np.column_stack([shared / area[1], shared / (area[0] + area[1] - shared)])
 
 
-def figures(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Means over variants by way, where the target is found, and the gain over the end alone that is better.
+HEAD = ["", "of", "found", "overlap", "IoU", "over the better end", "over the better of each variant", "worse variants"]
 
-    `over_better_end` is over the end that is better on average, `over_better_by_variant` over the one that is better in each
-    variant, which nobody knows beforehand; so is `worse_variants`.
+
+def table(_: Sequence[World], rows: dict[str, list[tuple[Array, Array]]]) -> str:
+    """Means over variants, where the target is found, box by box and as a scenario, and the gain over the end alone that is better.
+
+    One is better on average, another one in each variant, which nobody knows beforehand; a variant is worse than the latter.
     """
-    table = [{way: np.reshape(of_way, (-1, 2)) for way, of_way in r.items()} for r in rows]
-    means = {way: np.array([_mean(r[way]) for r in table]) for way in table[0]}
-    ends = np.array([means[way][:, 1] for way in ALONE if way in means])
-    better, best_on_average = np.nanmax(ends, axis=0), np.nanmean(ends, axis=1).max()
-    return {
-        way: {
-            "found": float(np.mean([(r[way][:, 1] > 0).mean() for r in table])),
-            "overlap": float(np.nanmean(m[:, 0])),
-            "iou": float(np.nanmean(m[:, 1])),
-            "over_better_end": float(np.nanmean(m[:, 1]) - best_on_average),
-            "over_better_by_variant": float(np.nanmean(m[:, 1] - better)),
-            "worse_variants": int(np.sum(m[:, 1] < better - WORSE_BY)),
-        }
-        for way, m in means.items()
-    }
-
-
-def _mean(shares: Array) -> Array:
-    """Return the mean overlap and IoU (2,) of the times at which the target is found; NaN without any."""
-    found = shares[shares[:, 1] > 0]
-    return found.mean(0) if len(found) else np.full(2, np.nan)
+    lines = []
+    for k, of in enumerate(("boxes", "scenario")):
+        found = {way: [np.reshape(r[k], (-1, 2)) for r in of_way] for way, of_way in rows.items()}
+        hits = {way: [s[s[:, 1] > 0] for s in of_way] for way, of_way in found.items()}
+        means = {way: np.array([s.mean(0) if len(s) else np.full(2, np.nan) for s in of]) for way, of in hits.items()}
+        ends = np.array([means[way][:, 1] for way in ALONE if way in means])
+        better, best_on_average = np.nanmax(ends, axis=0), np.nanmean(ends, axis=1).max()
+        for way, m in means.items():
+            share = np.mean([(s[:, 1] > 0).mean() for s in found[way]])
+            overlap, iou = np.nanmean(m, axis=0)
+            gains = iou - best_on_average, np.nanmean(m[:, 1] - better)
+            worse = int(np.sum(m[:, 1] < better - WORSE_BY))
+            lines.append(
+                [
+                    NAMES[way],
+                    of,
+                    f"{share:.2f}",
+                    f"{overlap:.3f}",
+                    f"{iou:.3f}",
+                    *(f"{g:+.3f}" for g in gains),
+                    str(worse),
+                ]
+            )
+    return markdown(HEAD, lines)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from benchmarks.table import cell, markdown
 from numpy.typing import NDArray
 
 from cooperation_worlds.world import Array
@@ -78,51 +76,4 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
     return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
 
 
-NAMES = {
-    "vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes",
-}  # fmt: skip
-# Title, figure and format of the columns of tests B and C.
-BLIND_AREA = (
-    ("known before contact s", "before_contact_s", ".2f"), ("distance m", "distance_m", ".1f"), ("least m", "distance_least_m", ".1f"),
-    ("20 m or more", "from_20_m", ".2f"), ("gained s", "gained_s", ".2f"), ("2 s or more", "gained_2_s", ".2f"),
-    ("never known", "never", "d"), ("collisions, braking when known", "collisions", "d"),
-    ("warned before contact s", "warned_before_s", ".2f"), ("never warned", "never_warned", "d"),
-    ("collisions, braking when warned", "collisions_warned", "d"),
-)  # fmt: skip
-OVERLAP = (
-    ("found", "found", ".2f"), ("overlap", "overlap", ".3f"), ("IoU", "iou", ".3f"), ("over the better end", "over_better_end", "+.3f"),
-    ("over the better of each variant", "over_better_by_variant", "+.3f"), ("worse variants", "worse_variants", "d"),
-)  # fmt: skip
-
-
-def range_table(figures: dict[str, Any]) -> str:
-    bins = list(next(iter(figures.values()))["recall_by_distance"])
-    rows = [
-        [NAMES[w], f"{f['range_m']:.0f}", cell(f["recall_30m"]), *(cell(v) for v in f["recall_by_distance"].values())]
-        for w, f in figures.items()
-    ]
-    return markdown(["", "range m", "recall at 30 m", *(f"{b} m" for b in bins)], rows)
-
-
-def blind_area_table(figures: dict[str, Any]) -> str:
-    rows = [[NAMES[w], *(format(f[key], form) for _, key, form in BLIND_AREA)] for w, f in figures.items()]
-    return markdown(["", *(title for title, _, _ in BLIND_AREA)], rows)
-
-
-def overlap_table(figures: dict[str, Any]) -> str:
-    found = [(of, w, f) for of in ("boxes", "scenario") for w, f in figures[of].items()]
-    rows = [[NAMES[w], of, *(format(f[key], form) for _, key, form in OVERLAP)] for of, w, f in found]
-    return markdown(["", "of", *(title for title, _, _ in OVERLAP)], rows)
-
-
-def ap_table(figures: dict[str, Any]) -> str:
-    ways = list(next(iter(figures["ap"].values())))
-    rows = [[kind, *(cell(ap[w] and 100 * ap[w], 1) for w in ways)] for kind, ap in figures["ap"].items()]
-    rows += [[f"recall, vehicles {what}", *(cell(of[w]) for w in ways)] for what, of in figures["recall"].items()]
-    share = f"{figures['vehicles']} vehicles, {100 * figures['hidden_from_vehicle']:.0f} % hidden from the vehicle"
-    return markdown(["AP BEV .5; people, two-wheelers .25", *(NAMES[w] for w in ways)], rows) + "\n\n" + share
-
-
-TABLE: dict[str, Callable[[dict[str, Any]], str]] = {
-    "range": range_table, "blind_area": blind_area_table, "overlap": overlap_table, "ap": ap_table,
-}  # fmt: skip
+NAMES = {"vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes"}

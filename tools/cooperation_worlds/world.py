@@ -5,6 +5,7 @@ Scene files are cast against meshes; here the caster of the random traffic is us
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -21,7 +22,7 @@ from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_poly
 from log2sim.synth.polytopes import Material, Polytope, Shape, box
 from log2sim.synth.raycast import mount_T_lidar, slab_distance, sweep_stamps
 from log2sim.synth.returns import LidarModel, ReturnModel
-from log2sim.synth.scene import Building, LidarSpec, Scene
+from log2sim.synth.scene import LidarSpec, Scene
 from log2sim.synth.synthesis import synthesize
 from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic_shapes import ROAD_USERS, SMALL
@@ -105,7 +106,11 @@ def cast(
         velocity = step / 0.1
     sensor = SensorState(map_T_lidar[:3, :3], map_T_lidar[:3, 3], velocity)
     solids = [_solid(actor, world.parts[actor.spec.id], t_s) for actor in moving.seen_from(spec.mount)]
-    solids += [*(_house(building) for building in world.scene.building), *world.things]
+    for house in world.scene.building:
+        half = np.array(house.size_m[:2]) / 2
+        part = box((*-half, 0.0), (*half, house.size_m[2]), Material.WALL)
+        solids.append(Solid((part,), np.array([*house.center, 0.0]), float(np.deg2rad(house.yaw_deg)), np.zeros(2)))
+    solids += world.things
     returns = cast_polytopes(
         model_of(spec), sensor, solids, _ground(world.seed), rng, ReturnModel(spec.noise_m, spec.dropout)
     )
@@ -119,15 +124,9 @@ def cast(
 def model_of(spec: LidarSpec) -> LidarModel:
     """Describe a LiDAR of a scene for the caster."""
     even = np.linspace(*spec.elevation_deg, spec.channels)
-    return LidarModel(
-        name=spec.name,
-        elevation_deg=spec.channels_deg or tuple(even.tolist()),
-        azimuth_deg=spec.azimuth_deg,
-        azimuth_step_deg=spec.azimuth_step_deg,
-        range_m=spec.range_m,
-        noise_m=spec.noise_m,
-        rate_hz=spec.rate_hz,
-    )
+    alike = ("name", "azimuth_deg", "azimuth_step_deg", "range_m", "noise_m", "rate_hz")
+    lines = spec.channels_deg or tuple(even.tolist())
+    return LidarModel(elevation_deg=lines, **{key: getattr(spec, key) for key in alike})
 
 
 def _solid(actor: Actor, parts: Parts, t_s: float) -> Solid:
@@ -135,12 +134,6 @@ def _solid(actor: Actor, parts: Parts, t_s: float) -> Solid:
     yaw, speed = float(state.yaw_rad[0]), float(state.speed_mps[0])
     floor = state.center_m[0] - [0.0, 0.0, actor.spec.box_m[2] / 2]
     return Solid(parts, floor, yaw, speed * np.array([np.cos(yaw), np.sin(yaw)]))
-
-
-def _house(building: Building) -> Solid:
-    length, width, height = building.size_m
-    parts = (box((-length / 2, -width / 2, 0.0), (length / 2, width / 2, height), Material.WALL),)
-    return Solid(parts, np.array([*building.center, 0.0]), float(np.deg2rad(building.yaw_deg)), np.zeros(2))
 
 
 @cache
@@ -151,12 +144,6 @@ def _ground(seed: int) -> Surface:
         [rng.uniform(0, 0.01, 3), rng.normal(0, 0.2, 3), rng.normal(0, 0.2, 3), rng.uniform(0, 2 * np.pi, 3)]
     )
     return Surface(np.zeros(5), waves, (), 0.0)
-
-
-def rigid(xy_m: Array, yaw_rad: float, xy: Array) -> Array:
-    """Turn points (N, 2) and move them."""
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    return np.asarray(np.asarray(xy) @ np.array([[c, s], [-s, c]]) + xy_m)
 
 
 # The sensors of the paper: at 2 m with a range of 20 m on the vehicle, at 3 m with 40 m at the road.
@@ -195,18 +182,14 @@ class Builder:
     ego: dict[str, Any] = field(default_factory=dict)
     things: list[tuple[Parts, Array, float]] = field(default_factory=list)
 
-    def drive_ego(self, waypoints: Array, **more: Any) -> None:
+    def drive_ego(self, waypoints: Any) -> None:
         """Let the ego, a car of random shape, drive along waypoints (W, 3: x, y, speed) of its box's center at time 0."""
         (length, width, height), parts = ROAD_USERS["car"](self.rng)
         while length > 5.2 or height > VEHICLE_HEIGHT_M - 0.1:
             (length, width, height), parts = ROAD_USERS["car"](self.rng)
         self.parts["ego"] = parts
-        self.ego = {
-            "waypoints": waypoints,
-            "size_m": _rounded((length, width, height)),
-            "rear_axle_offset_m": round(0.3 * length, 3),
-            **more,
-        }
+        size = _rounded((length, width, height))
+        self.ego = {"waypoints": waypoints, "size_m": size, "rear_axle_offset_m": round(0.3 * length, 3)}
 
     def add(self, name: str, shape: Shape, category: str, **place: Any) -> None:
         """Add a road user of a shape, parked at `pose` (x, y, degrees) or moving along `waypoints`."""
@@ -255,60 +238,44 @@ class Builder:
     def world(self, duration_s: float, target: str, contact_s: float = float("nan")) -> World:
         """Lay everything in the map: mirrored for left-hand traffic in three of ten worlds, turned and moved."""
         rng = np.random.default_rng([self.seed, 6])
-        lay = _Placement(bool(rng.random() < 0.3), float(rng.uniform(-np.pi, np.pi)), rng.uniform(-30, 30, 2))
+        side = -1 if rng.random() < 0.3 else 1
+        turn, origin = float(rng.uniform(-np.pi, np.pi)), rng.uniform(-30, 30, 2)
+        c, s = np.cos(turn), np.sin(turn)
+
+        def points(xy: Any) -> Array:
+            return np.asarray(np.asarray(xy, np.float64) * [1, side] @ np.array([[c, s], [-s, c]]) + origin)
+
+        def degrees(angle_deg: float) -> float:
+            return float(np.rad2deg(wrap_angle(np.deg2rad(side * angle_deg) + turn)))
+
+        def waypoints(rows: Any) -> list[list[float]]:
+            rows = np.asarray(rows, np.float64)
+            return np.column_stack([points(rows[:, :2]), rows[:, 2]]).tolist()  # type: ignore[no-any-return]
+
+        def laid(one: dict[str, Any]) -> dict[str, Any]:
+            """What of a table is a place or an angle, in the map."""
+            out = dict(one)
+            if "waypoints" in one:
+                out["waypoints"] = waypoints(one["waypoints"])
+            if "pose" in one:
+                out["pose"] = [*points([one["pose"][:2]])[0].tolist(), degrees(one["pose"][2])]
+            if one.get("mount") == "map":
+                x, y, z = one["position_m"]
+                out |= {"position_m": [*points([[x, y]])[0].tolist(), z], "yaw_deg": degrees(one["yaw_deg"])}
+            if "center" in one:
+                out |= {"center": points([one["center"]])[0].tolist(), "yaw_deg": degrees(0.0)}
+            return out
+
         table = {
-            "name": f"{self.test}_{self.seed}",
-            "duration_s": duration_s,
-            "ego": {**self.ego, "waypoints": lay.waypoints(self.ego["waypoints"]), "poses": "poses"},
-            "road": [{**road, "line": lay.points(road["line"]).tolist()} for road in self.roads],
-            "building": [
-                {**h, "center": lay.points([h["center"]])[0].tolist(), "yaw_deg": lay.degrees(h.get("yaw_deg", 0.0))}
-                for h in self.houses
-            ],
-            "agent": [lay.agent(agent) for agent in self.agents],
-            "lidar": [lay.lidar(lidar) for lidar in self.lidars],
-        }
+            "name": f"{self.test}_{self.seed}", "duration_s": duration_s, "ego": {**laid(self.ego), "poses": "poses"},
+            "road": [{**road, "line": points(road["line"]).tolist()} for road in self.roads],
+            "building": list(map(laid, self.houses)), "agent": list(map(laid, self.agents)), "lidar": list(map(laid, self.lidars)),
+        }  # fmt: skip
         things = tuple(
-            Solid(parts, np.append(lay.points([xy])[0], 0.0), np.deg2rad(lay.degrees(np.rad2deg(yaw))), np.zeros(2))
+            Solid(parts, np.append(points([xy])[0], 0.0), np.deg2rad(degrees(np.rad2deg(yaw))), np.zeros(2))
             for parts, xy, yaw in self.things
         )
         return World(self.test, self.seed, Scene.model_validate(table), self.parts, target, contact_s, things)
-
-
-@dataclass(frozen=True, eq=False)
-class _Placement:
-    """Where a world lies in the map."""
-
-    mirrored: bool
-    yaw_rad: float
-    xy_m: Array
-
-    def points(self, xy: Any) -> Array:
-        return rigid(self.xy_m, self.yaw_rad, np.asarray(xy, np.float64) * [1, -1 if self.mirrored else 1])
-
-    def degrees(self, angle_deg: float) -> float:
-        turned = np.deg2rad(-angle_deg if self.mirrored else angle_deg) + self.yaw_rad
-        return float(np.rad2deg(wrap_angle(turned)))
-
-    def waypoints(self, rows: Any) -> list[list[float]]:
-        rows = np.asarray(rows, np.float64)
-        return np.column_stack([self.points(rows[:, :2]), rows[:, 2]]).tolist()  # type: ignore[no-any-return]
-
-    def agent(self, agent: dict[str, Any]) -> dict[str, Any]:
-        if "pose" in agent:
-            x, y, yaw = agent["pose"]
-            return {**agent, "pose": [*self.points([[x, y]])[0].tolist(), self.degrees(yaw)]}
-        return {**agent, "waypoints": self.waypoints(agent["waypoints"])}
-
-    def lidar(self, lidar: dict[str, Any]) -> dict[str, Any]:
-        if lidar.get("mount") != "map":
-            return lidar
-        x, y, z = lidar["position_m"]
-        return {
-            **lidar,
-            "position_m": [*self.points([[x, y]])[0].tolist(), z],
-            "yaw_deg": self.degrees(lidar["yaw_deg"]),
-        }
 
 
 def _rounded(size: Sequence[float]) -> list[float]:
@@ -354,46 +321,37 @@ def visible_share(world: World, lidar: str, t_s: Array, target: str = "") -> Arr
     shares = np.array([(x, y, z) for x in ALONG for y in ACROSS for z in UP])
     states, out = actor.at(t_s), np.zeros(len(t_s))
     boxes = [(np.array(other.spec.box_m), other.at(t_s)) for other in seen.values()]
+    # What stands for good: rotation, center and size of the box around each building, and each part of a thing.
+    standing = []
+    for house in world.scene.building:
+        back = rotation_from_rpy(0, 0, np.deg2rad(house.yaw_deg))
+        standing.append((back, np.array([*house.center, house.size_m[2] / 2]), np.array(house.size_m)))
+    for thing in world.things:
+        back = rotation_from_rpy(0, 0, thing.yaw_rad)
+        for part in thing.parts:
+            middle = thing.position_m + back @ (part.low + part.high) / 2
+            standing.append((back, middle, np.asarray(part.high - part.low)))
     for k in range(len(t_s)):
         local = shares * np.array(actor.spec.box_m) * [0.5, 0.5, 1.0] - [0, 0, actor.spec.box_m[2] / 2]
         points = local @ rotation_from_rpy(0, 0, states.yaw_rad[k]).T + states.center_m[k]
         ray = points - eye[k]
         free = np.linalg.norm(ray, axis=1) < spec.range_m
-        for size, at in boxes:
-            back = rotation_from_rpy(0, 0, at.yaw_rad[k])
-            origin = np.tile((eye[k] - at.center_m[k]) @ back, (len(ray), 1))
-            free &= ~(slab_distance(size, origin, ray @ back) < 1.0)
-        for back, middle, size in _standing(world):
+        moved = [(rotation_from_rpy(0, 0, at.yaw_rad[k]), at.center_m[k], size) for size, at in boxes]
+        for back, middle, size in [*moved, *standing]:
             origin = np.tile((eye[k] - middle) @ back, (len(ray), 1))
             free &= ~(slab_distance(size, origin, ray @ back) < 1.0)
         out[k] = free.mean()
     return out
 
 
-def _standing(world: World) -> list[tuple[Array, Array, Array]]:
-    """List what stands for good: rotation, center and size of the box around each building, and each part of a thing."""
-    out = []
-    for house in world.scene.building:
-        back = rotation_from_rpy(0, 0, np.deg2rad(house.yaw_deg))
-        out.append((back, np.array([*house.center, house.size_m[2] / 2]), np.array(house.size_m)))
-    for thing in world.things:
-        back = rotation_from_rpy(0, 0, thing.yaw_rad)
-        for part in thing.parts:
-            middle = thing.position_m + back @ (part.low + part.high) / 2
-            out.append((back, middle, np.asarray(part.high - part.low)))
-    return out
-
-
 def agents_touch(world: World, t_s: Array, gap_m: float) -> bool:
     """Return whether two road users, the ego among them, come nearer to each other than a gap at times (T,)."""
     states = [(actor.at(t_s), np.tile(np.array(actor.spec.box_m[:2]) + gap_m, (len(t_s), 1))) for actor in _all(world)]
-    return any(
-        rectangles_overlap(
-            *(other.center_m - one.center_m)[:, :2].T, one.yaw_rad, other.yaw_rad, size, other_size
-        ).any()
-        for k, (one, size) in enumerate(states)
-        for other, other_size in states[:k]
-    )
+    for (other, other_size), (one, size) in itertools.combinations(states, 2):
+        apart = (other.center_m - one.center_m)[:, :2].T
+        if rectangles_overlap(*apart, one.yaw_rad, other.yaw_rad, size, other_size).any():
+            return True
+    return False
 
 
 def things_touch(world: World, t_s: Array, gap_m: float) -> bool:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kitti.boxes import PERIOD_NS, Boxes, Index, Mask, View, from_map, hidden_share, is_small, overlap_3d, same_frame
 from kitti.tracks import (
@@ -137,7 +136,11 @@ class Described:
 
 def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
     """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
-    out = _in_camera(rows, boxes, measurements, view, online=online)
+    columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
+    in_camera = from_map(*smooth_shapes(rows, boxes, measurements, online=online), rows.frame, view)
+    # In the image the detector knows better than a box around a box.
+    in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
+    out = Boxes(**(columns | in_camera))
     inside = np.isfinite(out.box_px).all(axis=1)
     out, rows = out.take(inside), rows.take(inside)
     if not online:
@@ -147,7 +150,7 @@ def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *
     seen = rows.source >= 0
     score = np.where(seen, boxes.score[rows.source], 0.0)
     distance, beyond, gap = _distances(rows, online=online)
-    moved = np.clip(_moved_m(rows, measurements, online=online) / MOVED_M, 0, 1) * view.motion_known
+    moved = np.clip(_moved_m(rows, measurements.center_m, online=online)[0] / MOVED_M, 0, 1) * view.motion_known
     evidence = _evidence(rows.track, seen, score, online | (beyond == 0), online=online)
     confidence = np.clip(evidence + moved, *CONFIDENCE_LIMITS)
     share, local = _near(rows, seen, score, online=online)
@@ -160,7 +163,7 @@ def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *
         "hidden": np.maximum(hidden - HIDDEN_SHARE, 0),
         "height": np.log(height / HEIGHTS_PX[1]),
     }
-    doubled = _from_there_on(_doubled(out, distance), beyond, out.track_id)
+    doubled = _doubled(out, distance, beyond)
     hits = sum_so_far(seen, first_of_run(out.track_id))
     return Described(out, seen, distance, gap, doubled, hits, confidence, features)
 
@@ -178,15 +181,6 @@ def _distances(rows: Rows, *, online: bool) -> tuple[Index, Index, Index]:
     return distance, np.where(outside, since, 0), np.where(seen | outside, 0, since + until - 1)
 
 
-def _in_camera(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Boxes:
-    columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
-    center, size, yaw = smooth_shapes(rows, boxes, measurements, online=online)
-    in_camera = from_map(center, size, yaw, rows.frame, view)
-    # In the image the detector knows better than a box around a box.
-    in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
-    return Boxes(**(columns | in_camera))
-
-
 def _evidence(track: Index, seen: Mask, score: Array, within: Mask, *, online: bool) -> Array:
     """Mean score (N,) of a track over the frames in which it was in view, and the logarithm of its detections.
 
@@ -194,19 +188,16 @@ def _evidence(track: Index, seen: Mask, score: Array, within: Mask, *, online: b
     """
     begin = first_of_run(track)
     counted = np.where(within, np.where(seen, score, MISSED_SCORE), 0.0)
-    sums = [sum_so_far(v, begin) for v in (counted, within, seen)]
-    if not online:
-        last = last_of_run(begin)
-        sums = [s[last] for s in sums]
-    total, frames, hits = sums
+    end = np.arange(len(begin)) if online else last_of_run(begin)
+    total, frames, hits = (sum_so_far(v, begin)[end] for v in (counted, within, seen))
     return np.asarray(total / np.maximum(frames, 1) + np.log(np.clip(hits, 1, FULL_HITS)))
 
 
-def _moved_m(rows: Rows, measurements: Measurements, *, online: bool) -> Array:
-    """Distance (N,) in the map from the first detection of a track to its last one, online to the last one so far."""
+def _moved_m(rows: Rows, center_m: Array, *, online: bool) -> tuple[Array, Array]:
+    """Distance (N,) in the map from the first detection of a track to its last one, online to the last one so far, and frames between."""
     first, last = end_rows(rows, online=online)
-    xy = measurements.center_m[:, :2]
-    return np.asarray(np.hypot(*(xy[rows.source[last]] - xy[rows.source[first]]).T))
+    moved = center_m[rows.source[last], :2] - center_m[rows.source[first], :2]
+    return np.asarray(np.hypot(*moved.T)), rows.frame[last] - rows.frame[first]
 
 
 def _near(rows: Rows, seen: Mask, score: Array, *, online: bool) -> tuple[Array, Array]:
@@ -228,31 +219,28 @@ def _hidden(out: Boxes, hides: Mask, frames: int) -> Array:
     return hidden
 
 
-def _doubled(out: Boxes, distance: Index) -> Mask:
-    """Which predicted boxes (N,) are where another track is that was detected there or, `distance` (N,) frames away, nearer."""
+def _doubled(out: Boxes, distance: Index, beyond: Index) -> Mask:
+    """Which predicted boxes (N,) are where another track is that was detected there or, `distance` (N,) frames away, nearer.
+
+    So are those farther from the end of their track, `beyond` (N,) frames after it or, negative, before it.
+    """
     order = np.argsort(out.frame, kind="stable")
     predicted = np.flatnonzero(distance > 0)
     i, j = same_frame(out.take(predicted), out.take(order), reach_m=True)
     i, j = predicted[i], order[j]
-    stronger = (out.track_id[i] != out.track_id[j]) & (
-        (distance[j] < distance[i]) | (distance[j] == distance[i]) & (j < i)
-    )
+    nearer = (distance[j] < distance[i]) | (distance[j] == distance[i]) & (j < i)
+    stronger = (out.track_id[i] != out.track_id[j]) & nearer
     i, j = i[stronger], j[stronger]
-    doubled = np.zeros(len(out), dtype=bool)
-    doubled[i[overlap_3d(out.take(i), out.take(j)) >= SAME_PLACE_IOU]] = True
-    return doubled
-
-
-def _from_there_on(doubled: Mask, beyond: Index, track: Index) -> Mask:
-    """Doubled boxes (N,) and those farther from the end of their track, `beyond` (N,) frames after it or, negative, before it."""
-    out = doubled.copy()
+    here = np.zeros(len(out), dtype=bool)
+    here[i[overlap_3d(out.take(i), out.take(j)) >= SAME_PLACE_IOU]] = True
+    doubled = here.copy()
     for sign in (1, -1):
         rows = np.flatnonzero(sign * beyond > 0)[::sign]
         if len(rows):
             # Rows beyond the same end follow each other; elsewhere the frame jumps back to one beside an end.
-            begin = first_of_run(track[rows] + np.cumsum(np.abs(beyond[rows]) == 1) * (int(track.max()) + 1))
-            out[rows] |= sum_so_far(doubled[rows], begin) > 0
-    return out
+            ends = np.cumsum(np.abs(beyond[rows]) == 1) * (int(out.track_id.max()) + 1)
+            doubled[rows] |= sum_so_far(here[rows], first_of_run(out.track_id[rows] + ends)) > 0
+    return doubled
 
 
 # Boxes that overlap this much (IoU in 3D) are one object, as for the benchmark.
@@ -265,7 +253,15 @@ def join_tracks(rows: Rows, boxes: Boxes, distance: Index) -> tuple[Rows, Mask]:
     `boxes` are the rows in the camera, `distance` (N,) the frames to the nearest detection of the track. Those that are nearer
     in time are joined first.
     """
-    i, j = predicted_on_detected(boxes, distance)
+    # Pairs of a predicted and a detected row of two tracks of one category that are one object.
+    order = np.argsort(boxes.frame, kind="stable")
+    found, predicted = order[distance[order] == 0], np.flatnonzero(distance > 0)
+    i, j = same_frame(boxes.take(predicted), boxes.take(found), reach_m=True)
+    i, j = predicted[i], found[j]
+    other = (boxes.track_id[i] != boxes.track_id[j]) & (boxes.category[i] == boxes.category[j])
+    i, j = i[other], j[other]
+    one = overlap_3d(boxes.take(i), boxes.take(j)) >= ONE_OBJECT_IOU
+    i, j = i[one], j[one]
     order = np.argsort(distance[i], kind="stable")
     pairs = np.column_stack([rows.track[i], rows.track[j]])[order]
     pairs = np.sort(pairs, axis=1)
@@ -281,35 +277,18 @@ def join_tracks(rows: Rows, boxes: Boxes, distance: Index) -> tuple[Rows, Mask]:
     number = np.arange(int(rows.track.max(initial=-1)) + 1)
     for t in head:
         number[t] = _first(head, t)
-    joined = Rows(**{**vars(rows), "track": number[rows.track]})
-    return joined, _nearest_of_frame(joined, distance)
-
-
-def predicted_on_detected(boxes: Boxes, distance: Index) -> tuple[Index, Index]:
-    """Pairs of a predicted and a detected row of two tracks of one category that are one object."""
-    order = np.argsort(boxes.frame, kind="stable")
-    found = order[distance[order] == 0]
-    predicted = np.flatnonzero(distance > 0)
-    i, j = same_frame(boxes.take(predicted), boxes.take(found), reach_m=True)
-    i, j = predicted[i], found[j]
-    other = (boxes.track_id[i] != boxes.track_id[j]) & (boxes.category[i] == boxes.category[j])
-    i, j = i[other], j[other]
-    one = overlap_3d(boxes.take(i), boxes.take(j)) >= ONE_OBJECT_IOU
-    return i[one], j[one]
+    joined = replace(rows, track=number[rows.track])
+    order = np.lexsort([distance, rows.frame, joined.track])
+    first = np.r_[True, (np.diff(joined.track[order]) != 0) | (np.diff(rows.frame[order]) != 0)][: len(order)]
+    keep = np.zeros(len(order), dtype=bool)
+    keep[order[first]] = True
+    return joined, keep
 
 
 def _first(head: dict[int, int], track: int) -> int:
     while head[track] != track:
         track = head[track]
     return track
-
-
-def _nearest_of_frame(rows: Rows, distance: Index) -> NDArray[np.bool_]:
-    order = np.lexsort([distance, rows.frame, rows.track])
-    first = np.r_[True, (np.diff(rows.track[order]) != 0) | (np.diff(rows.frame[order]) != 0)][: len(order)]
-    keep = np.zeros(len(order), dtype=bool)
-    keep[order[first]] = True
-    return keep
 
 
 PEDESTRIAN, RIDER = "Pedestrian", "Cyclist"
@@ -386,9 +365,8 @@ def decide_people(rows: Rows, pairs: Pairs, places_m: Array | None, *, online: b
 
 def _by_speed(rows: Rows, places_m: Array, *, online: bool) -> Array:
     """Log-odds (N,) of riders by the speed of their tracks."""
-    first, last = end_rows(rows, online=online)
-    moved_m = np.hypot(*(places_m[rows.source[last]] - places_m[rows.source[first]])[:, :2].T)
-    seconds = (rows.frame[last] - rows.frame[first]) * PERIOD_NS / NS_PER_S
+    moved_m, frames = _moved_m(rows, places_m, online=online)
+    seconds = frames * PERIOD_NS / NS_PER_S
     speed = np.divide(moved_m, seconds, out=np.zeros(len(moved_m)), where=(seconds > 0) & (moved_m > MOVED_ON_FOOT_M))
     walks = (speed >= WALKING_MPS[0]) & (speed <= WALKING_MPS[1])
     return np.where(speed > MAX_PEDESTRIAN_SPEED_MPS, RIDES, np.where(walks, WALKS, 0.0))

@@ -202,15 +202,8 @@ def count(scene: Scene, match: Index, threshold: float) -> Counts:
     chosen = match[scene.row] == scene.col
     overlap[scene.col[chosen]] = scene.iou[chosen]
     switches, fragments = _breaks(scene, match)
-    return Counts(
-        truths=int((~scene.ignorable).sum()),
-        matches=int(used.sum()),
-        overlap=float(overlap.sum()),
-        false_positives=int((there & ~used & ~scene.excused).sum()),
-        false_negatives=int(((match < 0) & ~scene.ignorable).sum()),
-        id_switches=switches,
-        fragments=fragments,
-    )
+    false = int((there & ~used & ~scene.excused).sum()), int(((match < 0) & ~scene.ignorable).sum())
+    return Counts(int((~scene.ignorable).sum()), int(used.sum()), float(overlap.sum()), *false, switches, fragments)
 
 
 def _breaks(scene: Scene, match: Index) -> tuple[int, int]:

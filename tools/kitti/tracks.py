@@ -142,7 +142,8 @@ NEAR_FRAMES = 3
 def smooth_shapes(rows: Rows, boxes: Boxes, measurements: Measurements, *, online: bool) -> tuple[Array, Array, Array]:
     """Centers (N, 3) and yaws (N,) in the map and sizes (N, 3) length, width, height of rows by track and frame.
 
-    Means over the detections with the category of the track, each by how likely it is one; online over those up to a row.
+    Means over the detections with the category of the track, each by how likely it is one, of the ground and the heading over those
+    around; online over those up to a row.
     """
     chance = np.where(rows.source >= 0, 1 / (1 + np.exp(-boxes.score[rows.source])), 0.0)
     begin = first_of_run(rows.track)
@@ -157,7 +158,12 @@ def smooth_shapes(rows: Rows, boxes: Boxes, measurements: Measurements, *, onlin
     # Twice the angle: a box is the same from the front and from behind.
     columns = np.column_stack([bottom, np.cos(2 * yaw), np.sin(2 * yaw)])
     weight = np.where(boxes.category[rows.source] == rows.category, chance, 0.0)
-    bottom, cos, sin = _mean_nearby(columns, weight, rows, online=online).T
+    key = rows.track * (int(rows.frame.max(initial=0)) + 2 * NEAR_FRAMES + 1) + rows.frame
+    a = np.searchsorted(key, key - NEAR_FRAMES, "left")
+    b = np.searchsorted(key, key + (0 if online else NEAR_FRAMES), "right")
+    total, *sums = (s[b] - s[a] for s in map(exact_sums, [weight, *(weight * columns.T)]))
+    means = np.column_stack(sums) / np.where(total > 0, total, SCALE)[:, None]
+    bottom, cos, sin = np.where(total[:, None] > 0, means, columns).T
     turn = np.arctan2(sin, cos) / 2 - yaw
     yaw = yaw + np.mod(turn + np.pi / 2, np.pi) - np.pi / 2
     return np.column_stack([rows.xy_m, bottom + size[:, 2] / 2]), size, yaw
@@ -169,16 +175,6 @@ def _mean_of_track(values: Array, weight: Array, begin: Index, *, online: bool) 
     total = sum_so_far(weight, begin)[end]
     sums = np.column_stack([sum_so_far(weight * v, begin)[end] for v in values.T])
     return np.where(total[:, None] > 0, sums / np.where(total > 0, total, 1.0)[:, None], values)
-
-
-def _mean_nearby(values: Array, weight: Array, rows: Rows, *, online: bool) -> Array:
-    """Means (N, K) of the values of a track in the frames around; the value itself where no weight is."""
-    key = rows.track * (int(rows.frame.max(initial=0)) + 2 * NEAR_FRAMES + 1) + rows.frame
-    a = np.searchsorted(key, key - NEAR_FRAMES, "left")
-    b = np.searchsorted(key, key + (0 if online else NEAR_FRAMES), "right")
-    total, *sums = (s[b] - s[a] for s in map(exact_sums, [weight, *(weight * values.T)]))
-    means = np.column_stack(sums) / np.where(total > 0, total, SCALE)[:, None]
-    return np.where(total[:, None] > 0, means, values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,18 +25,15 @@ def small_world() -> Log:
 
 
 def _nuscenes(log: Log, folder: Path) -> Path:
-    world = make_world(duration_s=DURATION_S, camera=CAMERA, lidar=[nuscenes_lidar()])
-    return nuscenes.encode(replace(world, name=log.name), folder)
-
-
-def nuscenes_lidar() -> dict[str, object]:
-    """The LiDAR of the encoder's own world, as its table in a scene."""
+    """With the LiDAR of the encoder's own world."""
     view_deg = 180.0 * 10.0 * nuscenes.VIEW_FIRINGS * nuscenes.FIRING_NS / 1e9
     step = 2 * view_deg * nuscenes.FIRING_STEP / nuscenes.VIEW_FIRINGS
-    return {
+    lidar = {
         "name": "top", "position_m": [0.75, 0.0, 2.125], "channels": nuscenes.RINGS, "elevation_deg": [-20.0, 2.0],
         "azimuth_deg": [-view_deg, view_deg], "azimuth_step_deg": step, "range_m": 60.0,
     }  # fmt: skip
+    world = make_world(duration_s=DURATION_S, camera=CAMERA, lidar=[lidar])
+    return nuscenes.encode(replace(world, name=log.name), folder)
 
 
 def _bag(container: str, compression: str = "") -> Callable[[Log, Path], Path]:

@@ -118,11 +118,12 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     number[used] = np.arange(len(used))
     column, points = number.take(cell), count.take(used).astype(np.float32)
     values = np.empty((CHANNELS, len(used)), np.float32)
-    values[0].fill(-np.inf)
-    values[2].fill(np.inf)
-    np.maximum.at(values[0], column, z)
-    np.minimum.at(values[2], column, z)
-    for channel, of_points in ((1, z), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
+    # In double precision NumPy takes a twentieth of the time.
+    highest, lowest, exact = np.full(len(used), -np.inf), np.full(len(used), np.inf), z.astype(np.float64)
+    np.maximum.at(highest, column, exact)
+    np.minimum.at(lowest, column, exact)
+    values[0], values[2] = highest, lowest
+    for channel, of_points in ((1, exact), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
         values[channel] = np.bincount(column, of_points, minlength=len(used)) / points
     values[:3] /= 2
     values[3] = np.log1p(points) / 3

@@ -178,22 +178,21 @@ def continued_sides(
         side_m = low[across] if low[across] > 0 else high[across] if high[across] < 0 else 0.0
         if abs(side_m) < MIN_SIDE_DISTANCE_M:
             continue
-        on_side = np.abs(others[:, across] - side_m) < SIDE_DEPTH_M
+        on_side = np.flatnonzero(np.abs(others[:, across] - side_m) < SIDE_DEPTH_M)
         for sign, end in ((1.0, high[axis]), (-1.0, low[axis])):
-            farthest = _walk(sign * others[on_side, axis], sign * end, step_rad, abs(side_m), max_gap_m)
+            along = sign * others[on_side, axis]
+            farthest = _walk(along, sign * end, step_rad, abs(side_m), max_gap_m)
             farthest = min(farthest, sign * end + max_length_m - (high[axis] - low[axis]))
-            along = sign * others[:, axis]
-            found |= on_side & (along > sign * end) & (along <= farthest)
+            found[on_side[(along > sign * end) & (along <= farthest)]] = True
     return np.flatnonzero(found)
 
 
 def _walk(along_m: Array, end_m: float, step_rad: float, side_m: float, max_gap_m: float) -> float:
     """Go on from an end over coordinates (m,) along a side at a distance, as long as the next is no farther than the next ray."""
-    for next_m in np.sort(along_m[along_m > end_m]).tolist():
-        if next_m - end_m > min(MAX_MISSED_RAYS * step_rad * (side_m**2 + next_m**2) / side_m, max_gap_m):
-            break
-        end_m = next_m
-    return end_m
+    place_m = np.concatenate([[end_m], np.sort(along_m[along_m > end_m])])
+    reach_m = np.minimum(MAX_MISSED_RAYS * step_rad * (side_m**2 + place_m[1:] ** 2) / side_m, max_gap_m)
+    ends = np.flatnonzero(np.diff(place_m) > reach_m)
+    return float(place_m[ends[0] if len(ends) else -1])
 
 
 GROUPS_OF_FEW_POINTS = ("pedestrian", "two_wheeler")
