@@ -55,12 +55,12 @@ def track(
     count = [len(m) for m in measurements]
     tick, first_row = np.repeat(np.arange(len(count)), count), np.cumsum([0, *count])
     found = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps)
-    # What the forward pass resumed after several misses is decided again by what is known on both sides.
-    parts = [
-        part
-        for ticks, rows in found
-        for part in np.split(first_row[ticks] + rows, np.flatnonzero(np.diff(ticks) > MAX_MISSES) + 1)
-    ]
+    parts = [first_row[ticks] + rows for ticks, rows in found]
+    if whole_boxes:
+        # What the forward pass resumed after several misses is decided again by the motion on both sides of the gap. Centers of partial
+        # views wander where an occlusion begins and ends, so that motions of one object disagree.
+        gaps = [np.flatnonzero(np.diff(ticks) > MAX_MISSES) + 1 for ticks, _ in found]
+        parts = [part for rows, cuts in zip(parts, gaps, strict=True) for part in np.split(rows, cuts)]
     least = min_hits(t_ns, min_life_s)
     tracks = [
         Track(category, tick[rows], everything.take(rows))
