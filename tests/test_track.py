@@ -16,7 +16,7 @@ from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.geometry.statistics import NEVER, choose_pairs
+from log2sim.geometry.transforms import NEVER, choose_pairs
 from log2sim.tracking.forward import (
     CENTER_SIGMA_M,
     ForwardTracker,
@@ -26,8 +26,7 @@ from log2sim.tracking.forward import (
     track_forward,
     update,
 )
-from log2sim.tracking.stitch import decide_category, stitch
-from log2sim.tracking.tracker import min_hits, track
+from log2sim.tracking.tracker import decide_category, min_hits, stitch, track
 
 PERIOD_S = 0.1
 START_NS = 1_700_000_000_000_000_000

@@ -16,16 +16,7 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
 from log2sim.agents.rays import count_rays
 from log2sim.agents.size import independent
-from log2sim.datatypes import (
-    GROUP_OF,
-    MAX_SIZE_M,
-    MIN_SIZE_M,
-    TYPICAL_SIZE_M,
-    AgentTable,
-    Log,
-    Obstacles,
-    Track,
-)
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, AgentTable, Log, Obstacles, Track
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, median, project

@@ -133,7 +133,12 @@ class Trajectory:
             jump = (miss > MIN_DISCONTINUITY_M) & (miss > MIN_DISCONTINUITY_MPS * span)
             at_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
             swing = np.where(at_jump, 0.0, rear_axle_offset_m * np.gradient(yaw, w.t_s))
-            vx, vy = _tangents(w.t_s, x, y, vx - swing * np.sin(yaw), vy + swing * np.cos(yaw), at_jump)
+            vx, vy = vx - swing * np.sin(yaw), vy + swing * np.cos(yaw)
+            # Difference quotients where the logged velocities disagree with them: sideways steps of a pedestrian and a box
+            # labeled back to front would otherwise bend the spline into loops.
+            dx, dy = np.gradient(x, w.t_s), np.gradient(y, w.t_s)
+            replaced = (np.hypot(vx - dx, vy - dy) > 0.5 + 0.3 * np.hypot(dx, dy)) & ~at_jump
+            vx, vy = np.where(replaced, dx, vx), np.where(replaced, dy, vy)
         return cls(w.t_s, x, y, w.z_m, yaw, w.speed_mps, vx, vy, jump, origin_m)
 
     def at(self, t_s: Array) -> TrajectoryStates:
@@ -183,17 +188,6 @@ class Trajectory:
     def discontinuity_times(self) -> Array:
         """Return the times (J,) of the waypoints that the agent cannot have moved to."""
         return self.t_s[1:][self.discontinuous]
-
-
-def _tangents(t_s: Array, x: Array, y: Array, vx: Array, vy: Array, at_jump: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Choose the velocities (T,) at the waypoints: the logged ones, or difference quotients where the two disagree.
-
-    Sideways steps of a pedestrian and a box labeled back to front would otherwise bend the spline into loops.
-    """
-    dx, dy = np.gradient(x, t_s), np.gradient(y, t_s)
-    differs = np.hypot(vx - dx, vy - dy) > 0.5 + 0.3 * np.hypot(dx, dy)
-    replaced = differs & ~at_jump
-    return np.where(replaced, dx, vx), np.where(replaced, dy, vy)
 
 
 def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:
