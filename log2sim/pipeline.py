@@ -10,10 +10,9 @@ import numpy as np
 
 from log2sim.agents import estimate
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.conflicts import extend_static
 from log2sim.agents.evidence import Recording
 from log2sim.agents.heading import decide_headings
-from log2sim.agents.judge import judge
+from log2sim.agents.judge import extend_static, judge
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log
 from log2sim.files.processes import default_jobs
@@ -26,8 +25,7 @@ from log2sim.localization.roadside import register_road
 from log2sim.perception.first_pass import Observations, observe
 from log2sim.perception.fusion import fuse
 from log2sim.perception.homography_stage import fit_homographies, place_by_homography
-from log2sim.perception.run_cache import StageCache, open_store
-from log2sim.perception.run_detectors import GivenDetector, create_detectors, sort_detectors
+from log2sim.perception.run_detectors import GivenDetector, StageCache, create_detectors, open_store, sort_detectors
 from log2sim.perception.sync import schedule_of
 from log2sim.plan import choose_detector, make_plan, select_sensors
 from log2sim.report import Progress, Result, Run, conclude, draft_scenario

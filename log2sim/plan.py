@@ -96,7 +96,27 @@ def select_sensors(log: Log, config: Config) -> Sensors:
         place = "on a vehicle" if config.cooperation.ends == VEHICLE else "at the road"
         raise ConfigError(f"--ends {config.cooperation.ends}: {log.name}: no sensor is {place}; choose both")
     cameras = _cameras(log, config)
-    _check_calibration(log, cameras)
+    # Raise `LogError` for a mounting that is no rigid motion and for intrinsics that project nothing
+    mounted = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
+    for sensor, mount_T_sensor in mounted.items():
+        rotation = mount_T_sensor[:3, :3]
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not np.isfinite(mount_T_sensor).all() or not error < MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+            raise LogError(
+                f"sensor '{sensor}': its mounting is not a rotation and a translation (R R^T departs from 1 by {error:.2g}, "
+                f"det R is {np.linalg.det(rotation):.2g}); expected a right-handed rotation, so check the calibration"
+            )
+    for sensor in cameras:
+        k = log.cameras[sensor].K
+        if not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0 or k[2].tolist() != [0, 0, 1]:
+            raise LogError(
+                f"camera '{sensor}': its intrinsics K are {k.tolist()}; expected finite numbers, positive focal lengths and "
+                "0, 0, 1 in the last row"
+            )
+    for sensor in (*cameras, *log.lidars):
+        for message, is_impossible in problems_of(log, sensor):
+            if is_impossible:
+                raise LogError(message)
     # The ego's poses must not all be at other times than the records of the sensors on it.
     mounts = {n: log.cameras[n].mount for n in cameras} or {n: lidar.mount for n, lidar in log.lidars.items()}
     stamps = [log.streams[name].t_ns for name in mounts if name in log.streams and len(log.streams[name].t_ns)]
@@ -137,30 +157,6 @@ def _cameras(log: Log, config: Config) -> tuple[str, ...]:
         if not is_used(log.cameras[name], config):
             raise ConfigError(f"--cameras: '{name}' is not at the end that --ends {config.cooperation.ends} uses")
     return tuple(name for name in config.cameras or log.cameras if is_used(log.cameras[name], config))
-
-
-def _check_calibration(log: Log, cameras: tuple[str, ...]) -> None:
-    """Raise `LogError` for a mounting that is no rigid motion and for intrinsics that project nothing."""
-    mounts = {n: log.cameras[n].mount_T_cam for n in cameras} | {n: s.mount_T_lidar for n, s in log.lidars.items()}
-    for name, mount_T_sensor in mounts.items():
-        rotation = mount_T_sensor[:3, :3]
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not np.isfinite(mount_T_sensor).all() or not error < MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
-            raise LogError(
-                f"sensor '{name}': its mounting is not a rotation and a translation (R R^T departs from 1 by {error:.2g}, "
-                f"det R is {np.linalg.det(rotation):.2g}); expected a right-handed rotation, so check the calibration"
-            )
-    for name in cameras:
-        k = log.cameras[name].K
-        if not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0 or k[2].tolist() != [0, 0, 1]:
-            raise LogError(
-                f"camera '{name}': its intrinsics K are {k.tolist()}; expected finite numbers, positive focal lengths and "
-                "0, 0, 1 in the last row"
-            )
-    for name in (*cameras, *log.lidars):
-        for message, is_impossible in problems_of(log, name):
-            if is_impossible:
-                raise LogError(message)
 
 
 def _lidars_out_of_range(log: Log, max_range_m: float) -> set[str]:

@@ -21,8 +21,7 @@ from log2sim.localization.choice import GIVEN, PoseChoice
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.homography_stage import CameraHomography
 from log2sim.perception.records import RecordSource
-from log2sim.perception.run_cache import StageCache
-from log2sim.perception.run_detectors import Detectors
+from log2sim.perception.run_detectors import Detectors, StageCache
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage, explain_missing_poses
 
@@ -79,13 +78,30 @@ def draft_scenario(
         reason = explain_missing_poses(log, t_ns)
         raise NothingToReconstruct(f"{log.name}: {reason}, and no object was detected in {len(t_ns)} ticks")
     faults = [fault.to_dict() for fault in (*run.faults, *observations.faults)]
+    # The cameras of a log with their homographies, as a scenario states them
+    entries = []
+    for name in log.cameras:
+        ground, homography = homographies.get(name), None
+        if ground is not None and ground.fit.ok:
+            fit = ground.fit
+            homography = {
+                "ground_H_image": fit.ground_H_image.tolist(),
+                "source": ground.source,
+                "inliers": int(fit.inliers.sum()),
+                "correspondences": len(fit.inliers),
+                "error_m": float(fit.error_m) if np.isfinite(fit.error_m) else None,
+                "condition": float(fit.condition),
+                "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
+                "slope": None if fit.slope is None else fit.slope.to_dict(),
+            }
+        entries.append({"name": name, "used": name in run.plan.cameras, "homography": homography})
     return Scenario(
         name=log.name,
         t0_ns=int(t_ns[0]),
         duration_s=float((t_ns[-1] - t_ns[0]) / NS_PER_S),
         agents=tuple(agents),
         map=log.map,
-        cameras=tuple(camera_entries(log, run.plan.cameras, homographies)),
+        cameras=tuple(entries),
         sensors=roadside_sensors(log, config.measure.max_range_m),
         provenance={
             "log": {"name": log.name, "format": log.format, "digest": log.digest},
@@ -153,27 +169,6 @@ def _view_of(azimuth_rad: Array) -> tuple[float, float]:
     return math.remainder(float(middle), 2 * math.pi), float(2 * math.pi - gap[widest])
 
 
-def camera_entries(log: Log, used: Sequence[str], homographies: Mapping[str, CameraHomography]) -> list[dict[str, Any]]:
-    """Return the cameras of a log with their homographies, as a scenario states them."""
-    entries = []
-    for name in log.cameras:
-        ground, homography = homographies.get(name), None
-        if ground is not None and ground.fit.ok:
-            fit = ground.fit
-            homography = {
-                "ground_H_image": fit.ground_H_image.tolist(),
-                "source": ground.source,
-                "inliers": int(fit.inliers.sum()),
-                "correspondences": len(fit.inliers),
-                "error_m": float(fit.error_m) if np.isfinite(fit.error_m) else None,
-                "condition": float(fit.condition),
-                "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
-                "slope": None if fit.slope is None else fit.slope.to_dict(),
-            }
-        entries.append({"name": name, "used": name in used, "homography": homography})
-    return entries
-
-
 def conclude(
     run: Run,
     observations: Observations,
@@ -196,6 +191,9 @@ def conclude(
     for name, index in schedule.frames.items():
         known = log.map_T_sensor(name, log.streams[name].t_ns[index[index >= 0]])[1]
         without_pose |= {} if known.all() else {name: int(np.sum(~known))}
+    agents = scenario.others
+    categories = sorted({a.category for a in agents})
+    known_m = [m for a in agents if (m := a.quality.get("smoothing_residual_rms_m")) is not None]
     report = {
         "report_version": 1,
         "log": {"name": log.name, "format": log.format, "digest": log.digest, "notes": list(log.notes)},
@@ -212,7 +210,14 @@ def conclude(
         "detections": observations.detections,
         "homography": {name: _homography_entry(g, run.config.topdown.method) for name, g in homographies.items()},
         "measurements": {"total": sum(map(len, from_lidar)), "with_lidar": int(sum(map(np.sum, from_lidar)))},
-        "agents": _agent_counts(scenario),
+        "agents": {
+            "total": len(agents),
+            "static": sum(a.static for a in agents),
+            "by_category": {c: sum(a.category == c for a in agents) for c in categories},
+            "smoothing_residual_median_m": rounded(float(np.median(known_m)), 4) if known_m else None,
+            "doubtful": {a.id: [doubt.to_dict() for doubt in a.doubts] for a in scenario.agents if a.is_doubtful},
+            "quarantined": [a.id for a in agents if a.quarantined],
+        },
         **figures,
         "unreadable": observations.unreadable,
         "poses": run.poses.to_dict(),
@@ -298,18 +303,4 @@ def _homography_entry(ground: CameraHomography, method: str) -> dict[str, Any]:
         "condition": rounded(fit.condition, 3),
         "pitch_roll": None if fit.pitch_roll is None else fit.pitch_roll.to_dict(),
         "slope": None if fit.slope is None else fit.slope.to_dict(),
-    }
-
-
-def _agent_counts(scenario: Scenario) -> dict[str, Any]:
-    agents = scenario.others
-    categories = sorted({a.category for a in agents})
-    known_m = [m for a in agents if (m := a.quality.get("smoothing_residual_rms_m")) is not None]
-    return {
-        "total": len(agents),
-        "static": sum(a.static for a in agents),
-        "by_category": {c: sum(a.category == c for a in agents) for c in categories},
-        "smoothing_residual_median_m": rounded(float(np.median(known_m)), 4) if known_m else None,
-        "doubtful": {a.id: [doubt.to_dict() for doubt in a.doubts] for a in scenario.agents if a.is_doubtful},
-        "quarantined": [a.id for a in agents if a.quarantined],
     }

@@ -8,7 +8,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from log2sim.evaluation.detection import Criterion, SceneBoxes, average_precision, match_detections, precision_recall
+from log2sim.evaluation.detection.boxes import SceneBoxes
+from log2sim.evaluation.detection.evaluation import average_precision, precision_recall
+from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import box_corners_bev, rectangle_overlap, upright_box_iou
 
 CAR = [0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]

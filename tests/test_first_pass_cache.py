@@ -22,10 +22,10 @@ from log2sim.files import plugins
 from log2sim.files.documents import check
 from log2sim.files.packing import pack
 from log2sim.files.stages import StageClock
-from log2sim.perception import first_pass, run_cache
+from log2sim.perception import first_pass, run_detectors
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.records import RecordSource
-from log2sim.perception.run_cache import StageCache, open_cache, open_store
+from log2sim.perception.run_detectors import StageCache, open_cache, open_store
 from log2sim.pipeline import observe_log, start
 from log2sim.report import Run
 
@@ -172,7 +172,7 @@ def test_another_setting_of_the_detector_searches_everything(
     monkeypatch.setitem(STATED, "cache_key", "seeing 2")
     look(log)
     assert len(made[-1].seen) == TICKS
-    monkeypatch.setattr(run_cache, "software_key", lambda *_: "another version")
+    monkeypatch.setattr(run_detectors, "software_key", lambda *_: "another version")
     look(log)
     assert len(made[-1].seen) == TICKS
 
@@ -425,5 +425,5 @@ def test_the_key_of_a_network_changes_with_its_weights_and_settings(
 
 
 def test_the_keys_hold_the_code_that_they_are_named_after() -> None:
-    package = Path(run_cache.__file__).resolve().parents[1]
-    assert all(list(package.glob(pattern)) for pattern in run_cache.STAGE_SOURCES)
+    package = Path(run_detectors.__file__).resolve().parents[1]
+    assert all(list(package.glob(pattern)) for pattern in run_detectors.STAGE_SOURCES)

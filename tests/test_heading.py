@@ -315,18 +315,17 @@ def test_oncoming_traffic_on_the_left_keeps_right_in_every_map_and_left_in_the_m
 @settings(max_examples=40, deadline=None)
 def test_the_direction_of_a_street_is_mirrored_with_its_world(turn, left_m, flipped):
     flow, pose = path(0.0, 0.0, 0.0), np.array([[20.0, left_m, np.pi * flipped]])
-    right = street_log_odds(moved(pose, turn)[0], [moved(flow, turn)], keeps_right=True)
-    left = street_log_odds(moved(mirrored(pose), turn)[0], [moved(mirrored(flow), turn)], keeps_right=False)
+    right = street_log_odds(moved(pose, turn)[0], [moved(flow, turn)])[0]
+    left = street_log_odds(moved(mirrored(pose), turn)[0], [moved(mirrored(flow), turn)])[1]
     assert right == pytest.approx(left, abs=1e-6)
     assert (right > 0) == ((left_m < 2) != flipped)
     # What points the other way has the opposite log-odds.
-    assert street_log_odds(
-        moved(pose + np.array([0, 0, np.pi]), turn)[0], [moved(flow, turn)], keeps_right=True
-    ) == pytest.approx(-right, abs=1e-6)
+    turned = street_log_odds(moved(pose + np.array([0, 0, np.pi]), turn)[0], [moved(flow, turn)])[0]
+    assert turned == pytest.approx(-right, abs=1e-6)
 
 
 def test_in_the_lane_of_another_one_surely_goes_its_way_and_at_its_curb_most_likely():
     def along(left_m):
-        return street_log_odds(np.array([30.0, left_m, 0.0]), [path(0.0, 0.0, 0.0)], keeps_right=True)
+        return street_log_odds(np.array([30.0, left_m, 0.0]), [path(0.0, 0.0, 0.0)])[0]
 
     assert along(0.3) > along(-3.0) > 2 > 0 > along(3.0) > along(8.0)

@@ -126,7 +126,7 @@ def test_one_door_leads_to_the_records() -> None:
         "logs/",
         "perception/records.py",
         "localization/replaced.py",
-        "perception/run_cache.py",
+        "perception/run_detectors.py",
     )  # readers, the door, streams of changed logs, and those that note what stages read
     package = ROOT / "log2sim"
     reading = re.compile(r"\bstream\w*(\[[^\]]*\])?\.read\b")

@@ -17,7 +17,7 @@ from log2sim.datatypes import Log
 from log2sim.errors import LogError
 from log2sim.geometry import apply, box_iou, inverse, project, project_boxes, wrap_angle
 from log2sim.logs.opening import open_log
-from log2sim.logs.waymo import reader
+from log2sim.logs.waymo import messages
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.reader import camera_of
 from log2sim.logs.waymo.segment import CameraCalibration
@@ -119,7 +119,7 @@ def test_labels_of_images_are_those_around_the_projected_boxes(log: Log) -> None
     ],
 )
 def test_damaged_labels_are_counted(path: Path, monkeypatch: pytest.MonkeyPatch, read: str, told: str) -> None:
-    sound, calls = getattr(reader, read), []
+    sound, calls = getattr(messages, read), []
 
     def broken(*arguments: object) -> object:
         calls.append(arguments)
@@ -127,7 +127,7 @@ def test_damaged_labels_are_counted(path: Path, monkeypatch: pytest.MonkeyPatch,
             raise WireError("cut")
         return sound(*arguments)
 
-    monkeypatch.setattr(reader, read, broken)
+    monkeypatch.setattr(messages, read, broken)
     assert sum(note.startswith(told) for note in open_log(path).notes) == 1
 
 

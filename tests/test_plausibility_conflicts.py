@@ -9,8 +9,7 @@ import pytest
 from worlds import rows_at
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents
-from log2sim.agents.conflicts import conflict_doubts, extend_static, find_conflicts, resolve_conflicts
-from log2sim.agents.judge import suppress_duplicates
+from log2sim.agents.judge import conflict_doubts, extend_static, find_conflicts, resolve_conflicts, suppress_duplicates
 from log2sim.datatypes import Agent, Track, Waypoints
 
 T = np.linspace(0.0, 4.0, 5)

@@ -7,7 +7,7 @@ import pytest
 from replay_maneuvers import MANEUVERS, agent_from, driven, ramp
 
 from log2sim.datatypes import Trajectory
-from log2sim.simulation.feasible_trajectory import FeasibilityLimits, _cost, _LeastSquares, _normal_equations
+from log2sim.simulation.feasible_trajectory import FeasibilityLimits, _cost, _normal_equations, residual_terms
 from log2sim.simulation.reference import feasible_trajectory_of, vehicle_reference
 
 LIMITS = FeasibilityLimits(offset_m=1.3, max_curvature_1pm=0.27, max_curvature_rate_1pmps=0.37, max_accel_mps2=10.0)
@@ -101,13 +101,15 @@ def test_the_gradient_is_that_of_the_cost():
     state = rng.normal(0, 0.5, (6, 6)) + np.array([0, 0, 0, 3.0, 0, 0])
     state[:, 5] *= 2  # beyond the limit in places
     logged = rng.normal(0, 1, (6, 4)) + np.array([0, 0, 0, 3.0])
-    problem = _LeastSquares(0.1, logged, LIMITS)
-    _, gradient = _normal_equations(problem.terms(state), len(state))
+    told = logged, 0.1, LIMITS
+    _, gradient = _normal_equations(residual_terms(state, *told), len(state))
     numeric = np.zeros_like(state)
     for index in np.ndindex(state.shape):
         step = np.zeros_like(state)
         step[index] = 1e-6
-        numeric[index] = (_cost(problem.terms(state + step)) - _cost(problem.terms(state - step))) / 2e-6
+        numeric[index] = (
+            _cost(residual_terms(state + step, *told)) - _cost(residual_terms(state - step, *told))
+        ) / 2e-6
     # The chord's shortening is held constant in the derivative: second order in the angle of a knot.
     np.testing.assert_allclose(gradient, numeric, rtol=0.02, atol=np.abs(numeric).max() * 0.02)
 
@@ -116,12 +118,12 @@ def test_the_band_is_that_of_the_residuals_derivatives():
     rng = np.random.default_rng(0)
     state = rng.normal(0, 0.1, (4, 6)) + np.array([0, 0, 0, 3.0, 0, 0.1])
     state[:, 2] /= 1e5  # the derivatives leave out how turning shortens the chord
-    problem = _LeastSquares(0.1, rng.normal(0, 0.1, (4, 4)) + np.array([0, 0, 0, 3.0]), LIMITS)
-    terms = problem.terms(state)
+    told = rng.normal(0, 0.1, (4, 4)) + np.array([0, 0, 0, 3.0]), 0.1, LIMITS
+    terms = residual_terms(state, *told)
     slopes = np.zeros((sum(len(t.residual) for t in terms), 24))
     for k in range(24):
         step = 1e-6 * np.eye(24)[k].reshape(4, 6)
-        up, down = (np.concatenate([t.residual for t in problem.terms(state + s)]) for s in (step, -step))
+        up, down = (np.concatenate([t.residual for t in residual_terms(state + s, *told)]) for s in (step, -step))
         slopes[:, k] = (up - down) / 2e-6
     weight = np.concatenate([1 / np.sqrt(1 + t.residual**2) if t.robust else np.ones(len(t.residual)) for t in terms])
     expected = slopes.T @ (weight[:, None] * slopes)

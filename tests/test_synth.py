@@ -17,9 +17,9 @@ from log2sim.geometry import NS_PER_S, apply, box_corners, inverse
 from log2sim.logs.opening import open_log
 from log2sim.synth import shapes
 from log2sim.synth.actors import MovingScene, TimedPath
-from log2sim.synth.paint import Appearance, paint
+from log2sim.synth.paint import paint
 from log2sim.synth.raycast import EGO, GROUND, cast_sweep
-from log2sim.synth.scene import load_scene, scene_from_table
+from log2sim.synth.scene import AgentSpec, load_scene, scene_from_table
 from log2sim.synth.shapes import Mesh
 from log2sim.synth.synthesis import synthesize, write_synthetic
 
@@ -328,7 +328,7 @@ def test_a_walker_touches_its_box_over_a_stride_and_always_the_ground() -> None:
 @pytest.mark.parametrize("category", SIZES)
 def test_every_part_has_a_color(category: str) -> None:
     mesh = shape(category)
-    look = Appearance(category, SIZES[category], (200, 30, 30), "sedan")
+    look = AgentSpec.model_construct(category=category, size_m=SIZES[category], color=(200, 30, 30), shape="sedan")
     rng = np.random.default_rng(0)
     face = rng.integers(len(mesh.faces), size=20000)
     weight = rng.dirichlet([1, 1, 1], size=len(face))[:, :, None]

@@ -12,7 +12,7 @@ from worlds import tiny_scene
 from log2sim.datatypes import MapFeatures
 from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground, GroundPlan
 from log2sim.synth.scene import Scene
-from log2sim.synth.truth import map_features_of
+from log2sim.synth.synthesis import map_features_of
 
 CROSSING: dict[str, Any] = {
     "road": [

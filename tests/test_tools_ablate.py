@@ -97,7 +97,7 @@ def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
     found = list(ablate.variations(Config()))
     assert {v.stage for v in found} == set(ablate.STAGES)
     labels = {v.label for v in found}
-    assert {"track.max_gap_s", "agents.conflicts.TOUCHING", "datatypes.categories.CATEGORY.max_size_m"} <= labels
+    assert {"track.max_gap_s", "agents.judge.TOUCHING", "datatypes.categories.CATEGORY.max_size_m"} <= labels
 
 
 def test_rows_are_worse_better_or_equal_beyond_the_noise_of_seeds():

@@ -25,7 +25,8 @@ from log2sim.synth.polytopes import Material, box, meshes_of
 from log2sim.synth.raster import nearest_of
 from log2sim.synth.raycast import BUILDING, cast_sweep
 from log2sim.synth.render import DEPTH_M, LENS_SPACING_M, WIDTH_M, Body, SceneInstant, samples_of, segment, signals_of
-from log2sim.synth.returns import LidarModel, ReturnModel, Weather, lidar_model, reflected
+from log2sim.synth.returns import LidarModel, ReturnModel, lidar_model, reflected
+from log2sim.synth.scene import Environment
 from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic import TrafficScene, draw_scene, labeled_cloud, rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, write_traffic
@@ -100,10 +101,10 @@ def test_a_scene_depends_on_its_seed_alone() -> None:
 
 
 def test_fog_extinguishes_as_koschmieder_says() -> None:
-    fog = Weather("fog", visibility_m=100.0)
+    fog = Environment(weather="fog", visibility_m=100.0)
     assert np.exp(-fog.extinction_per_m * 100) == pytest.approx(0.02, rel=1e-3)
     one = np.ones(1, np.float32)
-    ratio = reflected(50 * one, one, one, fog) / reflected(50 * one, one, one, Weather())
+    ratio = reflected(50 * one, one, one, fog) / reflected(50 * one, one, one, Environment())
     assert ratio[0] == pytest.approx(np.exp(-2 * fog.extinction_per_m * 50), rel=1e-4)
 
 
@@ -168,7 +169,7 @@ def test_beams_meet_the_housing_and_the_pole_and_no_other_return_moves() -> None
     assert all(tuple(p) in theirs for p in sweeps[0].sweep.xyz_m[~hit].tolist())
 
 
-CLEAR = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0, weather=Weather())
+CLEAR = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0, weather=Environment())
 SEE_THROUGH = (Material.GLASS, Material.LEAVES, Material.MESH)
 
 

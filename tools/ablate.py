@@ -57,7 +57,7 @@ STAGES = {
     "fusion": (("fuse",), "perception.fusion", ""),
     "tracking": (("track", "mark_unrecorded"), "tracking", "track"),
     "agents": (("estimate.estimate_agents", "decide_headings"), "agents", "smooth"),
-    "judgement": (("judge",), "agents.judge agents.conflicts agents.evidence agents.rays agents.weights", ""),
+    "judgement": (("judge",), "agents.judge agents.evidence agents.rays agents.weights", ""),
     "road": (("describe",), "road", "map appearance"),
 }  # fmt: skip
 # Figures with the change that counts as one step, and whether more is better.

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Name, file below log2sim/, expression (which occurs once), replacement, files of tests that hold it.
 MUTANTS = (
     ("sync takes later frames", "perception/sync.py", "np.abs(residual_ns) <= tolerance_ns", "residual_ns <= tolerance_ns", "sync"),
-    ("poses are not interpolated", "geometry/poses.py", "position[i] + fraction[:, None] * (position[k] - position[i])", "position[i]", "geometry"),
+    ("poses are not interpolated", "geometry/transforms.py", "position[i] + fraction[:, None] * (position[k] - position[i])", "position[i]", "geometry"),
     ("inverse of a transform", "geometry/transforms.py", "-(rt @ dst_T_src[..., :3, 3:])", "(rt @ dst_T_src[..., :3, 3:])", "geometry_properties"),
     ("sweeps are not compensated", "perception/lidar/cloud.py", "one_pose = not compensate or", "one_pose = True or", "ground sync"),
     ("ground without curvature", "perception/lidar/cloud.py", "x * x, x * y, y * y", "0 * x, 0 * x, 0 * y", "ground"),
@@ -39,7 +39,7 @@ MUTANTS = (
     ("Kalman gain", "tracking/forward.py", "gain @ (xy[:, :, None]", "0.5 * gain @ (xy[:, :, None]", "track"),
     ("process noise", "tracking/forward.py", "(span**3 / 3)", "(span**3 / 30)", "track"),
     ("weak detections start tracks", "tracking/forward.py", "fresh = strong.copy()", "fresh = np.ones_like(strong)", "track"),
-    ("gaps of tracks", "tracking/stitch.py", "-half_gap_s, noise)", "half_gap_s, noise)", "track"),
+    ("gaps of tracks", "tracking/tracker.py", "-half_gap_s, noise)", "half_gap_s, noise)", "track"),
     ("outliers count", "agents/smooth/fixed_interval.py", "problem = replace(problem, weight=weight)", "problem = replace(problem, weight=1 + 0 * weight)", "smooth"),
     ("standing vehicles roll", "agents/smooth/fixed_interval.py", "still = np.isfinite(sigma)", "still = np.isfinite(sigma) & False", "smooth"),
     ("sizes of whole sides", "agents/size.py", "error_of_all / (error_of_all + prior)", "prior / (error_of_all + prior)", "size"),

@@ -34,12 +34,7 @@ from log2sim.tracking.forward import MAX_MISSES
 
 
 def estimate_agents(
-    tracks: Sequence[Track],
-    obstacles: Sequence[Obstacles | None],
-    timeline: Timeline,
-    *,
-    smooth: bool,
-    jobs: int = 1,
+    tracks: Sequence[Track], obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool, jobs: int = 1
 ) -> list[AgentCandidate]:
     """Make a candidate of every object that the tracks show and that may suffice (`may_suffice`), moving ones first.
 

@@ -206,25 +206,28 @@ def side_log_odds(paths: Sequence[Array]) -> float:
     return float(log_odds_of(USUALLY_RIGHT) + evidence)
 
 
-def street_log_odds(pose: Array, paths: Sequence[Array], *, keeps_right: bool) -> float:
-    """Return the log-odds that the street's direction where something stands is along its yaw, by the traffic next to it.
+def street_log_odds(pose: Array, paths: Sequence[Array]) -> Array:
+    """Return the log-odds (2,) that the street's direction where something stands is along its yaw, by the traffic next to it.
+
+    The first is for traffic that keeps to the right, the second for the left.
 
     `pose`: (3,): x, y in m and yaw in rad. `paths`: (K, 3) each: as in `side_log_odds`.
 
     The mean over the paths, the nearer the heavier. A path says the less the farther it is and the less parallel, so nothing
     follows the traffic of another street.
     """
-    odds, weights = [], []
-    for passing in _passing_by(pose[:2], paths, float(pose[2])):
-        left_m = passing.left_m if keeps_right else -passing.left_m
-        across = NEAR_CURB if left_m < 0 else 1.0 - (NEXT_LANE if left_m < BEYOND_M else BEYOND)
-        along = IN_LANE if abs(left_m) < IN_LANE_M else across
-        chance = 0.5 + passing.belongs * (along - 0.5)
-        sign = 1.0 if np.cos(passing.heading_rad - pose[2]) > 0 else -1.0
-        odds.append(sign * float(log_odds_of(chance)))
-        weights.append(passing.belongs / (1.0 + abs(passing.left_m) / 2) ** 2)
-    total = float(np.sum(weights))
-    return float(np.dot(weights, odds) / total) if total > 0 else 0.0
+    passing = _passing_by(pose[:2], paths, float(pose[2]))
+    left_m, heading_rad, belongs = (
+        np.array([getattr(p, name) for p in passing], dtype=np.float64) for name in ("left_m", "heading_rad", "belongs")
+    )
+    weights = belongs / (1.0 + np.abs(left_m) / 2) ** 2
+    total, sign = float(np.sum(weights)), np.where(np.cos(heading_rad - pose[2]) > 0, 1.0, -1.0)
+    if total <= 0:
+        return np.zeros(2)
+    aside = np.stack([left_m, -left_m])
+    across = np.where(aside < 0, NEAR_CURB, 1.0 - np.where(aside < BEYOND_M, NEXT_LANE, BEYOND))
+    along = np.where(np.abs(aside) < IN_LANE_M, IN_LANE, across)
+    return np.array([weights @ odds for odds in sign * log_odds_of(0.5 + belongs * (along - 0.5))]) / total
 
 
 @dataclass(frozen=True)
@@ -409,10 +412,15 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
             road_users[k] = replace(c, agent=replace(c.agent, waypoints=w))
     middle = [(c.agent.waypoints, len(c.agent.waypoints) // 2) for c in road_users]
     poses = np.array([[w.x_m[k], w.y_m[k], w.yaw_rad[k]] for w, k in middle])
-    street = np.zeros((2, len(of)))
+    street, ways = np.zeros((2, len(of))), [ego_path, *paths]
+    low, high = (
+        np.array([f(way[:, :2], axis=0, initial=none) for way in ways])
+        for f, none in ((np.min, np.inf), (np.max, -np.inf))
+    )
     for k, pose in enumerate(poses):
-        others = [ego_path, *paths[:k], *paths[k + 1 :]]
-        street[:, k] = [street_log_odds(pose, others, keeps_right=right) for right in (True, False)]
+        away_m = np.maximum(low - pose[:2], pose[:2] - high).max(axis=1)
+        away_m[k + 1] = np.inf
+        street[:, k] = street_log_odds(pose, [ways[i] for i in np.flatnonzero(away_m <= FAR_M).tolist()])
     stands = np.flatnonzero([c.agent.static for c in road_users])
     rows = find_rows(poses, np.array([c.agent.size_m[0] for c in road_users]), stands)
     chance = headings_of(rows, own, street, side_log_odds([ego_path, *paths]))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORY, GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, Track
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, weighted_quantile
 from log2sim.perception import boxes
 from log2sim.perception.boxes import box_sigma
@@ -73,17 +74,13 @@ CLEAR_LOG_ODDS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Ends:
+class Ends(Columns):
     """Ends of the points of an object along its length and width in n views."""
 
     low: Array  # `low`, `high`: (n, 2), m
     high: Array
     real: NDArray[np.int64]  # (n, 2, 2): kinds of the ends, see `boxes.real_ends`
     gap_m: Array  # (n, 2, 2): distances between rays there, see `boxes.end_gaps`
-
-    def take(self, rows: slice | NDArray[np.intp]) -> Ends:
-        """Return the ends of some of the views."""
-        return Ends(*(column[rows] for column in vars(self).values()))
 
     def swapped(self) -> Ends:
         """Return the ends along axes that are turned by a quarter turn."""

@@ -72,20 +72,7 @@ RIGHT = {
     },
 }
 VARIANCES = {
-    "sigma_xy_m": {
-        "given": 3.38,
-        "given_moving": 0.776,
-        "hidden": 0.000732,
-        "range": 0.00563,
-        "wrong": 0.0427,
-    },
-    "sigma_yaw_rad": {
-        "given": 0.25,
-        "wrong": 0.244,
-    },
-    "sigma_speed_mps": {
-        "given": 10.1,
-        "standing": 1.57,
-        "moving": 0.27,
-    },
+    "sigma_xy_m": {"given": 3.38, "given_moving": 0.776, "hidden": 0.000732, "range": 0.00563, "wrong": 0.0427},
+    "sigma_yaw_rad": {"given": 0.25, "wrong": 0.244},
+    "sigma_speed_mps": {"given": 10.1, "standing": 1.57, "moving": 0.27},
 }

@@ -407,22 +407,18 @@ def _ended(workers: Workers, future: Future, job: Job, folder: BatchFolder) -> F
         raise ConfigError("the Dask scheduler is gone; the same command goes on where this one was")
     error = future.exception()
     if isinstance(error, KilledWorker):
-        return _died(job, repetition, folder)
+        # Return what came of a job whose worker died: after its work, before it, or by it
+        written = folder.read_row(job.name)
+        if written is not None and written.is_done:
+            return Finished(job, written)
+        row = failed_row(job, "WorkerDied", "the worker process died: it was killed, crashed or needed too much memory")
+        if not folder.take_unfinished(job.name):
+            return Finished(job, row, job)  # it waited behind another
+        if repetition is None:
+            folder.write_failure(row, row.error)
+        return Finished(job, row, repetition)
     row = failed_row(job, type(error).__name__, str(error))
     if isinstance(error, Log2SimError) or repetition is None:
         folder.write_failure(row, row.error)
         return Finished(job, row)
-    return Finished(job, row, repetition)
-
-
-def _died(job: Job, repetition: Job | None, folder: BatchFolder) -> Finished:
-    """Return what came of a job whose worker died: after its work, before it, or by it."""
-    written = folder.read_row(job.name)
-    if written is not None and written.is_done:
-        return Finished(job, written)
-    row = failed_row(job, "WorkerDied", "the worker process died: it was killed, crashed or needed too much memory")
-    if not folder.take_unfinished(job.name):
-        return Finished(job, row, job)  # it waited behind another
-    if repetition is None:
-        folder.write_failure(row, row.error)
     return Finished(job, row, repetition)

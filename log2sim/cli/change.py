@@ -46,7 +46,6 @@ def edit(
     drop_doubtful: opt.DropDoubtful = False,
     strict: Annotated[bool, opt.option("Exit 6 when a check fails.", None, "--strict")] = False,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Edit the agents of a scenario: their presence, category, timing, speed and lateral position.
 
@@ -125,12 +124,11 @@ def edit(
     if drop_doubtful:
         kept = {a.id for a in edited.agents}
         gone = [a for a in loaded.doubtful if a.id not in kept]
-        opt.say(f"left out as doubtful: {list_doubtful(gone) or 'none'}", quiet=quiet)
-    opt.say_all("warning", result.warnings, quiet=quiet)
-    opt.say(
+        opt.tell(f"left out as doubtful: {list_doubtful(gone) or 'none'}")
+    opt.say_all("warning", result.warnings)
+    opt.tell(
         f"{out}: {opt.counted(len(edits), 'edit')}, {count_agents(a.id for a in edited.agents)} over {edited.duration_s:.1f} s, "
-        f"{opt.counted(len(result.warnings), 'warning')}",
-        quiet=quiet,
+        f"{opt.counted(len(result.warnings), 'warning')}"
     )
     if strict:
         result.require_clean()
@@ -154,7 +152,6 @@ def correct(
     ] = None,
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Apply corrections that a person made: merged, split, moved and deleted agents, categories, fronts, sizes, colors, lines.
 
@@ -188,10 +185,10 @@ def correct(
 
         corrected = tag(corrected)
     corrected.save(out)
-    opt.say_all("warning", lines, quiet=quiet)
+    opt.say_all("warning", lines)
     done = len(document["corrections"]) - len(result.unmatched)
     lost = f", {len(result.unmatched)} without its agent" if result.unmatched else ""
-    opt.say(f"{out}: {opt.counted(done, 'correction')} applied{lost}", quiet=quiet)
+    opt.tell(f"{out}: {opt.counted(done, 'correction')} applied{lost}")
 
 
 def _with_points(scenario: Scenario, changed: set[str], log: Path, sequence: str | None) -> tuple[Scenario, list[str]]:
@@ -224,7 +221,6 @@ def studio(
         metavar="N", min=0, max=65535, help="Port of this computer.", show_default="a free one")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     sequence: opt.SequenceName = None,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Correct a scenario on a page: the doubtful agents first, merging, moving, turning, sizes, categories; with undo.
 
@@ -244,7 +240,7 @@ def studio(
     claim(path, overwrite=False)  # two studios on one file would overwrite each other's corrections
     loaded = Scenario.load(scenario)
     layers: dict[str, Any] = {}
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         if log is not None:
             wanted = opt.camera_names(cameras)
             recorded = open_recorded(log, loaded, sequence, round(max_mb * 1e6), wanted, report_progress)
@@ -256,7 +252,7 @@ def studio(
         except OSError as error:
             raise ConfigError(f"--port {port}: {error.strerror}; choose another") from None
         served.page()  # its pictures take long to gather: not while a browser waits
-    opt.say_all("warning", served.result.unmatched, quiet=quiet)
+    opt.say_all("warning", served.result.unmatched)
     try:
         opt.say(f"{served.address}  (Ctrl-C ends it; corrections go to {path})")
         if browser:

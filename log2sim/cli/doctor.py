@@ -19,7 +19,6 @@ import typer
 from packaging.requirements import InvalidRequirement, Requirement
 
 from log2sim.cli import options as opt
-from log2sim.cli.shared import format_rows
 from log2sim.errors import ConfigError, Log2SimError, install_command
 from log2sim.files.plugins import nearest
 from log2sim.files.version import __version__
@@ -94,6 +93,22 @@ def examine() -> dict[str, Any]:
     if sys.version_info < MIN_PYTHON:
         wanted = ".".join(map(str, MIN_PYTHON))
         broken.insert(0, f"Python {platform.python_version()} is too old: log2sim needs {wanted}")
+    # The built-in detectors with what they need; `broken` takes what should be there and is not
+    folder = Path(__file__).resolve().parents[1] / "perception" / "detect3d" / "weights"
+    models = {}
+    for name in ("vehicle", "roadside"):
+        model = folder / f"{name}.onnx"
+        models[f"lidar:{name}"] = "ready" if model.is_file() else f"{model} is missing"
+        broken += [] if model.is_file() else [f"{model}: is missing; install log2sim again"]
+    try:
+        from log2sim.perception.detect.ssd_mobilenet import NAME, graph_bytes
+
+        state = "ready"
+        if not any(cache.glob(f"{NAME}-*.onnx")):
+            graph_bytes()
+            state = "ready; converted into the cache at its first use"
+    except (Log2SimError, ImportError) as error:
+        state = str(error)
     return {
         "log2sim": __version__,
         "python": platform.python_version(),
@@ -101,7 +116,7 @@ def examine() -> dict[str, Any]:
         "program": sys.executable,
         "packages": packages,
         "extras": extras,
-        "models": _find_models(cache, broken),
+        "models": models | {"ssd-mobilenet-v2": state},
         "cache": str(cache),
         "cache_bytes": cache_bytes,
         "cores": os.cpu_count() or 1,
@@ -141,26 +156,6 @@ def version_of(name: str) -> str | None:
         return None
 
 
-def _find_models(cache: Path, broken: list[str]) -> dict[str, str]:
-    """Return the built-in detectors with what they need; `broken` takes what should be there and is not."""
-    folder = Path(__file__).resolve().parents[1] / "perception" / "detect3d" / "weights"
-    models = {}
-    for name in ("vehicle", "roadside"):
-        model = folder / f"{name}.onnx"
-        models[f"lidar:{name}"] = "ready" if model.is_file() else f"{model} is missing"
-        broken += [] if model.is_file() else [f"{model}: is missing; install log2sim again"]
-    try:
-        from log2sim.perception.detect.ssd_mobilenet import NAME, graph_bytes
-
-        state = "ready"
-        if not any(cache.glob(f"{NAME}-*.onnx")):
-            graph_bytes()
-            state = "ready; converted into the cache at its first use"
-    except (Log2SimError, ImportError) as error:
-        state = str(error)
-    return models | {"ssd-mobilenet-v2": state}
-
-
 def doctor(as_json: opt.AsJson = False) -> None:
     """Show versions, extras, models, cache and processors, and what is missing with the line that installs it.
 
@@ -178,7 +173,7 @@ def doctor(as_json: opt.AsJson = False) -> None:
         limits = "".join(f", {name}={value}" for name, value in found["threads"].items())
         extras = [extra for extra in found["extras"] if extra["purpose"]]
         absent = [f"  {extra['install']}" for extra in extras if extra["missing"]]
-        lines = format_rows([
+        lines = opt.format_rows([
             ("log2sim", found["log2sim"]),
             ("Python", f"{found['python']}, {found['program']}"),
             ("system", found["system"]),
@@ -187,10 +182,10 @@ def doctor(as_json: opt.AsJson = False) -> None:
             ("browser", found["browser"] or "none found; open the pages of log2sim view on another machine"),
         ])  # fmt: skip
         packages = [(p["name"], p["version"] or "-", p["state"]) for p in found["packages"]]
-        lines += ["", "packages", *format_rows(packages, indent=2)]
-        lines += ["", "detectors", *format_rows(list(found["models"].items()), indent=2)]
+        lines += ["", "packages", *opt.format_rows(packages, indent=2)]
+        lines += ["", "detectors", *opt.format_rows(list(found["models"].items()), indent=2)]
         states = [(e["name"], "missing" if e["missing"] else "installed", e["purpose"]) for e in extras]
-        lines += ["", "extras", *format_rows(states, indent=2)]
+        lines += ["", "extras", *opt.format_rows(states, indent=2)]
         lines += ["", "to add one:", *absent] if absent else []
         lines += ["", f"{len(found['broken'])} problems" if found["broken"] else "nothing needed is missing"]
         opt.say("\n".join(lines))
@@ -258,7 +253,7 @@ def cache(
     ]
     if last_run is not None:
         rows.append(("last run", f"{opt.counted(last_run['found'], 'tick')} known, {last_run['kept']} kept"))
-    opt.say("\n".join(format_rows(rows)))
+    opt.say("\n".join(opt.format_rows(rows)))
 
 
 def pages() -> dict[str, str]:

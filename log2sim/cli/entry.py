@@ -8,18 +8,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from log2sim.cli import change, doctor, evaluate, exchange, logs, reconstruct, show, simulate, situations
-from log2sim.cli.options import fail, printable, say
-from log2sim.cli.shared import (
-    DEBUG,
-    SIGNAL_CODE,
-    Debug,
-    Ended,
-    FollowLinks,
-    add_command,
-    ending_by_signals,
-    tolerating_lost_output,
-)
+from log2sim.cli import change, doctor, evaluate, exchange, logs, options, reconstruct, show, simulate, situations
 from log2sim.errors import Log2SimError
 from log2sim.files.inputs import OPTION, following_links
 from log2sim.files.outputs import holding_claims
@@ -53,12 +42,12 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True)
 def root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    debug: Debug = False,
-    follow_links: FollowLinks = False,
+    debug: options.Debug = False,
+    follow_links: options.FollowLinks = False,
 ) -> None:
     """Reconstruct driving logs as scenarios that a simulator can run."""
     if version:
-        say(__version__)
+        options.say(__version__)
         raise typer.Exit
 
 
@@ -68,32 +57,32 @@ for command in (
     change.correct, situations.tag, situations.find, situations.vary, exchange.export, exchange.synth, doctor.config, doctor.cache,
     doctor.doctor, doctor.help, exchange.import_, situations.test_, logs.map,
 ):  # fmt: skip
-    add_command(app, command)
+    options.add_command(app, command)
 
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
-    with tolerating_lost_output(), ending_by_signals() as ended, holding_claims():
+    with options.tolerating_lost_output(), options.ending_by_signals() as ended, holding_claims():
         _run(ended)
 
 
-def _run(ended: Ended) -> NoReturn:
+def _run(ended: options.Ended) -> NoReturn:
     # Taken off here, too: before the name of a command they mean the same.
-    arguments = [a for a in sys.argv[1:] if a not in (DEBUG, OPTION)]
-    debug = DEBUG in sys.argv
+    arguments = [a for a in sys.argv[1:] if a not in (options.DEBUG, OPTION)]
+    debug = options.DEBUG in sys.argv
     try:
         with following_links(OPTION in sys.argv):
             code = app(args=arguments, prog_name="log2sim", standalone_mode=False)
     except Log2SimError as error:
         if debug:
             raise
-        fail(str(error), error.exit_code)
+        options.fail(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except OSError as error:
         if debug:
             raise
-        fail(f"{error.filename or 'a file'}: {error.strerror or error}; check the name and the permissions", 3)
+        options.fail(f"{error.filename or 'a file'}: {error.strerror or error}; check the name and the permissions", 3)
     except Exception as error:
         format_message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's own usage errors
         if format_message is None:
@@ -105,16 +94,18 @@ def _run(ended: Ended) -> NoReturn:
                 _end(INTERRUPTED, ended)
             if debug:
                 raise
-            fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
+            options.fail(f"internal error: {type(error).__name__}: {error}; run again with --debug for the place", 1)
         if not arguments:
-            sys.stderr.write(printable(format_message()) + "\n")
+            sys.stderr.write(options.printable(format_message()) + "\n")
             sys.exit(2)
-        fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
+        options.fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
     _end(code, ended)
 
 
-def _end(code: Any, ended: Ended) -> NoReturn:
+def _end(code: Any, ended: options.Ended) -> NoReturn:
     if code == INTERRUPTED:  # typer returns it for Ctrl-C within a command
-        word, code = ("terminated", SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
-        fail(f"{word}; no incomplete file was left", code)
+        word, code = (
+            ("terminated", options.SIGNAL_CODE + ended.signal) if ended.signal else ("interrupted", INTERRUPTED)
+        )
+        options.fail(f"{word}; no incomplete file was left", code)
     sys.exit(code if isinstance(code, int) else 0)

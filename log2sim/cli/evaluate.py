@@ -43,7 +43,6 @@ def evaluate(
         "Reliability diagram of confidences or scores to write.", "FILE.png")] = None,
     out: Annotated[Path | None, opt.write_to("FILE", "Metrics file to write.")] = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Compare a scenario, or detected boxes, with the ground truth.
@@ -75,7 +74,7 @@ def evaluate(
             raise LogError(
                 f"{path}: is a folder, but of no batch; give a file, or the folder that `log2sim batch` wrote"
             )
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             result = evaluate_batch(
                 BatchFolder.load(path), truth,
                 lambda log, scenario: load_truth(log.path, scenario, sequence=log.sequence, points=True),
@@ -97,7 +96,7 @@ def evaluate(
             detected = DetectedBoxes.from_dict(document)
         except LogError as error:
             raise LogError(f"{path}: {error}") from None
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             if truth.is_file() and not is_log_file(truth):
                 raise LogError(f"{truth}: is a file and no log; the truth of boxes is a log with labels")
             labeled = open_log(truth, sequence=sequence, labels=labels)
@@ -111,15 +110,15 @@ def evaluate(
         if poses is not None:
             stated = _stated(scenario.provenance.get("poses"), poses)
             scenario = replace(scenario, provenance={**scenario.provenance, **stated})
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             known = load_truth(
                 truth, scenario, sequence=sequence, labels=labels, points=True,
                 progress=partial(report_progress, "count points"),
             )  # fmt: skip
-        opt.say_all("note", known.provenance.get("notes", ()) if labels is not None else (), quiet=quiet)
+        opt.say_all("note", known.provenance.get("notes", ()) if labels is not None else ())
         result = run(scenario, known, max_range_m=range, categories=wanted)
         if result["placement"]["method"] == "same_map" and (note := _other_map(scenario, truth)) is not None:
-            opt.say(f"note: {note}", quiet=quiet)
+            opt.tell(f"note: {note}")
         table = format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
     with together():
         if out is not None:
@@ -128,8 +127,8 @@ def evaluate(
             from log2sim.visualization.plot.reliability import write_reliability
 
             write_reliability(result, plot)
-    opt.say(table, quiet=quiet)
-    opt.report_written(out, plot, quiet=quiet)
+    opt.tell(table)
+    opt.report_written(out, plot)
 
 
 def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
@@ -170,7 +169,6 @@ def bench(
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Compare methods and settings by error and run time.
 
@@ -198,11 +196,11 @@ def bench(
     used = chosen.cameras or tuple(opened.cameras)
     known = truth_at(truth or log, used, sequence, provenance=made) if truth is not None or labeled else None
     scope = ScoreScope(range, opt.split_names(categories) or None)
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         others = tuple(detector or ())
         result = run(opened, chosen, truth=known, scope=scope, detectors=others, progress=report_progress)
     with together():
         write_json(out / "bench.json", bench_document(result))
         write_picture(result, out / "bench.png")
-    opt.say(format_benchmark(result), quiet=quiet)
-    opt.report_written(out / "bench.json", out / "bench.png", quiet=quiet)
+    opt.tell(format_benchmark(result))
+    opt.report_written(out / "bench.json", out / "bench.png")

@@ -34,7 +34,6 @@ def export(
         "--doubtful", "keep|drop|all",
         "Agents that the scenario itself doubts: keep all but the quarantined, drop them, or keep all.")] = "keep",
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Write a scenario in the format of a simulator or viewer.
@@ -62,20 +61,19 @@ def export(
     options = Options(revision, map, mode, opened, driver)
     files = run(chosen, to, out, options, quarantined=doubtful == "all", overwrite=overwrite)
     for file in files:
-        opt.say(f"{file}: written", quiet=quiet)
+        opt.tell(f"{file}: written")
     notes = export_notes(chosen)
     if loaded.doubtful:
-        opt.say(f"note: {doubtful_note(loaded, chosen)}", quiet=quiet)
-    opt.say_all("note", notes if verbose else notes[:MAX_NOTES], quiet=quiet)
+        opt.tell(f"note: {doubtful_note(loaded, chosen)}")
+    opt.say_all("note", notes if verbose else notes[:MAX_NOTES])
     if len(notes) > MAX_NOTES and not verbose:
-        opt.say(f"note: and {len(notes) - MAX_NOTES} more", quiet=quiet)
+        opt.tell(f"note: and {len(notes) - MAX_NOTES} more")
 
 
 def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="An OpenSCENARIO file with trajectories.")],
     out: Annotated[Path, opt.write_to("SCENARIO", "Scenario file to write.")],
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Convert an OpenSCENARIO file to a scenario.
 
@@ -88,7 +86,7 @@ def import_(
 
     check_targets(out, overwrite=overwrite)
     load(file).save(out)
-    opt.report_written(out, quiet=quiet)
+    opt.report_written(out)
 
 
 def synth(
@@ -112,7 +110,6 @@ def synth(
         "Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")] = False,
     seed: Annotated[int, opt.option("Seed of all random numbers.", min=0)] = 0,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Generate a synthetic log with exact ground truth, or random traffic for training and tests.
 
@@ -127,7 +124,7 @@ def synth(
 
     if (scene is None) == (traffic is None):
         raise ConfigError("give either a scene file or --traffic vehicle or --traffic roadside")
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         if scene is not None:
             loaded = load_scene(scene)
             changes = {k: v for k, v in (("light", light), ("weather", weather)) if v is not None}
@@ -150,4 +147,4 @@ def synth(
                 traffic, scenes, seed, sensor, chosen, duration, light, weather, pictures=not no_pictures
             )  # fmt: skip
             write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
-    opt.report_written(out, quiet=quiet)
+    opt.report_written(out)

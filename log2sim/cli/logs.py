@@ -11,7 +11,6 @@ import typer
 
 from log2sim.cli import options as opt
 from log2sim.cli.progress import progress
-from log2sim.cli.shared import format_rows, wrap
 from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.files.outputs import together
 from log2sim.visualization.progress import OPENING, VALIDATING
@@ -40,7 +39,7 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
         told = f"{len(gaps)}, longest {longest:.1f} s" if gaps else "none"
         hertz = "-" if rate is None else f"{rate:.1f} Hz"
         rows.append((name, str(sensor["records"]), hertz, told, sensor["mount"], what))
-    lines += [*format_rows(rows), ""]
+    lines += [*opt.format_rows(rows), ""]
     driven, boxes, place = "no poses", "none", "local, its place on Earth is not known"
     if (ego := log["ego"]) is not None:
         at = "" if ego["rate_hz"] is None else f" at {ego['rate_hz']:.1f} Hz"
@@ -59,11 +58,11 @@ def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
             counts = {s: n if isinstance(n, int) else sum(n.values()) for s, n in log[name].items()}
             facts.append((title, ", ".join(f"{sensor} {count}" for sensor, count in counts.items())))
     facts += [(key, str(value)) for key, value in log["details"].items() if isinstance(value, str | int | float)]
-    lines += format_rows(facts)
+    lines += opt.format_rows(facts)
     topics = log["details"].get("topics")
     if isinstance(topics, list) and topics:  # of a ROS recording, with what each was taken for
         taken = [(str(t["topic"]), str(t["messages"]), str(t["role"] or "-"), str(t["reason"])) for t in topics]
-        lines += ["", *format_rows([("topic", "messages", "role", ""), *taken])]
+        lines += ["", *opt.format_rows([("topic", "messages", "role", ""), *taken])]
     return [*lines, *_notes(log["notes"], verbose=verbose)]
 
 
@@ -92,7 +91,7 @@ def describe_scenario(scenario: Document, *, verbose: bool = False) -> list[str]
         ("ego", kept),
     ]
     lines = [f"{scenario['name']}: a scenario with {total} over {scenario['duration_s']:.1f} s", ""]
-    return [*lines, *format_rows(facts), *_notes(scenario["notes"], verbose=verbose)]
+    return [*lines, *opt.format_rows(facts), *_notes(scenario["notes"], verbose=verbose)]
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -104,7 +103,7 @@ def _notes(notes: Sequence[str], *, verbose: bool) -> list[str]:
     """Return the first notes, or all of them, and how many more there are."""
     shown = notes if verbose else notes[:MAX_NOTES]
     rest = len(notes) - len(shown)
-    lines = [line for note in shown for line in wrap(f"note: {note}", indent=6)]
+    lines = [line for note in shown for line in opt.wrap(f"note: {note}", indent=6)]
     return [*([""] if lines else []), *lines, *([f"note: and {rest} more; --verbose lists them"] if rest else [])]
 
 
@@ -119,7 +118,6 @@ def inspect(
         "Time to draw, in s after the first tick.", "S", default="in the middle")] = None,
     cameras: opt.Cameras = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Describe the content of a log, or of a scenario.json, or draw one tick of a log.
@@ -149,17 +147,17 @@ def inspect(
     else:
         names = opt.camera_names(cameras)
         check_targets(overlay, overwrite=overwrite)
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             report_progress(OPENING, 0, 0)
             opened = open_log(log, format=format, sequence=sequence)
         if overlay is not None:
             from log2sim.visualization.overlay import read_moment, write_overlay
 
             write_overlay(read_moment(opened, names, at), overlay, overwrite=overwrite)
-            opt.report_written(overlay, quiet=quiet)
+            opt.report_written(overlay)
             return
         document = summarize(opened)
-    opt.say(json.dumps(document, indent=2) if as_json else "\n".join(describe(document, verbose=verbose)), quiet=quiet)
+    opt.tell(json.dumps(document, indent=2) if as_json else "\n".join(describe(document, verbose=verbose)))
 
 
 SCHEMAS = {
@@ -174,7 +172,6 @@ def validate(
         help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Validate a file, or every record of a log.
 
@@ -193,11 +190,11 @@ def validate(
         from log2sim.logs.opening import list_gaps, validate_log
 
         opened = open_log(path, format=format, sequence=sequence)
-        with progress(quiet=quiet) as report_progress:
+        with progress() as report_progress:
             problems = validate_log(opened, progress=partial(report_progress, VALIDATING))
         # Those of native logs are among the problems.
         notes = () if opened.format == READER.name else opened.notes
-        opt.say_all("note", [*notes, *list_gaps(opened)], quiet=quiet)
+        opt.say_all("note", [*notes, *list_gaps(opened)])
         if problems:
             raise LogError(f"{path}: {opt.counted(len(problems), 'problem')}\n  " + "\n  ".join(problems))
     else:
@@ -217,7 +214,7 @@ def validate(
             DetectedBoxes.load(path)
         else:
             Scenario.load(path)
-    opt.say(f"{path}: valid", quiet=quiet)
+    opt.tell(f"{path}: valid")
 
 
 def convert(
@@ -230,7 +227,6 @@ def convert(
     cameras: opt.Cameras = None,
     labels: opt.LabelFile = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Write any log, or a part of it, as a log folder of log2sim; images are copied as they are.
 
@@ -251,18 +247,15 @@ def convert(
         raise ConfigError(f"{out}: holds the log that is converted; choose another folder")
     opened = open_log(log, format=format, sequence=sequence, labels=labels)
     part = cut_log(opened, cameras=names, start_s=start, stop_s=stop)
-    opt.say_all("note", part.notes, quiet=quiet)
+    opt.say_all("note", part.notes)
     problems: list[str] = []
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         done = partial(report_progress, "convert")
         write_log(part, out, overwrite=overwrite, jpeg_quality=95, progress=done, problems=problems)
-    opt.say_all("note: left out", problems, quiet=quiet)
+    opt.say_all("note: left out", problems)
     records = sum(len(stream.t_ns) for stream in part.streams.values()) - len(problems)
     size_mb = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
-    opt.say(
-        f"{out}: {opt.counted(records, 'record')} of {opt.counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB",
-        quiet=quiet,
-    )
+    opt.tell(f"{out}: {opt.counted(records, 'record')} of {opt.counted(len(part.streams), 'sensor')}, {size_mb:.1f} MB")
 
 
 def detect(
@@ -281,7 +274,6 @@ def detect(
     config: opt.ConfigFile = None,
     settings: opt.Settings = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Detect road users in the LiDAR sweeps of a log.
 
@@ -301,17 +293,17 @@ def detect(
     chosen = opt.load_config(config, settings, detector=detector, poses=poses, start_s=start, stop_s=stop)
     opened = open_log(log, format=format, sequence=sequence, labels=labels)
     weakness = describe_weakness(detector)
-    opt.say_all("note", [*opened.notes, *([weakness] if weakness else [])], quiet=quiet)
-    with progress(quiet=quiet) as report_progress:
+    opt.say_all("note", [*opened.notes, *([weakness] if weakness else [])])
+    with progress() as report_progress:
         result = detect_log(opened, chosen, progress=partial(report_progress, "detect"))
     result.found.save(out)
-    opt.say_all("poses", pose_reasons(result.poses.to_dict()), quiet=quiet)
-    opt.say_all("note", result.findings, quiet=quiet)
+    opt.say_all("poses", pose_reasons(result.poses.to_dict()))
+    opt.say_all("note", result.findings)
     if result.left_out:
-        opt.say(f"note: {opt.counted(result.left_out, 'sweep')} left out, without points or a known pose", quiet=quiet)
+        opt.tell(f"note: {opt.counted(result.left_out, 'sweep')} left out, without points or a known pose")
     boxes = sum(len(found) for found in result.found.boxes)
     words = f"{boxes} box{'es' * (boxes != 1)} in {opt.counted(len(result.found.t_ns), 'sweep')}"
-    opt.say(f"{out}: {words} by {result.found.detector}", quiet=quiet)
+    opt.tell(f"{out}: {words} by {result.found.detector}")
 
 
 def map(
@@ -327,7 +319,6 @@ def map(
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Make a map of the ground of a log: its color, its height, or how strongly it reflects the LiDAR.
 
@@ -357,9 +348,9 @@ def map(
     if chosen != "color" and not opened.lidars:
         raise ConfigError(f"{opened.name}: the log has no LiDAR; take --layer color")
     opened, loaded, note = _agents_of(opened, scenario)
-    opt.say_all("note", (*opened.notes, *((note,) if note else ())), quiet=quiet)
+    opt.say_all("note", (*opened.notes, *((note,) if note else ())))
     records = RecordSource(opened)
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         whole = map_ground(opened, loaded, settings, records, report_progress)
     ground = whole.around(map_files.known_cells(whole, chosen))
     with together():
@@ -374,11 +365,11 @@ def map(
         notes.append(
             f"heights in {out.name}: value 1 is {map_files.lowest_m(ground):.2f} m, {map_files.HEIGHT_STEP_M:g} m a step, 0 is unknown"
         )
-    opt.say_all("note", notes, quiet=quiet)
+    opt.say_all("note", notes)
     rows, columns = ground.alpha.shape
     d = ground.resolution_m
-    opt.report_written(world, quiet=quiet)
-    opt.say(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m", quiet=quiet)
+    opt.report_written(world)
+    opt.tell(f"{out}: {columns * d:.0f} x {rows * d:.0f} m in cells of {d:g} m")
 
 
 def _agents_of(log: Log, scenario: Path | None) -> tuple[Log, Scenario, str | None]:

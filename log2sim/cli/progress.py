@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from log2sim.cli.options import is_quiet
 from log2sim.visualization.progress import OPENING, VALIDATING, describe_stage
 
 if TYPE_CHECKING:
@@ -21,9 +22,9 @@ Report = Callable[[str, int, int], None]
 
 
 @contextmanager
-def progress(*, quiet: bool) -> Iterator[Report]:
+def progress() -> Iterator[Report]:
     """Yield a function `report_progress(stage, done, total)`; with a total of 0 the length of the stage is not known."""
-    if quiet:
+    if is_quiet.get():
         yield lambda stage, done, total: None
     elif sys.stderr.isatty():
         with _bars() as report_progress:

@@ -32,7 +32,6 @@ LOOKED_FOR = (
 
 def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = False) -> list[str]:
     """Summarize a run for people; with `verbose` everything is listed, also which stages were left out."""
-    from log2sim.cli.shared import format_rows
     from log2sim.datatypes import count_agents, count_categories
 
     scenario, seconds = result.scenario, result.report["seconds"]
@@ -59,7 +58,7 @@ def summarize_run(result: Result, next_line: str, out: Path, *, verbose: bool = 
         stages = [f"{'with' if s['kept'] else 'no'} {s['stage']}: {s['reason']}" for s in scenario.stages]
         rows += [("used", line) for line in stages]
     names = [name if k == 0 or rows[k - 1][0] != name else "" for k, (name, _) in enumerate(rows)]
-    table = format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
+    table = opt.format_rows([(name, text) for name, (_, text) in zip(names, rows)], indent=2)
     known = (result.report["detection_cache"] or {"found": 0})["found"]
     made = f"made in {speed}" + (f", {opt.counted(known, 'tick')} known from earlier runs" if known else "")
     # Never broken into lines: it is there to be copied.
@@ -137,7 +136,6 @@ def reconstruct(
         default="the usable cores")] = None,
     no_cache: opt.NoCache = False,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Reconstruct the scenario of a log.
@@ -158,7 +156,7 @@ def reconstruct(
         "cooperation": {k: v for k, v in (("ends", ends), ("fusion", fusion)) if v is not None},
         "calibration": {name: True for name, chosen in fixes.items() if chosen},
     }  # fmt: skip
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         report_progress(OPENING, 0, 0)
         from log2sim.edit.corrections import correct, load_corrections
         from log2sim.logs.opening import open_log
@@ -179,13 +177,13 @@ def reconstruct(
         notes.append(f"no image is searched: {MissingExtra(IMAGE_DETECTOR, 'coco')}")
     if weakness := describe_weakness(chosen.detect.in_sweeps or ""):
         notes.append(weakness)
-    opt.say_all("note", notes, quiet=quiet)
-    with progress(quiet=quiet) as report_progress:
+    opt.say_all("note", notes)
+    with progress() as report_progress:
         result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs)
     if by_hand is not None:
         corrected = correct(result.scenario, by_hand)
         result = replace(result, scenario=corrected.scenario)
-        opt.say_all("warning", corrected.unmatched, quiet=quiet)
+        opt.say_all("warning", corrected.unmatched)
     with together():
         if topdown is not None:
             from log2sim.cli.show import CELL_M
@@ -202,15 +200,15 @@ def reconstruct(
             write_json(report, result.report)
         result.scenario.save(out)
     findings = (*result.findings, *unused_records(result.report))
-    opt.say_all("poses", pose_reasons(result.report["poses"]), quiet=quiet)
-    opt.say_all("note", findings, quiet=quiet)
-    opt.report_written(report, topdown, quiet=quiet)
+    opt.say_all("poses", pose_reasons(result.report["poses"]))
+    opt.say_all("note", findings)
+    opt.report_written(report, topdown)
     # The next command shows the scenario with the pictures and the ground of its log.
     sequences = [] if sequence is None else ["--sequence", sequence]
     page = str(out.with_suffix(".html"))
     view = shlex.join(["log2sim", "view", str(out), "--log", str(log), *sequences, "-o", page])
     for line in summarize_run(result, view, out, verbose=verbose):
-        opt.say(line, quiet=quiet)
+        opt.tell(line)
 
 
 MAX_NAMED = 5
@@ -237,7 +235,6 @@ def batch(
     no_cache: opt.NoCache = False,
     overwrite: Annotated[bool, opt.option(
         "Start over: first remove the results that DIR holds.", None, "--overwrite", "-f")] = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Reconstruct all logs below a folder, or replay all scenarios there, several at once.
 
@@ -262,26 +259,25 @@ def batch(
     planned = plan_batch(root, out, chosen, format=format, overwrite=overwrite, cache=not no_cache, replay=replay)
     kind = "scenario" if format == SCENARIO else "log"
     found = f"{opt.counted(len(planned.jobs), kind)} below {root}"
-    opt.say(f"{found}, {len(planned.done)} of them done before" if planned.done else found, quiet=quiet)
+    opt.tell(f"{found}, {len(planned.done)} of them done before" if planned.done else found)
 
     begun = time.perf_counter()
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         rows = run_batch(planned, lambda: connect(jobs, scheduler), progress=partial(report_progress, f"{kind}s"))
     failed = [row for row in rows if not row.is_done]
     for row in failed[:MAX_NAMED]:
         reason = row.error.splitlines()[0] if row.error else row.error_kind
-        opt.say(f"failed: {row.log}: {reason}", quiet=quiet)
+        opt.tell(f"failed: {row.log}: {reason}")
     if len(failed) > MAX_NAMED:
-        opt.say(f"and {len(failed) - MAX_NAMED} more", quiet=quiet)
+        opt.tell(f"and {len(failed) - MAX_NAMED} more")
     now = sum(row.is_done and row.name not in planned.done for row in rows)
     rate = f"; {now / (time.perf_counter() - begun) * 3600:,.0f} {kind}s an hour" if now else ""
     sums, off_m = sum_up(rows), [row.cross_track_max_m for row in rows if row.cross_track_max_m is not None]
     collisions = opt.counted(sum(row.new_collisions or 0 for row in rows), "new collision")
     replayed = f"; replayed at most {max(off_m):.3f} m off the paths, {collisions}" if off_m else ""
-    opt.say(
+    opt.tell(
         f"{out / 'table.html'}: {sums['done']:.0f} of {opt.counted(len(rows), kind)} done, {sums['agents']:.0f} agents "
-        f"({sums['static']:.0f} static, {sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s{replayed}{rate}",
-        quiet=quiet,
+        f"({sums['static']:.0f} static, {sums['doubtful']:.0f} doubtful) over {sums['duration_s']:.0f} s{replayed}{rate}"
     )
     if failed:
         raise LogsFailed(f"{len(failed)} of {opt.counted(len(rows), kind)} failed; {out / 'table.html'} says why")

@@ -43,7 +43,6 @@ def plot(
         default="1, or what fits into a minute, half a minute for a .gif")] = None,
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Draw a scenario from above: a picture or a film.
 
@@ -65,17 +64,17 @@ def plot(
     options.require_fits(picture.path.suffix.lower(), picture.path.name)
     check_targets(picture.path, overwrite=overwrite)
     loaded = Scenario.load(scenario)
-    replayed = load_replay(replay, loaded, quiet=quiet) if replay is not None else None
+    replayed = load_replay(replay, loaded) if replay is not None else None
     known = None if truth is None else load_placed_truth(truth, loaded, sequence)
     if picture.note is not None:
-        opt.say(f"note: {picture.note}", quiet=quiet)
-    with progress(quiet=quiet) as report_progress:
+        opt.tell(f"note: {picture.note}")
+    with progress() as report_progress:
         ground = None if background is None else load_background(background, loaded, sequence, report_progress)
         plot_tracks(
             loaded, out, replay=replayed, truth=known, background=ground, predict_s=predict, options=options,
             overwrite=overwrite, progress=report_progress,
         )  # fmt: skip
-    opt.report_written(picture.path, quiet=quiet)
+    opt.report_written(picture.path)
 
 
 def view(
@@ -97,7 +96,6 @@ def view(
         default="that of --log")] = None,
     sequence: opt.SequenceName = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Write an interactive HTML page of a scenario.
 
@@ -118,7 +116,7 @@ def view(
         raise ConfigError(f"--max-mb {max_mb:g}: expected a number above 0 and up to 1000")
     loaded = Scenario.load(scenario)
     layers: dict[str, Any] = {
-        "replay": load_replay(replay, loaded, quiet=quiet) if replay is not None else None,
+        "replay": load_replay(replay, loaded) if replay is not None else None,
         "truth": load_placed_truth(truth, loaded, sequence) if truth is not None else None,
         "metrics": [],
     }
@@ -134,7 +132,7 @@ def view(
             raise LogError(
                 f"{metrics}: expected metrics of a scenario, as `log2sim evaluate SCENARIO --truth TRUTH --out FILE` writes them"
             ) from None
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         if log is not None:
             report_progress("open", 0, 0)
             from log2sim.visualization.recording import DEFAULT_MAX_BYTES
@@ -148,8 +146,8 @@ def view(
             layers["background"] = map_of(opened, loaded, report_progress)
         notes = write_page(loaded, out, **layers, predict_s=predict, overwrite=overwrite)
     for note in notes:
-        opt.say(note, quiet=quiet)
-    opt.say(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}", quiet=quiet)
+        opt.tell(note)
+    opt.tell(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {count_agents(a.id for a in loaded.agents)}")
 
 
 CELL_M = 0.06  # edge of a cell, m: pictures on paper and screens show no more of a hundred meters
@@ -209,7 +207,7 @@ def load_placed_truth(path: Path, scenario: Scenario, sequence: str | None) -> S
     return place_truth(load_truth(path, scenario, sequence=sequence), scenario)[0]
 
 
-def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Replay:
+def load_replay(path: Path, scenario: Scenario) -> Replay:
     """Load a replay to show with a scenario; warn when it belongs to another scenario."""
     from log2sim.datatypes import EGO
     from log2sim.simulation.result import Replay as Replayed
@@ -219,10 +217,8 @@ def load_replay(path: Path, scenario: Scenario, *, quiet: bool = False) -> Repla
     others = [a.id for a in loaded.agents if a.id != EGO]
     unknown = [id for id in others if id not in known]
     if loaded.scenario != scenario.name:
-        opt.say(
-            f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; the two may not match", quiet=quiet
-        )
+        opt.tell(f"warning: {path} replays '{loaded.scenario}', not '{scenario.name}'; the two may not match")
     elif unknown:
         count = f"{len(unknown)} of its {opt.counted(len(others), 'agent')} {'is' if len(unknown) == 1 else 'are'}"
-        opt.say(f"warning: {path} replays another version of '{scenario.name}': {count} not in it", quiet=quiet)
+        opt.tell(f"warning: {path} replays another version of '{scenario.name}': {count} not in it")
     return loaded

@@ -59,7 +59,6 @@ def replay(
     limit: Annotated[list[str] | None, opt.option(
         "Report agents beyond this limit, e.g. min_ttc_s=1; see --strict.", "METRIC=VALUE")] = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Simulate a scenario.
@@ -113,7 +112,7 @@ def replay(
         warnable(kept if confidence is not None else kept.active)
     policy = load_policy(ego) if ego is not None else BrakeWhenWarned(warning) if brake else None
     moved_by = external_simulator(simulator, host, port, map)
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress:
         if log is not None and policy is not None:
             from log2sim.localization.choice import localize_like
             from log2sim.logs.opening import open_log
@@ -131,13 +130,13 @@ def replay(
     result = changed(result, left_out=left_out, warnings=warned)
     if out is not None:
         result.save(out)
-    opt.say(summarize(result, limit=None if verbose else MAX_LISTED), quiet=quiet)
+    opt.tell(summarize(result, limit=None if verbose else MAX_LISTED))
     note = doubtful_note(kept, kept)
-    opt.say_all("note", [*([note] if note else []), *export_notes(kept)], quiet=quiet)
-    opt.report_written(out, quiet=quiet)
+    opt.say_all("note", [*([note] if note else []), *export_notes(kept)])
+    opt.report_written(out)
     if strict:
         require_strict(result, limits)
-    opt.say_all("limit exceeded", check_limits(result, limits), quiet=quiet)
+    opt.say_all("limit exceeded", check_limits(result, limits))
 
 
 def predict(
@@ -151,7 +150,6 @@ def predict(
         bool, opt.option("With --out: write every predicted position with its sigma, too.", None, "--positions")
     ] = False,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Predict each agent at each tick from its past, and estimate how far off that is.
 
@@ -171,10 +169,10 @@ def predict(
     document = prediction_document(loaded, predict_scenario(loaded, horizon, methods=methods), with_positions=positions)
     if out is not None:
         write_json(out, document)
-    opt.say(format_figures(document), quiet=quiet)
+    opt.tell(format_figures(document))
     if loaded.is_reconstruction:
-        opt.say("note: the states were smoothed over the whole log and depend a little on what came next", quiet=quiet)
-    opt.report_written(out, quiet=quiet)
+        opt.tell("note: the states were smoothed over the whole log and depend a little on what came next")
+    opt.report_written(out)
 
 
 def resimulate(
@@ -191,7 +189,6 @@ def resimulate(
         "Film of a LiDAR, and a camera where they are simulated: recorded, simulated, now.", "FILE.webm")] = None,
     seed: Annotated[int, opt.option("Seed of noise and lost returns.", min=0)] = 0,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Write what the LiDARs and cameras of a log would have recorded from where the ego drives now, among its agents.
 
@@ -225,11 +222,11 @@ def resimulate(
             now = to_scenario(Replay.load(replay), source)
         else:
             now = Scenario.load(replay).aligned_to(source)
-    with progress(quiet=quiet) as report:
+    with progress() as report:
         recorded = localize_like(open_log(log, sequence=sequence), source.provenance)
         notes = run(
             recorded, source, now, out, sensors=opt.split_names(sensors), cameras=cameras, seed=seed, overwrite=overwrite, progress=report,
             then=lambda simulation: None if filmed is None else write_film(simulation, source, filmed),
         )  # fmt: skip
-    opt.say_all("note", (*notes, *([filmed.note] if filmed is not None and filmed.note else [])), quiet=quiet)
-    opt.report_written(out, None if filmed is None else filmed.path, quiet=quiet)
+    opt.say_all("note", (*notes, *([filmed.note] if filmed is not None and filmed.note else [])))
+    opt.report_written(out, None if filmed is None else filmed.path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,19 +11,16 @@ import typer
 
 from log2sim.cli import options as opt
 from log2sim.cli.progress import progress
-from log2sim.cli.shared import format_rows
 from log2sim.errors import ConfigError
 from log2sim.files.outputs import replaced_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from log2sim.scenarios.index import Index, Row
-    from log2sim.scenarios.query import Found
-
-    MapFiles = Callable[[Callable[[str], Any], Sequence[str]], Iterator[Any]]
     from log2sim.geometry import Array
     from log2sim.scenarios.failure import Outcome
+    from log2sim.scenarios.index import Index, Row
+    from log2sim.scenarios.query import Found
 
 
 def tag(
@@ -32,7 +30,6 @@ def tag(
         "Table of measures of criticality to write, for each vehicle and the one ahead of it at each tick.",
         "FILE.csv")] = None,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Find lane changes, cut-ins, overtaking, near misses and more, of the ego and of all others.
@@ -57,15 +54,15 @@ def tag(
          ", ".join(f"{k} {v:.3g}" for k, v in g.quantities.items()))
         for g in shown
     ]  # fmt: skip
-    for line in format_rows([head, *rows]):
-        opt.say(line, quiet=quiet)
+    for line in opt.format_rows([head, *rows]):
+        opt.tell(line)
     counts = {name: sum(g.tag == name for g in shown) for name in TAGS}
-    opt.say(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag", quiet=quiet)
+    opt.tell(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag")
     if out is not None:
         tagged.save(out)
     if criticality is not None:
         write_criticality(criticality, criticality_table(tagged))
-    opt.report_written(out, criticality, quiet=quiet)
+    opt.report_written(out, criticality)
 
 
 MAX_LISTED = 40
@@ -90,7 +87,6 @@ def find(
         "Tag on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     as_json: opt.AsJson = False,
     overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Find situations in many scenarios by a condition on their tags.
 
@@ -111,16 +107,18 @@ def find(
     from log2sim.scenarios.query import ask
 
     check_targets(out, table, overwrite=overwrite)
-    quiet = quiet or as_json
+    if as_json:
+        opt.is_quiet.set(True)
     opt.require_own_workers(jobs, scheduler)
-    with progress(quiet=quiet) as report_progress:
+    with progress() as report_progress, _runs(jobs, scheduler) as run:
         index = open_index(
-            path, fresh=fresh, jobs=jobs, map_files=_on_workers(scheduler) if scheduler else None,
+            path, fresh=fresh, jobs=jobs,
+            map_files=None if scheduler is None else lambda work, names: run(work, [str(Path(n).resolve()) for n in names]),
             progress=lambda done, total: report_progress("scenarios", done, total),
         )  # fmt: skip
-    opt.say_all("left out", index.problems, quiet=quiet)
+    opt.say_all("left out", index.problems)
     if fields or not condition:
-        for line in format_rows(_overview(index, fields=fields)):
+        for line in opt.format_rows(_overview(index, fields=fields)):
             opt.say(line)
         return
     found = ask(index, condition, min_probability=probability)
@@ -129,33 +127,39 @@ def find(
 
         opt.say(json.dumps(list(found.rows), ensure_ascii=False))
     for k, row in enumerate(found.rows[:MAX_LISTED]):
-        opt.say(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}", quiet=quiet)
+        opt.tell(f"{k + 1:>4}  {row['file']}: {say_hit(row).partition(':')[0]}, {say_quantities(row)}")
     more = len(found.rows) - MAX_LISTED
     if more > 0:
-        opt.say(f"and {more} more; --out and --table have all", quiet=quiet)
-    opt.say(f"{opt.counted(len(found.rows), 'hit')} in {opt.counted(index.scenarios, 'scenario')}", quiet=quiet)
+        opt.tell(f"and {more} more; --out and --table have all")
+    opt.tell(f"{opt.counted(len(found.rows), 'hit')} in {opt.counted(index.scenarios, 'scenario')}")
     for line in found.closest:
-        opt.say(line, quiet=quiet)
+        opt.tell(line)
     if out is not None:
         write_hits(out, index, condition, found.rows)
     if table is not None:
         write_table(table, found.rows)
-    opt.report_written(out, table, quiet=quiet)
+    opt.report_written(out, table)
     if open_ is not None:
         if open_ > len(found.rows):
             raise ConfigError(f"--open {open_}: there are {opt.counted(len(found.rows), 'hit')}")
-        opt.say(_opened(index, found.rows[open_ - 1], open_, out), quiet=quiet)
+        # Write the page of a hit's scenario, open it in a browser at the moment, and return its address
+        hit = found.rows[open_ - 1]
+        import tempfile
+        import webbrowser
+        from urllib.parse import quote
 
+        from log2sim.datatypes import Scenario
+        from log2sim.visualization.page.writer import write_page
 
-def _on_workers(scheduler: str) -> MapFiles:
-    """Return a function that maps over files on the workers of a scheduler."""
-    from log2sim.batch.run import workers_of
-
-    def run(work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
-        with workers_of(scheduler) as workers:
-            yield from map_on_workers(workers.client, work, names)
-
-    return run
+        page = (
+            out.with_name(f"{out.stem}-{open_}.html")
+            if out is not None
+            else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{open_}.html"
+        )
+        write_page(Scenario.load(index.folder / hit["file"]), page, overwrite=True)
+        address = f"{page.resolve().as_uri()}#t={hit['t_s']:.2f}&agent={quote(hit['agent'])}"
+        webbrowser.open(address)
+        opt.tell(address)
 
 
 @contextmanager
@@ -171,15 +175,14 @@ def _runs(
     from log2sim.batch.run import workers_of
 
     with workers_of(scheduler) as workers:
-        yield lambda work, tasks: (f.result() for f in workers.client.map(work, tasks, pure=False))
+        yield partial(map_on_workers, workers.client)
 
 
-def map_on_workers(client: Any, work: Callable[[str], Any], names: Sequence[str]) -> Iterator[Any]:
-    """Yield what a function makes of files on the workers of a client, in any order; each result is freed once it was taken."""
-    from distributed import as_completed
-
-    for future in as_completed(client.map(work, [str(Path(n).resolve()) for n in names], pure=False)):
-        yield future.result()
+def map_on_workers(client: Any, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
+    """Yield what a function makes of tasks on the workers of a client, in their order; each result is freed once it was taken."""
+    futures = client.map(work, tasks, pure=False)
+    while futures:
+        yield futures.pop(0).result()
 
 
 def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
@@ -198,26 +201,6 @@ def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
         span = pc.min_max(column).as_py() if known and str(column.type) == "double" else None
         rows.append((name, str(known), f"{span['min']:.4g} {span['max']:.4g}" if span else ""))
     return rows
-
-
-def _opened(index: Index, row: Row, number: int, out: Path | None) -> str:
-    """Write the page of a hit's scenario, open it in a browser at the moment, and return its address."""
-    import tempfile
-    import webbrowser
-    from urllib.parse import quote
-
-    from log2sim.datatypes import Scenario
-    from log2sim.visualization.page.writer import write_page
-
-    page = (
-        out.with_name(f"{out.stem}-{number}.html")
-        if out is not None
-        else Path(tempfile.mkdtemp(prefix="log2sim-find-")) / f"hit-{number}.html"
-    )
-    write_page(Scenario.load(index.folder / row["file"]), page, overwrite=True)
-    address = f"{page.resolve().as_uri()}#t={row['t_s']:.2f}&agent={quote(row['agent'])}"
-    webbrowser.open(address)
-    return address
 
 
 def _hits(found: Found) -> Sequence[Row]:
@@ -243,7 +226,6 @@ def vary(
         bool, opt.option("Write OpenSCENARIO 1.2 with parameters and their values, too.", None, "--openscenario")
     ] = False,
     overwrite: opt.OverwriteFolder = False,
-    quiet: opt.Quiet = False,
 ) -> None:
     """Vary a situation: fit the distribution of its parameters over all that are found, and draw concrete scenarios.
 
@@ -288,18 +270,15 @@ def vary(
     for name, p in described.items():
         figures = (p["least"], p["greatest"], *(p["quantiles"][q] for q in ("0.05", "0.5", "0.95")))
         shown.append((name, *(f"{figure:.4g}" for figure in figures)))
-    for line in format_rows(shown):
-        opt.say(line, quiet=quiet)
-    opt.say(
+    for line in opt.format_rows(shown):
+        opt.tell(line)
+    opt.tell(
         f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "
-        f"in {chosen['file']} at {chosen['t_s']:.1f} s",
-        quiet=quiet,
+        f"in {chosen['file']} at {chosen['t_s']:.1f} s"
     )
     refused = [row["problem"] for row in table if row["problem"]]
     if refused:
-        opt.say(
-            f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}", quiet=quiet
-        )
+        opt.tell(f"{len(refused)} cannot be driven, collide or are no {chosen['tag']}, such as: {refused[0]}")
 
 
 def test_(
@@ -322,7 +301,6 @@ def test_(
     scheduler: Annotated[str | None, opt.option(
         "Drive on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     overwrite: opt.OverwriteFolder = False,
-    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Test a policy in variations of a situation: where it fails, how critical, how likely.
 
@@ -335,7 +313,6 @@ def test_(
     log2sim test samples/egos.py:BrakeLate results/ "cut_in" -o late/ --latency 0.3:0.05 --noise 0.2
     """
     from dataclasses import asdict
-    from functools import partial
 
     import numpy as np
 
@@ -373,7 +350,7 @@ def test_(
     outcomes: list[Outcome] = []
     values: list[Array] = []
     work = partial(judge_run, base, logical, driver, limits, agents)
-    with progress(quiet=quiet) as report_progress, _runs(jobs, scheduler) as run:
+    with progress() as report_progress, _runs(jobs, scheduler) as run:
 
         def margins(scores: Array) -> Array:
             drawn = logical.from_scores(scores)
@@ -412,11 +389,10 @@ def test_(
             ],
         )  # fmt: skip
     failures = int((found.margins <= 0).sum())
-    opt.say(
-        f"{opt.counted(failures, 'failure')} in {opt.counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}",
-        quiet=quiet,
+    opt.tell(
+        f"{opt.counted(failures, 'failure')} in {opt.counted(len(outcomes), 'run')}; probability of failure {say_estimate(found.estimate)}"
     )
     errors = sum(bool(o.problem) for o in outcomes)
     if errors:
-        opt.say(f"the policy raised in {opt.counted(errors, 'run')}; the report has the traceback", quiet=quiet)
-    opt.say(f"{out / 'report.html'}: written", quiet=quiet)
+        opt.tell(f"the policy raised in {opt.counted(errors, 'run')}; the report has the traceback")
+    opt.tell(f"{out / 'report.html'}: written")

@@ -63,21 +63,19 @@ from log2sim.datatypes.log import (
     retime_spans,
     seen_from,
 )
-from log2sim.datatypes.map_features import (
+from log2sim.datatypes.scenario import (
     BORDER_KINDS,
+    EGO,
     LANE_LINE_KINDS,
     LANE_ORIGINS,
     MARKING_KINDS,
+    SIGNAL_STATES,
+    TAGS,
+    VERSION,
     MapFeatures,
     MapLane,
     Marking,
     RoadBorder,
-)
-from log2sim.datatypes.scenario import (
-    EGO,
-    SIGNAL_STATES,
-    TAGS,
-    VERSION,
     Scenario,
     Signal,
     Tag,

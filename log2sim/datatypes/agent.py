@@ -15,12 +15,13 @@ from log2sim.datatypes.categories import CATEGORIES, GROUP_OF
 from log2sim.datatypes.findings import Finding
 from log2sim.datatypes.log import Span
 from log2sim.errors import ScenarioError
+from log2sim.files.arrays import Columns
 from log2sim.files.documents import short_repr
 from log2sim.geometry import Array, wrap_angle
 
 
 @dataclass(frozen=True, eq=False)
-class Waypoints:
+class Waypoints(Columns):
     """A trajectory of the box center as columns, map frame.
 
     Half a turn is no part of `sigma_yaw_rad`: whether front and back may be swapped is a doubt of the agent.
@@ -50,18 +51,10 @@ class Waypoints:
             if len(column) != len(self.t_s):
                 raise ValueError(f"waypoints: {key} has {len(column)} values, t_s has {len(self.t_s)}")
 
-    def __len__(self) -> int:
-        """Return the number of waypoints."""
-        return len(self.t_s)
-
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the columns that there are, by name."""
         names = (*self.FLOATS, "observed", *self.OPTIONAL_FLOATS, "visible", "lidar_points")
         return {key: getattr(self, key) for key in names if getattr(self, key) is not None}
-
-    def take(self, index: Any) -> Self:
-        """Take the waypoints at `index`, integers in rising order, a slice or a mask."""
-        return type(self)(**{key: column[index] for key, column in self.columns().items()})
 
     def problem(self) -> str | None:
         """Describe the first defect: no waypoint, a value that is not finite, times that do not increase; None without."""
@@ -133,7 +126,12 @@ class Trajectory:
             jump = (miss > MIN_DISCONTINUITY_M) & (miss > MIN_DISCONTINUITY_MPS * span)
             at_jump = np.concatenate([jump, [False]]) | np.concatenate([[False], jump])
             swing = np.where(at_jump, 0.0, rear_axle_offset_m * np.gradient(yaw, w.t_s))
-            vx, vy = _tangents(w.t_s, x, y, vx - swing * np.sin(yaw), vy + swing * np.cos(yaw), at_jump)
+            vx, vy = vx - swing * np.sin(yaw), vy + swing * np.cos(yaw)
+            # Difference quotients where the logged velocities disagree with them: sideways steps of a pedestrian and a box
+            # labeled back to front would otherwise bend the spline into loops.
+            dx, dy = np.gradient(x, w.t_s), np.gradient(y, w.t_s)
+            replaced = (np.hypot(vx - dx, vy - dy) > 0.5 + 0.3 * np.hypot(dx, dy)) & ~at_jump
+            vx, vy = np.where(replaced, dx, vx), np.where(replaced, dy, vy)
         return cls(w.t_s, x, y, w.z_m, yaw, w.speed_mps, vx, vy, jump, origin_m)
 
     def at(self, t_s: Array) -> TrajectoryStates:
@@ -183,17 +181,6 @@ class Trajectory:
     def discontinuity_times(self) -> Array:
         """Return the times (J,) of the waypoints that the agent cannot have moved to."""
         return self.t_s[1:][self.discontinuous]
-
-
-def _tangents(t_s: Array, x: Array, y: Array, vx: Array, vy: Array, at_jump: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Choose the velocities (T,) at the waypoints: the logged ones, or difference quotients where the two disagree.
-
-    Sideways steps of a pedestrian and a box labeled back to front would otherwise bend the spline into loops.
-    """
-    dx, dy = np.gradient(x, t_s), np.gradient(y, t_s)
-    differs = np.hypot(vx - dx, vy - dy) > 0.5 + 0.3 * np.hypot(dx, dy)
-    replaced = differs & ~at_jump
-    return np.where(replaced, dx, vx), np.where(replaced, dy, vy)
 
 
 def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:

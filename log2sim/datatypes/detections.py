@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes.log import Deferred, seen_from
-from log2sim.files.arrays import ArrayFile, ArrayList, array_lengths, join_arrays, take_arrays
+from log2sim.files.arrays import ArrayFile, ArrayList, Columns, array_lengths, join_arrays, take_arrays
 from log2sim.files.documents import short_repr
 from log2sim.geometry import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes3D:
+class Boxes3D(Columns):
     """Boxes of M road users, map frame."""
 
     __repr__ = short_repr
@@ -33,15 +33,6 @@ class Boxes3D:
     # (M, 2): which of the `ENDS` found it; None where their clouds were searched as one
     seen_by: NDArray[np.bool_] | None = None
 
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.t_ns)
-
-    def take(self, index: Any) -> Self:
-        """Take the boxes at `index`, integers or a mask."""
-        columns: dict[str, Any] = {k: None if v is None else v[index] for k, v in vars(self).items()}
-        return type(self)(**columns)
-
     @classmethod
     def empty(cls) -> Self:
         """Return no boxes."""
@@ -49,15 +40,9 @@ class Boxes3D:
         return cls(n, np.zeros((0, 3)), np.zeros((0, 3)), flat, flat, np.zeros(0, dtype="<U16"), flat, n)
 
     @classmethod
-    def join(cls, parts: Sequence[Boxes3D]) -> Boxes3D:
+    def join(cls, parts: Sequence[Self]) -> Self:
         """Concatenate several sets; an empty sequence gives no boxes. Who found them is known if it is of all."""
-        if not parts:
-            return cls.empty()
-        columns: dict[str, Any] = {}
-        for name in vars(parts[0]):
-            values = [getattr(p, name) for p in parts]
-            columns[name] = None if any(v is None for v in values) else np.concatenate(values)
-        return cls(**columns)
+        return super().join(parts) if parts else cls.empty()
 
 
 TUPLES = ("cluster", "others")

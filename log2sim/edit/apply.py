@@ -88,16 +88,8 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     edit: the speed of a static agent, a path shifted beyond its center of curvature, a trajectory without waypoints
     left.
 
-    Parameters
-    ----------
-    edits : sequence of Only, Remove, DropDoubtful, Replace, Add, Speed, Lateral, CutIn, Shift
-        Each kind of motion at most once for an agent.
-
-    Returns
-    -------
-    Edited
-        The scenario, longer where an agent now lives beyond its end, with the edits and the digest of the source appended to
-        `provenance["edits"]`; and warnings of new collisions and infeasible motion.
+    `edits`: each kind of motion at most once for an agent. Returns the scenario, longer where an agent now lives beyond its end, with
+    the edits and the digest of the source appended to `provenance["edits"]`; and warnings of new collisions and infeasible motion.
     """
     if not edits:
         raise ConfigError("no edits; say what to change, such as a shift of one agent")

@@ -15,7 +15,7 @@ import numpy as np
 
 from log2sim.datatypes import EGO, TYPICAL_SIZE_M, Agent, MapFeatures, Marking, RoadBorder, Scenario, Waypoints
 from log2sim.datatypes.agent import STANDSTILL_MPS, hermite, hermite_slope
-from log2sim.datatypes.map_features import BORDER_KINDS
+from log2sim.datatypes.scenario import BORDER_KINDS
 from log2sim.edit.edits import STEP_S, ground_at, insert_steps, new_id, resampled
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check, read_json
@@ -73,15 +73,8 @@ def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     agent. Raises `ScenarioError` when they are of another log: its name differs, and none of them finds what it is
     about.
 
-    Parameters
-    ----------
-    corrections : mapping
-        A document of `schemas/corrections-1.json`, as `load_corrections` returns it.
-
-    Returns
-    -------
-    Corrected
-        The scenario, with the corrections that were applied and the digest of its source appended to `provenance["corrections"]`.
+    `corrections`: a document of `schemas/corrections-1.json`, as `load_corrections` returns it. Returns the scenario, with the
+    corrections that were applied and the digest of its source appended to `provenance["corrections"]`.
     """
     draft = _Draft(scenario, corrections.get("map_offset_m"))
     unmatched, applied = [], []

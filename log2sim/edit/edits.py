@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Finding, Waypoints, retime_spans
+from log2sim.datatypes import CATEGORIES, EGO, TYPICAL_SIZE_M, Agent, Waypoints, retime_spans
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, wrap_angle
@@ -52,46 +51,6 @@ def shifted_in_time(agent: Agent, seconds: float) -> Waypoints:
         return kept
     start = replace(resampled(agent, np.array([-seconds])), t_s=np.zeros(1))
     return Waypoints(**{k: np.concatenate([v, getattr(kept, k)]) for k, v in start.columns().items()})
-
-
-def retimed_doubts(doubts: Sequence[Finding], change: Callable[[float], float]) -> tuple[Finding, ...]:
-    """Move the spans of doubts, without what then is before the scenario's start t = 0.
-
-    A sentence of a file that names a time, which stays that of the source, says so.
-    """
-    moved = []
-    for d in (doubt.retimed(change) for doubt in doubts):
-        if d.end_s is not None and d.end_s < 0.0:
-            continue
-        d = replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0))
-        told = d.text is not None and _NAMES_A_TIME.search(d.text) and OLD_TIME not in d.text
-        moved.append(replace(d, text=f"{d.text}, {OLD_TIME}") if told else d)
-    return tuple(moved)
-
-
-def shifted_left(w: Waypoints, meters: float) -> Waypoints:
-    """Return waypoints `meters` to the left of their headings, to the right where negative.
-
-    A point fixed to the left of a rigid body moves along the body's heading, `meters` times the yaw rate slower than
-    the body, which is 1 - curvature times `meters` of its speed. So all points of the body, also the rear axle, drive a
-    parallel curve, and a standing body keeps its heading. `parallel_fails` tells where no parallel curve exists. The
-    height stays.
-    """
-    yaw = np.unwrap(w.yaw_rad)
-    rate = np.gradient(yaw, w.t_s, edge_order=2 if len(w) > 2 else 1) if len(w) > 1 else np.zeros(len(w))
-    return replace(
-        w,
-        x_m=w.x_m - meters * np.sin(w.yaw_rad),
-        y_m=w.y_m + meters * np.cos(w.yaw_rad),
-        speed_mps=w.speed_mps - meters * rate,
-    )
-
-
-def parallel_fails(w: Waypoints, meters: float) -> NDArray[np.bool_]:
-    """Mask (T - 1,) of the steps between waypoints whose radius is not larger than the shift."""
-    chord, turn = chords(w)
-    moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
-    return moves & (chord * (chord - meters * turn) <= 0)
 
 
 def chords(w: Waypoints) -> tuple[Array, Array]:
@@ -266,7 +225,15 @@ class _WaypointEdit(_AgentEdit):
         waypoints, retime = self.moved(agent)
         moved = replace(agent, waypoints=replace(waypoints, visible=None, lidar_points=None))
         if retime is not None:
-            doubts, seen = retimed_doubts(agent.doubts, retime), agent.observed_by
+            # Move the spans of doubts, without what then is before the scenario's start t = 0
+            retimed = []
+            for d in (doubt.retimed(retime) for doubt in agent.doubts):
+                if d.end_s is not None and d.end_s < 0.0:
+                    continue
+                d = replace(d, start_s=None if d.start_s is None else max(d.start_s, 0.0))
+                told = d.text is not None and _NAMES_A_TIME.search(d.text) and OLD_TIME not in d.text
+                retimed.append(replace(d, text=f"{d.text}, {OLD_TIME}") if told else d)
+            doubts, seen = tuple(retimed), agent.observed_by
             moved = replace(moved, doubts=doubts, observed_by=retime_spans(seen, retime, begin_s=0.0))
         return {**agents, self.agent: moved}
 
@@ -339,11 +306,13 @@ class Lateral(_WaypointEdit):
     def moved(self, agent: Agent) -> tuple[Waypoints, None]:
         """Return the waypoints of the parallel path."""
         w = agent.waypoints
-        fails = parallel_fails(w, self.meters)
+        # Steps between waypoints (T - 1,) whose radius is not larger than the shift.
+        chord, turn = chords(w)
+        moves = np.abs(chord) > MIN_PATH_MPS * np.diff(w.t_s)
+        fails = moves & (chord * (chord - self.meters * turn) <= 0)
         if self.window is not None:
             fails &= w.t_s[1:] > self.window.begin_s
         if fails.any():
-            chord, turn = chords(w)
             radius_m = np.where(fails, np.abs(chord / np.where(fails, turn, 1.0)), np.inf)
             k = int(np.argmin(radius_m))
             raise ConfigError(
@@ -352,7 +321,15 @@ class Lateral(_WaypointEdit):
             )
         if self.window is not None:
             return lane_changed(agent, self.meters, *self.window.of(agent, self.kind)), None
-        return shifted_left(w, self.meters), None
+        # Return waypoints `meters` to the left of their headings, to the right where negative
+        yaw = np.unwrap(w.yaw_rad)
+        rate = np.gradient(yaw, w.t_s, edge_order=2 if len(w) > 2 else 1) if len(w) > 1 else np.zeros(len(w))
+        return replace(
+            w,
+            x_m=w.x_m - self.meters * np.sin(w.yaw_rad),
+            y_m=w.y_m + self.meters * np.cos(w.yaw_rad),
+            speed_mps=w.speed_mps - self.meters * rate,
+        ), None
 
 
 @dataclass(frozen=True)

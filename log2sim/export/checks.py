@@ -102,7 +102,11 @@ def require_start_as_in_scenario(agents: Sequence[Agent], placed: Array) -> None
     """
     start_s = max(0.0, min(float(a.waypoints.t_s[0]) for a in agents))
     there = _Boxes.of(agents, _states(agents, np.array([start_s]))[:, 0])
-    moved = np.flatnonzero(there.differ_from(placed.T))
+    # Mark (A,) the boxes that other states (4, A) place elsewhere
+    change = placed.T - there.states
+    change[3] = wrap_angle(change[3])
+    same = (np.abs(change) <= SAME_PLACE).all(axis=0)  # False for NaN
+    moved = np.flatnonzero(np.asarray(~same & ~np.isnan(placed.T).any(axis=0)))
     everybody = np.arange(len(agents))
     first = np.where(np.isin(everybody, moved), len(agents), 0) + everybody  # pairs of which one was moved, once
     boxes = _Boxes.of(agents, placed.T)
@@ -147,13 +151,6 @@ class _Boxes:
     @classmethod
     def of(cls, agents: Sequence[Agent], states: Array) -> _Boxes:
         return cls(states, np.array([a.size_m for a in agents]).reshape(-1, 3))
-
-    def differ_from(self, states: Array) -> NDArray[np.bool_]:
-        """Mark (A,) the boxes that other states (4, A) place elsewhere."""
-        change = states - self.states
-        change[3] = wrap_angle(change[3])
-        same = (np.abs(change) <= SAME_PLACE).all(axis=0)  # False for NaN
-        return np.asarray(~same & ~np.isnan(states).any(axis=0))
 
     def overlapping(
         self, rows: NDArray[np.intp], others: NDArray[np.intp], rank: NDArray[np.intp]

@@ -7,14 +7,13 @@ that conflicts with other packages, and its writer truncates decimals and dates 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import Agent, MapLane, Scenario, Signal
+from log2sim.datatypes import Agent, Scenario, Signal
 from log2sim.errors import ScenarioError
 from log2sim.export import xml_text
 from log2sim.export.csv_table import write_csv_table
@@ -87,7 +86,24 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     marks = MarkFinder(scenario)
     for lane in roads:
         own = [len(roads) + k for k, names in enumerate(lights, start=1) if lane.id in names]
-        root.append(_lanelet(lane, number_of, marks, own))
+        # A lane with its edges, the lanes before, behind and beside it, and the traffic lights for it
+        lanelet = element("lanelet", id=str(number_of[lane.id]))
+        sides = ("leftBound", "rightBound"), edges_of(lane), map(marks.mark, (lane.left, lane.right))
+        for tag, bound, mark in zip(*sides):
+            parent = element(tag, lanelet)
+            for point in bound:
+                _point(parent, point)
+            _texts(parent, lineMarking=LINE_MARKING[mark.kind])
+        for tag, others in (("predecessor", lane.predecessors), ("successor", lane.successors)):
+            for other in others:
+                element(tag, lanelet, ref=str(number_of[other]))
+        for tag, beside in (("adjacentLeft", lane.left_lane), ("adjacentRight", lane.right_lane)):
+            if beside is not None:
+                element(tag, lanelet, ref=str(number_of[beside]), drivingDir="same")
+        _texts(lanelet, laneletType="unknown" if lane.junction is None else "intersection")
+        for light in own:
+            element("trafficLightRef", lanelet, ref=str(light))
+        root.append(lanelet)
     root.extend(_traffic_light(signal, len(roads) + k, t_s) for k, signal in enumerate(scenario.signals, start=1))
     first = len(roads) + len(scenario.signals) + 1
     table: list[tuple[object, ...]] = [("commonroad_id", "agent", "category", "role", "confidence", "doubts")]
@@ -117,27 +133,6 @@ def _texts(parent: Element, **children: str) -> Element:
 
 def _point(parent: Element, xyz: Array) -> None:
     _texts(element("point", parent), **dict(zip("xyz", map(_decimal, xyz))))
-
-
-def _lanelet(lane: MapLane, number_of: Mapping[str, int], marks: MarkFinder, lights: Sequence[int]) -> Element:
-    """Return a lane with its edges, the lanes before, behind and beside it, and the traffic lights for it."""
-    lanelet = element("lanelet", id=str(number_of[lane.id]))
-    sides = ("leftBound", "rightBound"), edges_of(lane), map(marks.mark, (lane.left, lane.right))
-    for tag, bound, mark in zip(*sides):
-        parent = element(tag, lanelet)
-        for point in bound:
-            _point(parent, point)
-        _texts(parent, lineMarking=LINE_MARKING[mark.kind])
-    for tag, names in (("predecessor", lane.predecessors), ("successor", lane.successors)):
-        for name in names:
-            element(tag, lanelet, ref=str(number_of[name]))
-    for tag, beside in (("adjacentLeft", lane.left_lane), ("adjacentRight", lane.right_lane)):
-        if beside is not None:
-            element(tag, lanelet, ref=str(number_of[beside]), drivingDir="same")
-    _texts(lanelet, laneletType="unknown" if lane.junction is None else "intersection")
-    for light in lights:
-        element("trafficLightRef", lanelet, ref=str(light))
-    return lanelet
 
 
 def _traffic_light(signal: Signal, number: int, t_s: Array) -> Element:

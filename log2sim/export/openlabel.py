@@ -69,9 +69,23 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
             "frame_properties": {"timestamp": str(t_ns), "transforms": transforms, "streams": streams},
             "objects": {uid: {"object_data": found} for uid, found in data[k].items()},
         }
+    # The map, the ego in it, and the sensors on the ego and in the map
+    systems: dict[str, Any] = {"map": {"type": "scene_cs", "parent": "", "children": []}}
+    if scenario.ego is not None or (log is not None and log.ego is not None):
+        systems["ego"] = {"type": "local_cs", "parent": "map", "children": []}
+    sensors: list[Camera | Lidar] = [] if log is None else [*log.cameras.values(), *log.lidars.values()]
+    for sensor in sensors:
+        mount_T_sensor = (sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar).copy()
+        if sensor.mount == "map":
+            mount_T_sensor[:3, 3] += scenario.map.offset_m
+        pose = {"matrix4x4": _rounded(mount_T_sensor, 9)}
+        systems[sensor.name] = {"type": "sensor_cs", "parent": sensor.mount, "pose_wrt_parent": pose}
+    for name, system in systems.items():
+        if system["parent"]:
+            systems[system["parent"]]["children"].append(name)
     document = {
         "metadata": {"schema_version": "1.0.0", "name": scenario.name, "annotator": "log2sim"},
-        "coordinate_systems": _systems(scenario, log),
+        "coordinate_systems": systems,
         "streams": {} if log is None else _streams(log),
         "objects": {
             str(uid): _object(agent, [k for k, found in enumerate(data) if str(uid) in found])
@@ -121,24 +135,6 @@ def _transforms(
     moved = map_T_ego.copy()
     moved[:3, 3] += scenario.map.offset_m
     return {"ego_to_map": {"src": "ego", "dst": "map", "transform_src_to_dst": {"matrix4x4": _rounded(moved, 9)}}}
-
-
-def _systems(scenario: Scenario, log: Log | None) -> dict[str, Any]:
-    """Return the map, the ego in it, and the sensors on the ego and in the map."""
-    systems: dict[str, Any] = {"map": {"type": "scene_cs", "parent": "", "children": []}}
-    if scenario.ego is not None or (log is not None and log.ego is not None):
-        systems["ego"] = {"type": "local_cs", "parent": "map", "children": []}
-    sensors: list[Camera | Lidar] = [] if log is None else [*log.cameras.values(), *log.lidars.values()]
-    for sensor in sensors:
-        mount_T_sensor = (sensor.mount_T_cam if isinstance(sensor, Camera) else sensor.mount_T_lidar).copy()
-        if sensor.mount == "map":
-            mount_T_sensor[:3, 3] += scenario.map.offset_m
-        pose = {"matrix4x4": _rounded(mount_T_sensor, 9)}
-        systems[sensor.name] = {"type": "sensor_cs", "parent": sensor.mount, "pose_wrt_parent": pose}
-    for name, system in systems.items():
-        if system["parent"]:
-            systems[system["parent"]]["children"].append(name)
-    return systems
 
 
 def _streams(log: Log) -> dict[str, Any]:

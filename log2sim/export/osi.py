@@ -89,24 +89,6 @@ def _marking(osi: Any, number: int, points: Array, color: str | None) -> Any:
     )
 
 
-def _traffic_lights(osi: Any, scenario: Scenario, first: int, t_s: float) -> list[Any]:
-    """Return the traffic lights of a scenario with their states at a time, numbered from `first` on."""
-    kind = osi.TrafficLight.Classification
-    length, width, height = LIGHT_SIZE_M
-    out = []
-    for number, signal in enumerate(scenario.signals, start=first):
-        color, mode = LIGHT[str(signal.at(np.array([t_s]))[0])]
-        turn = osi.Orientation3d(roll=0.0, pitch=0.0, yaw=float(signal.heading_rad or 0.0))
-        size = osi.Dimension3d(length=length, width=width, height=height)
-        out.append(osi.TrafficLight(
-            id=osi.Identifier(value=number),
-            base=osi.BaseStationary(position=_vector(osi, signal.position_m), dimension=size, orientation=turn),
-            classification=kind(color=kind.Color[color], mode=kind.Mode[mode], icon=kind.Icon.NONE, is_out_of_service=mode == "OFF"),
-            source_reference=[osi.ExternalReference(type="io.log2sim.signal", identifier=[signal.id])],
-        ))  # fmt: skip
-    return out
-
-
 SOURCE = "io.log2sim.scenario"
 AXLE_OF_HEIGHT = 0.2  # height of the wheel hubs above ground as a share of the vehicle's height; not measured
 # Names in OSI's `MovingObject.VehicleClassification.Type`, whose types include the rider.
@@ -163,9 +145,23 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         for k, stamp_ns in enumerate(stamps.tolist()):
             alive = [(n, a, m) for n, (a, m) in enumerate(moves, start=1) if m.valid[k]]
             t_s = (stamp_ns - scenario.t0_ns) / NS_PER_S
+            # The traffic lights of a scenario with their states at a time, numbered from `first` on
+            kind = betterosi.TrafficLight.Classification
+            length, width, height = LIGHT_SIZE_M
+            out = []
+            for number, signal in enumerate(scenario.signals, start=(free + len(painted))):
+                color, mode = LIGHT[str(signal.at(np.array([t_s]))[0])]
+                turn = betterosi.Orientation3d(roll=0.0, pitch=0.0, yaw=float(signal.heading_rad or 0.0))
+                size = betterosi.Dimension3d(length=length, width=width, height=height)
+                out.append(betterosi.TrafficLight(
+                    id=betterosi.Identifier(value=number),
+                    base=betterosi.BaseStationary(position=_vector(betterosi, signal.position_m), dimension=size, orientation=turn),
+                    classification=kind(color=kind.Color[color], mode=kind.Mode[mode], icon=kind.Icon.NONE, is_out_of_service=mode == "OFF"),
+                    source_reference=[betterosi.ExternalReference(type="io.log2sim.signal", identifier=[signal.id])],
+                ))  # fmt: skip
             writer.add(betterosi.GroundTruth(
                 **head, **ground,
-                traffic_light=_traffic_lights(betterosi, scenario, free + len(painted), t_s),
+                traffic_light=out,
                 timestamp=betterosi.Timestamp(seconds=stamp_ns // NS_PER_S, nanos=stamp_ns % NS_PER_S),
                 moving_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if not _stationary(a)],
                 stationary_object=[_object(betterosi, n, a, m, k) for n, a, m in alive if _stationary(a)],

@@ -1,4 +1,4 @@
-"""Arrays that wait in a temporary file instead of in memory, so that a long log takes no more of it than a short one."""
+"""Arrays as columns of a table, and in a temporary file, so that a long log takes no more memory than a short one."""
 
 from __future__ import annotations
 
@@ -8,10 +8,30 @@ import threading
 import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+class Columns:
+    """Base of frozen dataclasses whose fields are columns: arrays with one row a thing, None for one that is not known."""
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(next(iter(vars(self).values())))
+
+    def take(self, index: Any) -> Self:
+        """Take the rows at `index`: integers, a slice or a mask."""
+        return type(self)(**{name: None if v is None else v[index] for name, v in vars(self).items()})
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """Concatenate one or more sets; a column is known if it is of all."""
+        tables = [vars(part) for part in parts]
+        columns = {name: [table[name] for table in tables] for name in tables[0]}
+        return cls(**{k: None if any(v is None for v in c) else np.concatenate(c) for k, c in columns.items()})
+
 
 # Arrays of short logs never leave the memory.
 MEMORY_BYTES = 64 * 2**20

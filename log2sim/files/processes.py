@@ -138,20 +138,16 @@ def _serve(work: Callable[[Any], Any], connection: Connection, not_mine: list[Co
             except Exception as error:
                 error.add_note("".join(traceback.format_exception(error)))
                 answer = (False, error)
-            connection.send_bytes(_pickled(answer))
+            # A pickle that can be read; of an error that cannot, its text
+            try:
+                content = pickle.dumps(answer, protocol=5)
+                if not answer[0]:
+                    pickle.loads(content)
+            except Exception:
+                content = pickle.dumps((False, RuntimeError(f"{type(answer[1]).__name__}: {answer[1]}")))
+            connection.send_bytes(content)
     except (EOFError, OSError):
         os._exit(0)
-
-
-def _pickled(answer: tuple[bool, Any]) -> bytes:
-    """Return a pickle that can be read; of an error that cannot, its text."""
-    try:
-        content = pickle.dumps(answer, protocol=5)
-        if not answer[0]:
-            pickle.loads(content)
-    except Exception:
-        content = pickle.dumps((False, RuntimeError(f"{type(answer[1]).__name__}: {answer[1]}")))
-    return content
 
 
 def _receive(connection: Connection, process: Any) -> Any:

@@ -164,10 +164,7 @@ def _distorted(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
         radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     if not (p1 or p2):
         return x * radial, y * radial
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
+    return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
 
 def undistort(camera: Camera, uv_px: Array) -> Array:

@@ -1,11 +1,19 @@
-"""Rigid transforms, rotations, angles and stamps in nanoseconds; names and frames as in `log2sim.geometry`."""
+"""Rigid transforms, rotations, angles and stamps in nanoseconds, poses over time, and windows and gates of samples.
+
+Names and frames as in `log2sim.geometry`.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from log2sim.files.documents import short_repr
 
 NS_PER_S = 1_000_000_000
 
@@ -169,3 +177,164 @@ def slerp(q0: Array, q1: Array, fraction: Array) -> Array:
     w1 = np.where(small, fraction, np.sin(fraction * angle) / sine)
     q = w0[:, None] * q0 + w1[:, None] * q1
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+# Poses of some logs are 1 ns apart; beyond the ends of a track motion is taken from poses at least this far apart, if there are.
+MIN_EXTRAPOLATION_BASE_NS = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTrack:
+    """Poses of the ego over time.
+
+    `t_ns` (P,): strictly increasing absolute stamps. `map_T_ego` (P, 4, 4). `max_gap_s`, s: poses are not interpolated
+    between stamps farther apart than this. `extrapolate_s`, s: poses are extrapolated up to this far outside the track.
+    `sigma_m`, `sigma_yaw_rad` (P,), optional: standard deviations of the position along each axis, m, and of the yaw, rad;
+    None where they are not known.
+    """
+
+    __repr__ = short_repr
+
+    t_ns: NDArray[np.int64]
+    map_T_ego: Array
+    max_gap_s: float = 1.0
+    extrapolate_s: float = 0.2
+    sigma_m: Array | None = None
+    sigma_yaw_rad: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Check that stamps increase and that there is one pose for each."""
+        if len(self.t_ns) == 0 or len(self.t_ns) != len(self.map_T_ego):
+            raise ValueError("a pose track needs one pose per stamp and at least one of them")
+        if np.any(np.diff(self.t_ns) <= 0):
+            raise ValueError("stamps of a pose track must be strictly increasing")
+        if any(s is not None and len(s) != len(self.t_ns) for s in (self.sigma_m, self.sigma_yaw_rad)):
+            raise ValueError("a pose track with standard deviations needs one per stamp")
+
+    @cached_property
+    def _quaternions(self) -> Array:
+        return quaternion_from_rotation(self.map_T_ego[:, :3, :3])
+
+    def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Interpolate the pose at stamps (N,) int64 ns: rotation by slerp, translation linearly.
+
+        Returns `map_T_ego`: (N, 4, 4); `valid`: (N,): false in gaps longer than `max_gap_s` and farther than `extrapolate_s`
+        outside the track.
+        """
+        t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
+        if len(self.t_ns) == 1:
+            near = np.abs(t - self.t_ns[0]) <= round(self.extrapolate_s * NS_PER_S)
+            return np.repeat(self.map_T_ego, len(t), axis=0), near
+        i, k = self._neighbors(t)
+        span = (self.t_ns[k] - self.t_ns[i]).astype(np.float64)
+        fraction = (t - self.t_ns[i]).astype(np.float64) / span
+        q = self._quaternions
+        position = self.map_T_ego[:, :3, 3]
+        poses = transform(
+            rotation_from_quaternion(slerp(q[i], q[k], fraction)),
+            position[i] + fraction[:, None] * (position[k] - position[i]),
+        )
+        margin = round(self.extrapolate_s * NS_PER_S)
+        inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
+        recorded = (t == self.t_ns[i]) | (t == self.t_ns[k])
+        return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | recorded)
+
+    def sigmas_at(self, t_ns: ArrayLike, usual: tuple[float, float]) -> Array:
+        """Interpolate the standard deviations (N, 2) of position, m, and yaw, rad, at stamps (N,) int64 ns.
+
+        `usual`: what they are where the track does not know them.
+        """
+        t_s = (np.atleast_1d(np.asarray(t_ns, dtype=np.int64)) - self.t_ns[0]) / NS_PER_S
+        known_s = (self.t_ns - self.t_ns[0]) / NS_PER_S
+        out = np.tile(usual, (len(t_s), 1)).astype(np.float64)
+        for k, sigma in enumerate((self.sigma_m, self.sigma_yaw_rad)):
+            if sigma is not None:
+                out[:, k] = np.interp(t_s, known_s, sigma)
+        return out
+
+    def _neighbors(self, t_ns: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows (N,) before and after stamps; outside the track its end and a row some time away, never two at nearly one time."""
+        last = len(self.t_ns) - 1
+        after = np.clip(np.searchsorted(self.t_ns, t_ns, side="right"), 1, last)
+        start, end = t_ns < self.t_ns[0], t_ns > self.t_ns[-1]
+        if not (start.any() or end.any()):
+            return after - 1, after
+        second = min(int(np.searchsorted(self.t_ns, self.t_ns[0] + MIN_EXTRAPOLATION_BASE_NS)), last)
+        early_ns = self.t_ns[-1] - MIN_EXTRAPOLATION_BASE_NS
+        second_last = max(int(np.searchsorted(self.t_ns, early_ns, side="right")) - 1, 0)
+        return np.where(end, second_last, after - 1), np.where(start, second, after)
+
+
+# Gates of squared Mahalanobis distances, by degrees of freedom and probability: 99 % and 99.9 %.
+CHI2_2DOF_99 = 9.21
+CHI2_2DOF_999 = 13.8
+CHI2_4DOF_999 = 18.5
+NEVER = 1e6
+"""Cost of no pair above which as many pairs as possible are chosen, where those of pairs are much smaller."""
+
+
+def choose_pairs(
+    first: NDArray[np.signedinteger[Any]], second: NDArray[np.signedinteger[Any]], cost: Array, none: float = NEVER
+) -> NDArray[np.intp]:
+    """Choose among possible pairs (P,), each once, those (K,) of the best assignment; `none` is what it costs to leave one out.
+
+    What no chain of possible pairs connects does not compete: each group of the others is assigned on its own, so that a long
+    log with many tracks takes no table of all pairs. Pairs that are alone, nearly all in a sparse scene, take no solver.
+    """
+    usable = np.flatnonzero(cost < none)
+    row, column = (np.unique(side[usable], return_inverse=True)[1] for side in (first, second))
+    alone = (np.bincount(row)[row] == 1) & (np.bincount(column)[column] == 1)
+    if alone.all():
+        return usable
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    contested, row, column = usable[~alone], row[~alone], column[~alone]
+    count = int(max(row.max(), column.max())) + 1
+    graph = coo_array((np.ones(len(row)), (row, column + count)), shape=(2 * count, 2 * count))
+    group = connected_components(graph, directed=False)[1][row]
+    order = np.argsort(group, kind="stable")
+    chosen = [usable[alone]]
+    for pairs in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        (rows, r), (columns, c) = (np.unique(side[pairs], return_inverse=True) for side in (row, column))
+        table, place = np.full((len(rows), len(columns)), none), np.full((len(rows), len(columns)), -1)
+        table[r, c], place[r, c] = cost[contested[pairs]], contested[pairs]
+        taken = place[linear_sum_assignment(table)]
+        chosen.append(taken[taken >= 0])
+    return np.sort(np.concatenate(chosen))
+
+
+def median(values: NDArray[Any]) -> float:
+    """Return the median of values (N,), N > 0, none of them NaN: `np.median`, which takes ten times as long for a few hundred."""
+    k = len(values) // 2
+    ordered = np.partition(values, k)
+    return float(ordered[k]) if len(values) % 2 else float((ordered[:k].max() + ordered[k]) / 2)
+
+
+def weighted_quantile(values: Array, weight: Array, share: float) -> float:
+    """Return the smallest of the values (N,), N > 0, that hold a share of the weight (N,) together with all smaller ones."""
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weight[order])
+    return float(values[order[min(int(np.searchsorted(reached, reached[-1] * share)), len(order) - 1)]])
+
+
+def fit_windows(values: NDArray[Any], window: int, degree: int, derivative: int = 0, spacing: float = 1.0) -> Any:
+    """Fit a polynomial to the odd `window` around each of the values (N,) and return it, or a derivative; at either end the last window's.
+
+    Savitzky and Golay (1964): `scipy.signal.savgol_filter`, which fits both ends anew for each call.
+    """
+    half, weights = window // 2, _window_weights(window, degree, derivative, spacing)
+    inside = np.correlate(values, weights[half], "valid")
+    return np.concatenate([weights[:half] @ values[:window], inside, weights[half + 1 :] @ values[-window:]])
+
+
+@lru_cache(maxsize=64)
+def _window_weights(window: int, degree: int, derivative: int, spacing: float) -> Array:
+    """Return the weights (W, W) of the values of a window in the polynomial, or its derivative, at each of them."""
+    at = np.arange(-(window // 2), window // 2 + 1) * spacing
+    fit = np.linalg.pinv(np.vander(at, degree + 1, increasing=True))
+    return sum(
+        (math.perm(k, derivative) * np.outer(at ** (k - derivative), fit[k]) for k in range(derivative, degree + 1)),
+        start=np.zeros((window, window)),
+    )

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,8 +65,6 @@ class RoadView:
         valid &= (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width_px) & (uv[:, 1] < camera.height_px)
         uv = np.where(valid[:, None], (uv + 0.5) * scale - 0.5, -1.0).astype(np.float32)
         self.map_uv = uv.reshape(rows, columns, 2)
-        import cv2
-
         margin = np.ones((ROAD_WINDOW_PX, ROAD_WINDOW_PX), dtype=np.uint8)
         shown = valid.reshape(rows, columns).astype(np.uint8)
         self.shown = np.asarray(cv2.erode(shown, margin, borderType=cv2.BORDER_CONSTANT, borderValue=0), dtype=np.uint8)
@@ -76,14 +75,10 @@ class RoadView:
 
     def view(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Look at the road of an image from above."""
-        import cv2
-
         return np.asarray(cv2.remap(image, self.map_uv[..., 0], self.map_uv[..., 1], cv2.INTER_LINEAR), dtype=np.uint8)
 
     def followed(self, first: NDArray[np.uint8], second: NDArray[np.uint8], guess_m: Array) -> tuple[Array, Array]:
         """Follow the texture of the road from one view to the next: positions (N, 2), m, in the ego's frame at both."""
-        import cv2
-
         if self.shown.mean() < MIN_SHOWN_SHARE:
             return np.zeros((0, 2)), np.zeros((0, 2))
         start = cv2.goodFeaturesToTrack(first, ROAD_POINTS, MIN_CORNER, ROAD_SPACING_PX, mask=self.shown)
@@ -103,8 +98,6 @@ def follow_points(
     They move by about `guess_px` (2,), patches around them are `window_px` wide, and motion is searched in the image halved `levels`
     times first.
     """
-    import cv2
-
     if start is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     shift = np.zeros(2, np.float32) if guess_px is None else guess_px.astype(np.float32)
@@ -229,8 +222,6 @@ class _Follower:
 
     def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return an image in shades of gray, at most `MAX_WIDTH_PX` wide."""
-        import cv2
-
         small = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if self.scale < 1:
             small = cv2.resize(small, None, fx=self.scale, fy=self.scale, interpolation=cv2.INTER_AREA)
@@ -238,8 +229,6 @@ class _Follower:
 
     def motion(self, first: NDArray[np.uint8], second: NDArray[np.uint8], dt_s: float) -> Array | None:
         """Estimate the pose (4, 4) of the ego at the second image in its frame at the first; None where too little is seen."""
-        import cv2
-
         corners = cv2.goodFeaturesToTrack(first, MAX_POINTS, MIN_CORNER, SPACING_PX)
         from_px, to_px = follow_points(first, second, corners, window_px=WINDOW_PX, levels=LEVELS)
         if len(from_px) < MIN_FOLLOWED:
@@ -256,8 +245,6 @@ class _Follower:
 
     def _turn(self, from_xy: Array, to_xy: Array) -> Array | None:
         """Estimate the rotation (3, 3) of the ego at the second image in its frame at the first, from normalized points (N, 2)."""
-        import cv2
-
         threshold = TOLERANCE_PX / self.scale / float(self.camera.K[0, 0])
         ego_R_cam = self.camera.mount_T_cam[:3, :3]
         only = _pure_rotation(from_xy, to_xy, threshold)

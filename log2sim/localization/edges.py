@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -173,8 +174,6 @@ class YawEstimate:
 
 def find_image_edges(gray: NDArray[np.uint8], *, sideways: bool) -> NDArray[np.float32]:
     """Compute the strength (H, W) of edges that are upright in the world; `sideways` for a camera lying on its side."""
-    import cv2
-
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0)
     across, along = (np.abs(cv2.Sobel(smooth, cv2.CV_32F, dx, dy, ksize=3)) for dx, dy in ((1, 0), (0, 1)))
     upright = np.maximum(along - across if sideways else across - along, 0)

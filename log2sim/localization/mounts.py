@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -125,8 +126,6 @@ def _choose_pairs(log: Log, t_ns: NDArray[np.int64], during_ns: tuple[int, int] 
 
 def _follow(camera: Camera, first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Array, Array]:
     """Follow corners from one image to another: rays (N, 3), (N, 3) of unit length."""
-    import cv2
-
     corners = cv2.goodFeaturesToTrack(first, MAX_CORNERS, CORNER_QUALITY, SPACING_PX)
     followed = follow_points(first, second, corners, window_px=WINDOW_PX, levels=LEVELS)
     scale = first.shape[1] / camera.width_px

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
@@ -92,8 +93,6 @@ def place_as_given(points_m: Array, refined: Log, given: Log) -> Array:
     """
     if refined.ego is None or given.ego is None or refined.ego is given.ego or not len(points_m):
         return points_m
-    from scipy.spatial import cKDTree
-
     nearest = cKDTree(refined.ego.map_T_ego[:, :2, 3]).query(points_m[:, :2])[1]
     given_T_refined = given.ego.map_T_ego @ inverse(refined.ego.map_T_ego)
     rotation, translation = given_T_refined[nearest, :3, :3], given_T_refined[nearest, :3, 3]

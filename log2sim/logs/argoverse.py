@@ -72,18 +72,6 @@ TRANSFORM: Mapping[str, Kind] = dict.fromkeys((*QUATERNION, *TRANSLATION), "floa
 OFFSET_STEP_M = 1000.0
 
 
-def read_ego_track(path: Path, notes: list[str]) -> tuple[PoseTrack, tuple[float, float, float]]:
-    """Read `city_SE3_egovehicle.feather`: all its poses, in a map that lies `offset_m`, whole kilometers, off the city's frame."""
-    columns = read_columns(path, {"timestamp_ns": "int", **TRANSFORM})
-    city_T_ego = transforms_of(columns, path)
-    if not len(city_T_ego):
-        raise LogError(f"{path}: no poses; expected at least one")
-    keep = strictly_increasing(columns["timestamp_ns"], path.name, notes)
-    east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / OFFSET_STEP_M) * OFFSET_STEP_M)
-    map_T_ego = shift_poses(city_T_ego[keep], np.array([east, north, 0.0]))
-    return PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
-
-
 def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:
     """Build transforms (N, 4, 4) of the columns `TRANSFORM`, each (N,); `LogError` for an impossible one."""
     q, position = (
@@ -309,7 +297,16 @@ def _logs(root: Path, depth: int) -> Iterator[Path]:
 
 def _open(path: Path) -> Log:
     notes: list[str] = []
-    ego, offset_m = read_ego_track(path / POSES, notes)
+    # Read `city_SE3_egovehicle.feather`: all its poses, in a map that lies `offset_m`, whole kilometers, off the city's frame
+    poses = path / POSES
+    columns = read_columns(poses, {"timestamp_ns": "int", **TRANSFORM})
+    city_T_ego = transforms_of(columns, poses)
+    if not len(city_T_ego):
+        raise LogError(f"{poses}: no poses; expected at least one")
+    keep = strictly_increasing(columns["timestamp_ns"], poses.name, notes)
+    east, north = (float(v) for v in np.floor(city_T_ego[keep[0], :2, 3] / OFFSET_STEP_M) * OFFSET_STEP_M)
+    map_T_ego = shift_poses(city_T_ego[keep], np.array([east, north, 0.0]))
+    ego, offset_m = PoseTrack(columns["timestamp_ns"][keep], map_T_ego), (east, north, 0.0)
     table = read_columns(path / MOUNTS, {"sensor_name": "text", **TRANSFORM})
     mounts = {str(n): mount for n, mount in zip(table["sensor_name"], transforms_of(table, path / MOUNTS))}
     cameras, streams = _cameras(path, mounts, notes)

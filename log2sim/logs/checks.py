@@ -171,7 +171,24 @@ class Span:
 
 def list_time_problems(log: Log) -> list[str]:
     """List what is wrong with the stamps of a log, one line each; only stamps are read, and the labels."""
-    return [*_other_clocks(log), *_reference_problem(log), *_image_label_problems(log), *_label_problems(log)]
+    # Report boxes in images, and regions without labels, whose stamp no frame has
+    problems = []
+    for what, by_camera in (("boxes", log.image_labels), ("ignored regions", log.ignored_regions)):
+        for name, rows in by_camera.items():
+            stream = log.streams.get(name)
+            if stream is None or not len(rows.t_ns) or not len(stream.t_ns):
+                continue
+            frames = stream.t_ns
+            off_ns = np.abs((frames[nearest_index(frames, rows.t_ns)] - rows.t_ns).astype(np.float64))
+            lost = off_ns > STAMP_TOLERANCE_NS
+            if not lost.any():
+                continue
+            line = f"{int(lost.sum())} of {len(lost)} {what} in images of '{name}' are at stamps of no frame, first {rows.t_ns[lost].min()}"
+            spans = Span.of(f"{what}", rows.t_ns), Span.of("frames", frames)
+            apart = f": {describe_gap(*spans)}" if spans[0].is_apart(spans[1]) else ""
+            nearest = "" if apart or not lost.all() else f"; the nearest is {off_ns.min() / 1e6:.3g} ms off"
+            problems.append(f"{line}{nearest}{apart}")
+    return [*_other_clocks(log), *_reference_problem(log), *problems, *_label_problems(log)]
 
 
 def describe_gap(one: Span, other: Span) -> str:
@@ -268,27 +285,6 @@ def _reference_problem(log: Log) -> list[str]:
         f"the reference {kind} '{reference}' {' and '.join(parts)} other sensors{shifted}: a run of its ticks lasts "
         f"{length_ns / NS_PER_S:.1f} s of the {whole_ns / NS_PER_S:.1f} s of the log"
     ]
-
-
-def _image_label_problems(log: Log) -> list[str]:
-    """Report boxes in images, and regions without labels, whose stamp no frame has."""
-    problems = []
-    for what, by_camera in (("boxes", log.image_labels), ("ignored regions", log.ignored_regions)):
-        for name, rows in by_camera.items():
-            stream = log.streams.get(name)
-            if stream is None or not len(rows.t_ns) or not len(stream.t_ns):
-                continue
-            frames = stream.t_ns
-            off_ns = np.abs((frames[nearest_index(frames, rows.t_ns)] - rows.t_ns).astype(np.float64))
-            lost = off_ns > STAMP_TOLERANCE_NS
-            if not lost.any():
-                continue
-            line = f"{int(lost.sum())} of {len(lost)} {what} in images of '{name}' are at stamps of no frame, first {rows.t_ns[lost].min()}"
-            spans = Span.of(f"{what}", rows.t_ns), Span.of("frames", frames)
-            apart = f": {describe_gap(*spans)}" if spans[0].is_apart(spans[1]) else ""
-            nearest = "" if apart or not lost.all() else f"; the nearest is {off_ns.min() / 1e6:.3g} ms off"
-            problems.append(f"{line}{nearest}{apart}")
-    return problems
 
 
 def _label_problems(log: Log) -> list[str]:

@@ -60,7 +60,18 @@ def replace_labels(log: Log, path: Path) -> Log:
         labels = boxes_3d(read_csv_table(path, BOX_3D_COLUMNS, BOX_3D_OPTIONAL))
         labels = replace(labels, center_m=labels.center_m - np.array(log.map.offset_m))
     elif len(first.partition("\n")[0].split()) in (kitti.LABEL_FIELDS, kitti.RESULT_FIELDS):
-        labels, regions = _kitti_labels(log, path, text, notes)
+        # Place the rows of a KITTI file: frames are those of the reference camera, boxes in its axes
+        camera, stamps = _reference(log, path)
+        if camera not in log.cameras:
+            raise LogError(f"{path}: KITTI's boxes are in the frame of a camera, and {log.name} has none")
+        rows = kitti.parse_labels_noting(text, path, notes)
+        inside = rows.frame < len(stamps)
+        if not inside.all():
+            notes.append(f"{int((~inside).sum())} labels left out: of frames after the last of '{camera}'")
+        poses_at = partial(log.map_T_sensor, camera)
+        placed = kitti.labels_of_rows(rows.take(inside), poses_at, lambda frame: stamps[frame], "", camera)
+        assert placed.boxes_3d is not None
+        labels, regions = placed.boxes_3d, dict(placed.ignored)
     else:
         raise LogError(f"{path}: is no file of boxes; expected {EXPECTED}")
     possible = find_possible(labels)
@@ -132,21 +143,6 @@ def _labels_of(log: Log, path: Path, boxes: list[_Box], notes: list[str]) -> Lab
         kind=np.array([box.word for box in found])[known],
         labeled_ns=np.unique(t_ns),
     )
-
-
-def _kitti_labels(log: Log, path: Path, text: str, notes: list[str]) -> tuple[Labels, dict[str, ImageRegions]]:
-    """Place the rows of a KITTI file: frames are those of the reference camera, boxes in its axes."""
-    camera, stamps = _reference(log, path)
-    if camera not in log.cameras:
-        raise LogError(f"{path}: KITTI's boxes are in the frame of a camera, and {log.name} has none")
-    rows = kitti.parse_labels_noting(text, path, notes)
-    inside = rows.frame < len(stamps)
-    if not inside.all():
-        notes.append(f"{int((~inside).sum())} labels left out: of frames after the last of '{camera}'")
-    poses_at = partial(log.map_T_sensor, camera)
-    placed = kitti.labels_of_rows(rows.take(inside), poses_at, lambda frame: stamps[frame], "", camera)
-    assert placed.boxes_3d is not None
-    return placed.boxes_3d, dict(placed.ignored)
 
 
 def _nuscenes_boxes(log: Log, path: Path, document: Any) -> Iterator[_Box]:

@@ -262,7 +262,19 @@ def parse_pcd(data: bytes, t_ns: int) -> tuple[NDArray[Any], Offset, Intensity]:
             raise ValueError(f"truncated: {len(body)} of {count * layout.itemsize} bytes")
         rows = np.frombuffer(body, layout, count)
     elif encoding == "ascii":
-        rows = _parse_ascii(body, layout, count)
+        widths = [int(np.prod(layout[name].shape, dtype=int)) for name in layout.names or ()]
+        if count * sum(widths) > MAX_ASCII_VALUES:
+            raise ValueError(
+                f"{count * sum(widths)} values as text, more than the {MAX_ASCII_VALUES} that are read; convert it to binary"
+            )
+        cells = body.split(maxsplit=count * sum(widths))[: count * sum(widths)]
+        if len(cells) != count * sum(widths):
+            raise ValueError(f"truncated: {len(cells)} of {count * sum(widths)} values")
+        table = np.array(cells, dtype="S32").reshape(count, sum(widths))
+        rows = np.zeros(count, layout)
+        for name, width, start in zip(layout.names or (), widths, np.cumsum([0, *widths])):
+            if width == 1 and not name.startswith("_"):
+                rows[name] = table[:, start].astype(layout[name])
     else:
         advice = "convert it to binary (pcl_convert_pcd_ascii_binary IN OUT 1)"
         raise ValueError(f"DATA {encoding} is not supported; {advice}")
@@ -298,23 +310,6 @@ def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
         if axis not in names:
             raise ValueError(f"PCD header: no field '{axis}'")
     return np.dtype(spec)
-
-
-def _parse_ascii(body: bytes, layout: np.dtype[Any], count: int) -> NDArray[Any]:
-    widths = [int(np.prod(layout[name].shape, dtype=int)) for name in layout.names or ()]
-    if count * sum(widths) > MAX_ASCII_VALUES:
-        raise ValueError(
-            f"{count * sum(widths)} values as text, more than the {MAX_ASCII_VALUES} that are read; convert it to binary"
-        )
-    words = body.split(maxsplit=count * sum(widths))[: count * sum(widths)]
-    if len(words) != count * sum(widths):
-        raise ValueError(f"truncated: {len(words)} of {count * sum(widths)} values")
-    table = np.array(words, dtype="S32").reshape(count, sum(widths))
-    rows = np.zeros(count, layout)
-    for name, width, start in zip(layout.names or (), widths, np.cumsum([0, *widths])):
-        if width == 1 and not name.startswith("_"):
-            rows[name] = table[:, start].astype(layout[name])
-    return rows
 
 
 def _offset_ns(values: NDArray[Any], begin_ns: int) -> NDArray[np.int64]:

@@ -41,8 +41,9 @@ from log2sim.resim.world import World, alive, given_T_refined, mesh_of, place
 from log2sim.road.pictures import View
 from log2sim.synth.backdrop import Backdrop
 from log2sim.synth.light import GAMMA, OVERCAST, RenderCamera
-from log2sim.synth.paint import Appearance, paint
+from log2sim.synth.paint import paint
 from log2sim.synth.render import Body, SceneInstant, draw_bodies, draw_shadows
+from log2sim.synth.scene import AgentSpec
 
 Image = NDArray[np.uint8]
 
@@ -452,7 +453,7 @@ def _draw(
     bodies = []
     for agent, pose in agents:
         rgb = tuple((agent.color or {}).get("rgb", (110, 110, 115)))
-        look_ = Appearance(agent.category, agent.size_m, rgb, "hatch")
+        look_ = AgentSpec.model_construct(category=agent.category, size_m=agent.size_m, color=rgb, shape="hatch")
         bodies.append(Body(mesh_of(agent), pose, agent.size_m, partial(paint, look_)))
     view, light = RenderCamera.of(camera, map_T_cam), OVERCAST
     instant = SceneInstant(cast(Backdrop, None), bodies, light)

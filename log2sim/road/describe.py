@@ -23,7 +23,7 @@ from log2sim.localization.replaced import replace_poses
 from log2sim.perception.first_pass import Observations
 from log2sim.perception.frames import give_pictures
 from log2sim.perception.records import RecordSource
-from log2sim.perception.run_cache import StageCache
+from log2sim.perception.run_detectors import StageCache
 from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler

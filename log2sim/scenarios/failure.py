@@ -48,15 +48,9 @@ class Search:
 def search(margins: Margins, dimensions: int, runs: int, rng: np.random.Generator) -> Search:
     """Search for failures, and estimate how probable they are when scores are standard normal.
 
-    Parameters
-    ----------
-    margins : callable
-        Returns how far (M,) runs with scores (M, D) are from a failure, negative for failures.
-    runs : int
-        In all; half of them search, the others estimate.
+    `margins`: returns how far (M,) runs with scores (M, D) are from a failure, negative for failures. `runs`: in all; half of them
+    search, the others estimate.
 
-    Notes
-    -----
     Cross-entropy method (Rubinstein and Kroese, "The Cross-Entropy Method", 2004; for driving O'Kelly et al., NeurIPS 2018): the
     mean of the normal distribution that runs are drawn from moves to those nearest to a failure, weighed by likelihood ratios, until a
     fifth of them fail. The estimate is by importance sampling from a mixture of that and the given distribution, which bounds weights by

@@ -141,16 +141,8 @@ def open_index(
 
     Raises `ScenarioError` where there is no scenario. Raises `MissingExtra` without pyarrow.
 
-    Parameters
-    ----------
-    path : Path
-        A scenario file, or a folder such as that of a batch.
-    fresh : bool
-        Whether to read all files again.
-    jobs : int, optional
-        Processes that tag; by default one for each core.
-    map_files : callable, optional
-        Applies a function to the names of files in another place, such as the workers of a cluster.
+    `path`: a scenario file, or a folder such as that of a batch. `fresh`: whether to read all files again. `jobs`: processes that tag,
+    by default one for each core. `map_files`: applies a function to names of files elsewhere, such as on the workers of a cluster.
     """
     import_arrow()
     if path.is_file():

@@ -12,20 +12,9 @@ import numpy as np
 
 from log2sim.datatypes import Tag
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
+from log2sim.scenarios import traffic as motion
 from log2sim.scenarios.criticality import deceleration_to_avoid, encroachment_time, time_headway, time_to_collision
 from log2sim.scenarios.maneuvers import BREAK, MOVING_MPS, lateral_extent, tag_of
-from log2sim.scenarios.traffic import (
-    KEEPING_MPS,
-    SAME_WAY_RAD,
-    SIDE_M,
-    Beside,
-    Index,
-    Traffic,
-    latched,
-    probability_above,
-    runs,
-    turned,
-)
 from log2sim.simulation.metrics.collisions import BoxTracks
 from log2sim.simulation.metrics.conflicts import post_encroachment_times, time_to_touch
 from log2sim.simulation.prediction.motion_table import TICK_S
@@ -53,7 +42,7 @@ MOST_PER_TICK_M = 5.0  # by which one gets ahead of another within a tick: 50 m/
 WINDOW = round(4.0 / TICK_S)  # ticks around a lane's edge in which a lane change is looked at
 
 
-def pair_tags(traffic: Traffic) -> Iterator[Tag]:
+def pair_tags(traffic: motion.Traffic) -> Iterator[Tag]:
     """Find what agents do to each other."""
     for r in range(len(traffic.ids)):
         beside = traffic.beside(r)
@@ -71,7 +60,9 @@ def pair_tags(traffic: Traffic) -> Iterator[Tag]:
     yield from _crossings(traffic)
 
 
-def lane_measures(traffic: Traffic, b: Beside, r: int, o: Index, n: Index) -> dict[str, Array]:
+def lane_measures(
+    traffic: motion.Traffic, b: motion.Beside, r: int, o: motion.Index, n: motion.Index
+) -> dict[str, Array]:
     """Return gap, relative speed and measures of criticality (N,) of agent `r` behind others (N,) at ticks (N,)."""
     pace = traffic.continued.speed_mps
     gap, own, speed = b.gap_m[o, n], pace[r, n], pace[o, n] * np.cos(b.turn_rad[o, n])
@@ -85,7 +76,7 @@ def _at(measures: dict[str, Array], n: int) -> dict[str, float]:
     return {name: float(values[n]) for name, values in measures.items()}
 
 
-def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+def _following(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `r` follows or approaches `o`, and where that is a near miss."""
     if not (traffic.wheeled[o] and (b.leader == o).any()):
         return
@@ -96,30 +87,30 @@ def _following(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     sigma_m, sigma_mps = (np.hypot(s[r], s[o]) for s in (traffic.sigma_m, traffic.sigma_speed_mps))
 
     def within(half_m: float, n: int) -> float:
-        return probability_above(half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
+        return motion.probability_above(half_m - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
 
     follows = ahead & (np.abs(closing) < APPROACHING_MPS) & (headway < FOLLOWING_S) & (own + relative > 1.0)
-    for i, j in runs(follows, round(1.0 / TICK_S), BREAK):
+    for i, j in motion.runs(follows, round(1.0 / TICK_S), BREAK):
         n, lasts_s = i + int(np.argmin(headway[i : j + 1])), (j - i) * TICK_S
         yield tag_of(traffic, "following", r, (i, n, j), within(b.half_m, n), o, duration_s=lasts_s, **_at(measures, n))
-    for i, j in runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S), BREAK):
+    for i, j in motion.runs(ahead & (closing >= APPROACHING_MPS) & (ttc < APPROACHING_S), round(0.5 / TICK_S), BREAK):
         n = i + int(np.argmin(ttc[i : j + 1]))
-        sure = within(b.half_m, n) * probability_above(closing[n], 0.0, sigma_mps[n])
+        sure = within(b.half_m, n) * motion.probability_above(closing[n], 0.0, sigma_mps[n])
         yield tag_of(traffic, "approaching", r, (i, n, j), sure, o, **_at(measures, n))
     width = traffic.table.size_m[[r, o], 1].sum() / 2
     on_course = np.abs(b.aside_m[o]) < width
     near = ahead & on_course & (closing > 1.0) & ((ttc < NEAR_TTC_S) | (drac > NEAR_DRAC_MPS2))
-    for i, j in runs(near, 2):
+    for i, j in motion.runs(near, 2):
         n, peak = i + int(np.argmin(ttc[i : j + 1])), i + int(np.argmax(drac[i : j + 1]))
         # Of gap / closing speed and of DRAC, by the errors of both.
         sigma_ttc = np.hypot(sigma_m[n] / closing[n], gap[n] * sigma_mps[n] / closing[n] ** 2)
         sigma_drac = drac[peak] * np.hypot(2 * sigma_mps[n] / closing[peak], sigma_m[n] / max(gap[peak], 0.1))
-        by_drac = probability_above(drac[peak], NEAR_DRAC_MPS2, sigma_drac)
-        sure = max(probability_above(-ttc[n], -NEAR_TTC_S, sigma_ttc), by_drac) * within(width, n)
+        by_drac = motion.probability_above(drac[peak], NEAR_DRAC_MPS2, sigma_drac)
+        sure = max(motion.probability_above(-ttc[n], -NEAR_TTC_S, sigma_ttc), by_drac) * within(width, n)
         yield tag_of(traffic, "near_miss", r, (i, n, j), sure, o, **{**_at(measures, n), "drac_mps2": drac[peak]})
 
 
-def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+def _lane_changes(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `o` comes into the lane of `r` ahead of it, or leaves it there; also within `UNSEEN_S` before and after both were seen."""
     on = traffic.continued
     known = np.isfinite(b.aside_m[o]) & (b.ahead_m[o] > 0)
@@ -146,22 +137,22 @@ def _lane_changes(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         if measures["time_headway_s"] > LEADING_S:
             continue
         # Who joins turns itself; who was there before the other turned in behind it does not.
-        turn = abs(turned(on.course_rad[o], begin, end))
+        turn = abs(motion.turned(on.course_rad[o], begin, end))
         joins = enters and np.abs(b.turn_rad[o, begin : crossing + 1]).max() > JOINING_RAD and turn > JOINING_RAD
         if not joins and (turn > JOINING_RAD or not _is_change_of(traffic, b, r, o, crossing)):
             continue
         before, after = np.arange(begin, crossing + 1), np.arange(crossing, end + 1)
         outer, inner = (before, after) if enters else (after, before)
         beyond, within = outer[np.nanargmax(off[outer])], inner[np.nanargmin(off[inner])]
-        sure = probability_above(off[beyond], b.half_m, b.sigma_m[o, beyond])
-        sure *= probability_above(-off[within], -b.half_m, b.sigma_m[o, within])
-        sure *= probability_above(b.ahead_m[o, crossing], 0.0, np.hypot(*on.sigma_m[[r, o], crossing]))
+        sure = motion.probability_above(off[beyond], b.half_m, b.sigma_m[o, beyond])
+        sure *= motion.probability_above(-off[within], -b.half_m, b.sigma_m[o, within])
+        sure *= motion.probability_above(b.ahead_m[o, crossing], 0.0, np.hypot(*on.sigma_m[[r, o], crossing]))
         tag = "merging" if joins else "cut_in" if enters else "cut_out"
         yield tag_of(traffic, tag, o, (begin, crossing, end), sure, r, lateral_speed_mps=abs(lateral), duration_s=(end - begin) * TICK_S,
                      side=np.sign(-lateral if enters else lateral), **measures)  # fmt: skip
 
 
-def _is_change_of(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> bool:
+def _is_change_of(traffic: motion.Traffic, b: motion.Beside, r: int, o: int, n: int) -> bool:
     """Return whether it is `o` that crosses the edge of a lane at a tick, and not the path of `r` that does, now or on its way there."""
     found = traffic.path(r)
     if found is None:
@@ -173,10 +164,10 @@ def _is_change_of(traffic: Traffic, b: Beside, r: int, o: int, n: int) -> bool:
     arrives = found.station_m <= found.station_m[n] + b.ahead_m[o, n]  # False for NaN
     last = max(int(np.flatnonzero(arrives)[-1]), n)
     own = np.abs(traffic.drift_mps[r, n : last + 1])
-    return bool(np.nanmax(own, initial=0.0) < KEEPING_MPS and not abs(traffic.drift_mps[o, n]) <= own[-1])
+    return bool(np.nanmax(own, initial=0.0) < motion.KEEPING_MPS and not abs(traffic.drift_mps[o, n]) <= own[-1])
 
 
-def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+def _overtaking(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `o` passes `r`: from behind its rear to ahead of its front, while both go the same way.
 
     For `UNSEEN_S` before and after both were seen their speeds are supposed to be those of then.
@@ -184,7 +175,7 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
     on, reach = traffic.continued, (traffic.table.size_m[r, 0] + traffic.table.size_m[o, 0]) / 2
     slower, faster, sigma = on.speed_mps[r], on.speed_mps[o] - on.speed_mps[r], np.hypot(on.sigma_m[r], on.sigma_m[o])
     ahead, aside, same = b.ahead_m[o], b.aside_m[o], b.same_way[o]
-    passed = latched(ahead > reach, ahead < -reach, np.ones(len(ahead), dtype=bool))
+    passed = motion.latched(ahead > reach, ahead < -reach, np.ones(len(ahead), dtype=bool))
     for n in (np.flatnonzero(passed[1:] & ~passed[:-1]) + 1).tolist():
         start = int(np.flatnonzero(ahead[:n] < -reach)[-1])
         part = slice(start, n + 1)
@@ -194,26 +185,28 @@ def _overtaking(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         if np.abs(aside[part]).max() > 4.5 * b.half_m or np.diff(ahead[part]).max() > MOST_PER_TICK_M:
             continue
         middle = start + int(np.argmin(np.abs(ahead[part])))
-        sure = probability_above(-ahead[start], 0.0, sigma[start]) * probability_above(ahead[n], 0.0, sigma[n])
+        sure = motion.probability_above(-ahead[start], 0.0, sigma[start]) * motion.probability_above(
+            ahead[n], 0.0, sigma[n]
+        )
         clearance = abs(aside[middle]) - traffic.table.size_m[[r, o], 1].sum() / 2
         yield tag_of(traffic, "overtaking", o, (start, middle, n), sure, r, lateral_gap_m=clearance, side=np.sign(aside[middle]),
                      relative_speed_mps=faster[middle], duration_s=(n - start) * TICK_S)  # fmt: skip
 
 
-def _oncoming(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+def _oncoming(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when `o` comes toward `r` where `r` will drive, within `CROSSING_S`."""
-    width = traffic.table.size_m[[r, o], 1].sum() / 2 - SIDE_M
+    width = traffic.table.size_m[[r, o], 1].sum() / 2 - motion.SIDE_M
     speed, own = traffic.speed_mps[o], traffic.speed_mps[r]
     ttc = time_to_collision(b.gap_m[o], own + speed)
     state = (np.abs(b.turn_rad[o]) > ONCOMING_RAD) & (np.abs(b.aside_m[o]) < width) & (b.ahead_m[o] > 0)
     state &= ttc < CROSSING_S
-    for i, j in runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S), BREAK):
+    for i, j in motion.runs(state & (speed > MOVING_MPS) & (own > MOVING_MPS), round(0.3 / TICK_S), BREAK):
         n = i + int(np.argmin(np.where(ttc[i : j + 1] > 0, ttc[i : j + 1], np.inf)))
-        sure = probability_above(width - np.abs(b.aside_m[o, i : j + 1].min()), 0.0, b.sigma_m[o, n])
-        yield tag_of(traffic, "oncoming_in_lane", o, (i, n, j), sure, r, gap_m=b.gap_m[o, n], ttc_s=ttc[n], relative_speed_mps=own[n] + speed[n], overlap_m=width + SIDE_M - abs(b.aside_m[o, n]))  # fmt: skip
+        sure = motion.probability_above(width - np.abs(b.aside_m[o, i : j + 1].min()), 0.0, b.sigma_m[o, n])
+        yield tag_of(traffic, "oncoming_in_lane", o, (i, n, j), sure, r, gap_m=b.gap_m[o, n], ttc_s=ttc[n], relative_speed_mps=own[n] + speed[n], overlap_m=width + motion.SIDE_M - abs(b.aside_m[o, n]))  # fmt: skip
 
 
-def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
+def _stepping_out(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> Iterator[Tag]:
     """Find when a pedestrian who was hidden from `r` comes into its lane ahead of it."""
     inside = b.in_lane[o]
     for n in (np.flatnonzero(inside[1:] & ~inside[:-1]) + 1).tolist():
@@ -235,12 +228,12 @@ def _stepping_out(traffic: Traffic, b: Beside, r: int, o: int) -> Iterator[Tag]:
         if not hidden.any() or hidden[-1]:
             continue
         seen = int(ticks[np.flatnonzero(hidden)[-1]]) + 1
-        sure = probability_above(b.half_m + 0.5 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
+        sure = motion.probability_above(b.half_m + 0.5 - np.abs(b.aside_m[o, n]), 0.0, b.sigma_m[o, n])
         yield tag_of(traffic, "stepping_out", o, (seen, n, n), sure, r, visible_s=(n - seen) * TICK_S, speed_mps=traffic.speed_mps[o, n],
                      ttc_s=arrives_s, gap_m=b.gap_m[o, n])  # fmt: skip
 
 
-def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tuple[int, int]) -> Array:
+def _hidden(traffic: motion.Traffic, eye: Array, place: Array, ticks: Array, pair: tuple[int, int]) -> Array:
     """Return whether the line of sight (N,) from an eye to a place crosses the box of a third road user."""
     import shapely
 
@@ -262,7 +255,7 @@ def _hidden(traffic: Traffic, eye: Array, place: Array, ticks: Array, pair: tupl
     return hidden
 
 
-def _crossings(traffic: Traffic) -> Iterator[Tag]:
+def _crossings(traffic: motion.Traffic) -> Iterator[Tag]:
     """Find whose paths cross, who turns across the path of oncoming traffic, and near misses there."""
     t, on = traffic.table, traffic.continued
     height = t.center_m[..., 2].copy()
@@ -279,11 +272,11 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
         if pet > CROSSING_S or min(speed_a, speed_c) < 0.5 or not (traffic.wheeled[a] or traffic.wheeled[c]):
             continue
         angle = float(abs(wrap_angle(on.course_rad[a, i] - on.course_rad[c, j])))
-        if not SAME_WAY_RAD <= angle <= np.pi - JOINING_RAD:
+        if not motion.SAME_WAY_RAD <= angle <= np.pi - JOINING_RAD:
             continue
         begin, ttc, touch = _planar_ttc(traffic, a, c, j)
         sigma_s = float(np.hypot(on.sigma_m[a, i] / speed_a, on.sigma_m[c, j] / speed_c))
-        sure = probability_above(CROSSING_S - pet, 0.0, sigma_s)
+        sure = motion.probability_above(CROSSING_S - pet, 0.0, sigma_s)
         way_m = t.size_m[a, 0] + t.size_m[c, 1]
         measures = {
             "pet_s": pet, "angle_rad": angle, "speed_mps": speed_a, "other_speed_mps": speed_c, "ttc_s": ttc,
@@ -293,12 +286,15 @@ def _crossings(traffic: Traffic) -> Iterator[Tag]:
         for one, two, n in ((a, c, i), (c, a, j)):
             if traffic.wheeled[one] and traffic.wheeled[two] and _turns_across(traffic, one, two, n, begin):
                 yield tag_of(traffic, "turning_across", one, (min(begin, i), n, j), sure, two, **measures)
-        near = max(probability_above(NEAR_PET_S - pet, 0.0, sigma_s), probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s))
+        near = max(
+            motion.probability_above(NEAR_PET_S - pet, 0.0, sigma_s),
+            motion.probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s),
+        )
         if pet < NEAR_PET_S or ttc < NEAR_TTC_S:
             yield tag_of(traffic, "near_miss", a, (min(touch, i), i, j), near, c, **measures)
 
 
-def _planar_ttc(traffic: Traffic, a: int, c: int, until: int) -> tuple[int, float, int]:
+def _planar_ttc(traffic: motion.Traffic, a: int, c: int, until: int) -> tuple[int, float, int]:
     """Return the first tick within `CROSSING_S` before one at which both are there, the least TTC in the plane since then, and when."""
     t = traffic.table
     ticks = np.arange(max(until - round(2 * CROSSING_S / TICK_S), 0), until + 1)
@@ -314,7 +310,7 @@ def _planar_ttc(traffic: Traffic, a: int, c: int, until: int) -> tuple[int, floa
     return int(ticks[0]), float(times[n]), int(ticks[n])
 
 
-def _turns_across(traffic: Traffic, one: int, two: int, n: int, begin: int) -> bool:
+def _turns_across(traffic: motion.Traffic, one: int, two: int, n: int, begin: int) -> bool:
     """Return whether `one`, which is at the crossing at tick `n`, turned before the oncoming `two`."""
     course = traffic.course_rad
     known = np.flatnonzero(np.isfinite(course[one, begin : n + 1]) & np.isfinite(course[two, begin : n + 1])) + begin

@@ -217,13 +217,9 @@ def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
     Raises `ConfigError` for a condition that is not understood, or that has unknown names. Raises `MissingExtra`
     without DuckDB.
 
-    Parameters
-    ----------
-    text : str
-        Such as "cut_in and ttc_s < 2 and ego.speed_mps > 10": a tag is true for its rows; a second one where such a tag shares a road
-        user and a time with the first, whose fields then are "hard_braking.deceleration_mps2". What is not known fulfils no comparison.
-    min_probability : float
-        Of the tags, unless the condition says something of `probability`.
+    `text`: such as "cut_in and ttc_s < 2 and ego.speed_mps > 10": a tag is true for its rows; a second one where such a tag shares a
+    road user and a time with the first, whose fields then are "hard_braking.deceleration_mps2". What is not known fulfils no
+    comparison. `min_probability`: of the tags, unless the condition says something of `probability`.
     """
     try:
         import duckdb

@@ -23,8 +23,6 @@ MIN_PROBABILITY = 0.1
 def find_tags(scenario: Scenario) -> tuple[Tag, ...]:
     """Find what the road users of a scenario do, in the order of time.
 
-    Notes
-    -----
     Agents that are quarantined are left out. Cost: for each vehicle that moves, the agents within 100 m at each tick of 0.1 s.
     """
     traffic = Traffic(scenario.active)
@@ -42,10 +40,8 @@ def tag(scenario: Scenario) -> Scenario:
 def criticality_table(scenario: Scenario) -> dict[str, Array]:
     """Measure how critical it is for each vehicle and the one ahead of it in its lane, at each tick of 0.1 s.
 
-    Returns
-    -------
-    dict of str to (N,) array
-        `agent`, `other`, `t_s` and measures of `log2sim.scenarios.criticality`, in SI units; what has no value, such as a TTC of who falls behind, is infinite.
+    Returns `agent`, `other`, `t_s` and measures of `log2sim.scenarios.criticality`, in SI units; what has no value, such as a TTC of
+    who falls behind, is infinite.
     """
     traffic = Traffic(scenario.active)
     ids = np.array(traffic.ids, dtype=object)

@@ -88,14 +88,14 @@ def fit_trajectory(
     logged = np.stack([x_m, y_m, axis + away, np.where(np.abs(away) > np.pi / 2, -speed_mps, speed_mps)], axis=1)
     along = np.gradient(x_m, t_s) * np.cos(axis) + np.gradient(y_m, t_s) * np.sin(axis)
     state = _initial_states(t_s, x_m, y_m, axis, along, limits)
-    problem = _LeastSquares(float(t_s[1] - t_s[0]), logged, limits)
-    terms = problem.terms(state)
+    told = logged, float(t_s[1] - t_s[0]), limits
+    terms = residual_terms(state, *told)
     cost, damping = _cost(terms), 1e-2
     for _ in range(MAX_ITERATIONS):
         band, gradient = _normal_equations(terms, len(state))
         for _ in range(MAX_DAMPING_TRIALS):
             trial = state - _solve(band, gradient, damping)
-            terms = problem.terms(trial)
+            terms = residual_terms(trial, *told)
             gain = cost - _cost(terms)
             if gain > 0:
                 break
@@ -137,57 +137,49 @@ class ResidualTerm(NamedTuple):
     robust: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class _LeastSquares:
-    """The least-squares problem of one trajectory."""
+def residual_terms(state: Array, logged: Array, h: float, limits: FeasibilityLimits) -> list[ResidualTerm]:
+    """Return the terms of the cost of states (K, 6) at knots `h` s apart.
 
-    h_s: float  # spacing of the knots
-    logged: Array  # (K, 4) box center x, y, yaw and speed at the knots
-    limits: FeasibilityLimits
-
-    def terms(self, state: Array) -> list[ResidualTerm]:
-        """Return the terms of the cost: the scenario's states, limits, rolling from knot to knot, and smooth driving."""
-        x, y, yaw, speed, accel, curvature = state.T
-        log_x, log_y, log_yaw, log_speed = self.logged.T
-        limits, o, scale = self.limits, self.limits.offset_m, math.sqrt(self.h_s / KNOT_S)
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        place, turn, pace = scale / POSITION_M, scale / YAW_RAD, scale / SPEED_MPS
-        hard, gentle = _limit_residual(accel, limits.max_accel_mps2, scale)
-        tight, wide = _limit_residual(curvature, limits.max_curvature_1pm, scale)
-        aside, grip = _limit_residual(speed**2 * curvature, limits.max_lateral_mps2, scale)
-        knots = [
-            ResidualTerm((x + o * cos - log_x) * place, {X: place, YAW: -o * place * sin}),
-            ResidualTerm((y + o * sin - log_y) * place, {Y: place, YAW: o * place * cos}),
-            ResidualTerm(hard, {ACCEL: gentle}),
-            ResidualTerm(tight, {CURVATURE: wide}),
-            ResidualTerm(aside, {SPEED: grip * 2 * speed * curvature, CURVATURE: grip * speed**2}),
-            ResidualTerm((yaw - log_yaw) * turn, {YAW: turn}, robust=True),
-            ResidualTerm((speed - log_speed) * pace, {SPEED: pace}, robust=True),
-        ]
-        h, (a, b) = self.h_s, (state[:-1].T, state[1:].T)
-        (_, _, yaw, speed, accel, curvature), (dx, dy, turn, gain, jerk, bend) = (a + b) / 2, b - a
-        cos, sin, per_speed = np.cos(yaw), np.sin(yaw), h * np.sinc(turn / (2 * np.pi))
-        east, north = per_speed * cos, per_speed * sin
-        smooth, straight = 1 / (math.sqrt(h * KNOT_S) * JERK_MPS3), 1 / (math.sqrt(h * KNOT_S) * self._curvature_rate)
-        return [
-            *knots,
-            _transition((dx - speed * east) / ROLL_M, X, 1 / ROLL_M, {YAW: speed * north / ROLL_M, SPEED: -east / ROLL_M}),
-            _transition((dy - speed * north) / ROLL_M, Y, 1 / ROLL_M, {YAW: -speed * east / ROLL_M, SPEED: -north / ROLL_M}),
-            _transition(
-                (turn - h * speed * curvature) / ROLL_RAD, YAW, 1 / ROLL_RAD,
-                {SPEED: -h / ROLL_RAD * curvature, CURVATURE: -h / ROLL_RAD * speed},
-            ),
-            _transition((gain - h * accel) / ROLL_MPS, SPEED, 1 / ROLL_MPS, {ACCEL: -h / ROLL_MPS}),
-            _transition(jerk * smooth, ACCEL, smooth, {}),
-            _transition(bend * straight, CURVATURE, straight, {}),
-        ]  # fmt: skip
-
-    @cached_property
-    def _curvature_rate(self) -> Array:
-        """Standard deviation (K - 1,) of the curvature rate: limited by the steering, and by comfort at speed."""
-        pace = np.maximum(np.abs(self.logged[1:, 3]), np.abs(self.logged[:-1, 3]))
-        steering = self.limits.max_curvature_rate_1pmps / 2
-        return np.asarray(LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering))
+    They are the scenario's states, `logged` (K, 4) as box center x, y, yaw and speed; limits; rolling; and smooth driving.
+    """
+    x, y, yaw, speed, accel, curvature = state.T
+    log_x, log_y, log_yaw, log_speed = logged.T
+    o, scale = limits.offset_m, math.sqrt(h / KNOT_S)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    place, turn, pace = scale / POSITION_M, scale / YAW_RAD, scale / SPEED_MPS
+    hard, gentle = _limit_residual(accel, limits.max_accel_mps2, scale)
+    tight, wide = _limit_residual(curvature, limits.max_curvature_1pm, scale)
+    aside, grip = _limit_residual(speed**2 * curvature, limits.max_lateral_mps2, scale)
+    knots = [
+        ResidualTerm((x + o * cos - log_x) * place, {X: place, YAW: -o * place * sin}),
+        ResidualTerm((y + o * sin - log_y) * place, {Y: place, YAW: o * place * cos}),
+        ResidualTerm(hard, {ACCEL: gentle}),
+        ResidualTerm(tight, {CURVATURE: wide}),
+        ResidualTerm(aside, {SPEED: grip * 2 * speed * curvature, CURVATURE: grip * speed**2}),
+        ResidualTerm((yaw - log_yaw) * turn, {YAW: turn}, robust=True),
+        ResidualTerm((speed - log_speed) * pace, {SPEED: pace}, robust=True),
+    ]
+    # How fast the curvature changes is limited by the steering, and by comfort at speed.
+    pace = np.maximum(np.abs(log_speed[1:]), np.abs(log_speed[:-1]))
+    steering = limits.max_curvature_rate_1pmps / 2
+    curvature_rate = LATERAL_JERK_MPS3 / np.maximum(pace**2, LATERAL_JERK_MPS3 / steering)
+    a, b = state[:-1].T, state[1:].T
+    (_, _, yaw, speed, accel, curvature), (dx, dy, turn, gain, jerk, bend) = (a + b) / 2, b - a
+    cos, sin, per_speed = np.cos(yaw), np.sin(yaw), h * np.sinc(turn / (2 * np.pi))
+    east, north = per_speed * cos, per_speed * sin
+    smooth, straight = 1 / (math.sqrt(h * KNOT_S) * JERK_MPS3), 1 / (math.sqrt(h * KNOT_S) * curvature_rate)
+    return [
+        *knots,
+        _transition((dx - speed * east) / ROLL_M, X, 1 / ROLL_M, {YAW: speed * north / ROLL_M, SPEED: -east / ROLL_M}),
+        _transition((dy - speed * north) / ROLL_M, Y, 1 / ROLL_M, {YAW: -speed * east / ROLL_M, SPEED: -north / ROLL_M}),
+        _transition(
+            (turn - h * speed * curvature) / ROLL_RAD, YAW, 1 / ROLL_RAD,
+            {SPEED: -h / ROLL_RAD * curvature, CURVATURE: -h / ROLL_RAD * speed},
+        ),
+        _transition((gain - h * accel) / ROLL_MPS, SPEED, 1 / ROLL_MPS, {ACCEL: -h / ROLL_MPS}),
+        _transition(jerk * smooth, ACCEL, smooth, {}),
+        _transition(bend * straight, CURVATURE, straight, {}),
+    ]  # fmt: skip
 
 
 def _transition(residual: Array, state: int, per_rise: Array | float, per_mean: Slopes) -> ResidualTerm:

@@ -104,18 +104,15 @@ def observe(scenario: Scenario, now_s: float) -> Present:
         fits = [np.polyfit(t, c, 2) for c in (way.real, way.imag)]
         accel[k] = 2 * fits[0][0]
         rest = [c - np.polyval(fit, t) for c, fit in zip((way.real, way.imag), fits)]
-        jitter[:, k] = [_jitter(c) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
+        # White noise, whose second differences over two ticks have a standard deviation of sqrt(6) times its own.
+        bends = [np.abs(c[4:] - 2 * c[2:-2] + c[:-4]) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
+        jitter[:, k] = np.median(bends, axis=1) * NORMAL_PER_MEDIAN / np.sqrt(6.0)
     group = np.array([GROUP_OF.get(a.category, "other") for a in known], dtype="<U16")
     return Present(
         tuple(known), place, wrap_angle(course), yaw, np.where(slow, 0.0, speed), np.clip(accel, -4.0, 3.0),
         np.where(slow, 0.0, smooth.turn_radps[row, last]), np.array([not a.static for a in known], dtype=bool),
         np.stack([_drawn_to_group(c, group) for c in jitter]), sizes_of(known), group,
     )  # fmt: skip
-
-
-def _jitter(values: Array) -> float:
-    """Return the standard deviation of white noise in values at successive ticks, whose second differences have one of sqrt(6) times that."""
-    return float(np.median(np.abs(values[4:] - 2 * values[2:-2] + values[:-4])) * NORMAL_PER_MEDIAN / np.sqrt(6.0))
 
 
 def _drawn_to_group(own: Array, group: NDArray[np.str_]) -> Array:

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.errors import ConfigError
 from log2sim.geometry import NS_PER_S, Array, Mount, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import shapes
-from log2sim.synth.paint import Appearance
 from log2sim.synth.scene import AgentSpec, Ego, Scene
 from log2sim.synth.shapes import Mesh
 
@@ -46,7 +45,9 @@ class RoundedPath:
         at = np.concatenate([[0.0], np.cumsum(chord)])
         margin = rounding_m
         s = np.arange(-margin - 1.0, at[-1] + margin + 1.0, STEP_M)
-        line = np.stack([_extended(s, at, waypoints[:, k]) for k in (0, 1)], 1)
+        first, last = ((waypoints[k + 1] - waypoints[k]) / (at[k + 1] - at[k]) for k in (0, len(at) - 2))
+        line = np.stack([np.interp(s, at, column) for column in waypoints.T], 1)
+        line = line + first * np.minimum(s - at[0], 0)[:, None] + last * np.maximum(s - at[-1], 0)[:, None]
         window = max(1, round(rounding_m / 2 / STEP_M) | 1)
         kernel = np.convolve(np.ones(window), np.ones(window))
         if window > 1:
@@ -72,12 +73,6 @@ class RoundedPath:
         s = np.arange(self._ends[0], self._ends[1], 0.1)
         d, dd = self._spline(s, 1), self._spline(s, 2)
         return np.asarray((d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3)
-
-
-def _extended(s: Array, at: Array, values: Array) -> Array:
-    before = (values[1] - values[0]) / (at[1] - at[0]) * np.minimum(s - at[0], 0)
-    after = (values[-1] - values[-2]) / (at[-1] - at[-2]) * np.maximum(s - at[-1], 0)
-    return np.asarray(np.interp(s, at, values) + before + after)
 
 
 class TimedPath:
@@ -182,10 +177,10 @@ class Actor:
     """One road user of a scene."""
 
     spec: AgentSpec
-    appearance: Appearance
     path: TimedPath | None  # None for a parked one
     parked: tuple[float, float, float] | None = None  # x, y in m and heading in rad of a parked one
     offset_m: float = 0.0  # distance from the guided point forward to the box center
+    seed: int = 0  # of its steps and of the folds of its clothes
 
     def at(self, t_s: ArrayLike) -> ActorStates:
         """States at times (T,) in s since the start of the log."""
@@ -209,13 +204,13 @@ class Actor:
 
     def mesh(self, t_s: float) -> Mesh:
         """Return the shape at a time, agent frame."""
-        size, category, seed = self.spec.box_m, self.spec.category, self.appearance.seed
+        size, category = self.spec.box_m, self.spec.category
         if category == "car":
             return shapes.car(size, self.spec.shape)
         if category in ("truck", "bus"):
             return shapes.truck(size) if category == "truck" else shapes.bus(size)
         stride_m = shapes.PEDAL_M if category == "cyclist" else shapes.STRIDE_M * size[2] / 1.75
-        turn = self.at(t_s).distance_m[0] / stride_m + seed / 7
+        turn = self.at(t_s).distance_m[0] / stride_m + self.seed / 7
         phase = int(np.floor(turn * shapes.PHASES)) % shapes.PHASES
         standing = self.path is None
         return shapes.cyclist(size, phase) if category == "cyclist" else shapes.pedestrian(size, phase, standing)
@@ -245,18 +240,16 @@ class MovingScene:
             # The id "ego" is refused in scene files, so nothing is validated here.
             size, offset_m = scene.ego.size_m, scene.ego.rear_axle_offset_m
             spec = AgentSpec.model_construct(id="ego", category="car", size_m=size, color=EGO_COLOR, shape="sedan")
-            ego = Actor(spec, Appearance("car", size, EGO_COLOR, "sedan"), path, offset_m=offset_m)
+            ego = Actor(spec, path, offset_m=offset_m)
         actors = []
         for index, spec in enumerate(scene.agent):
-            looks = (spec.box_m, spec.color, spec.shape, spec.second_color, spec.skin, spec.hair)
-            appearance = Appearance(spec.category, *looks, seed=index)
             if spec.pose is not None:
                 x, y, yaw_deg = spec.pose
-                actors.append(Actor(spec, appearance, None, (x, y, float(wrap_angle(np.deg2rad(yaw_deg))))))
+                actors.append(Actor(spec, None, (x, y, float(wrap_angle(np.deg2rad(yaw_deg)))), seed=index))
                 continue
             rounding = spec.rounding_m if spec.rounding_m is not None else (25.0 if spec.vehicle else 3.0)
             path = _path(spec, rounding, f"agent '{spec.id}'", vehicle=spec.vehicle)
-            actors.append(Actor(spec, appearance, path, offset_m=spec.rear_axle_offset_m))
+            actors.append(Actor(spec, path, offset_m=spec.rear_axle_offset_m, seed=index))
         return cls(scene, ego, tuple(actors))
 
     def map_T_mount(self, mount: Mount, t_ns: NDArray[np.int64]) -> Array:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from log2sim.geometry import Array, Camera, apply, inverse
 from log2sim.synth.ground import GROUND_M_PER_PX, LEVELS, TILE_PX, Ground
 from log2sim.synth.paint import Paint
-from log2sim.synth.returns import Weather
 from log2sim.synth.scene import Environment, Road
 
 Color = tuple[float, float, float]
@@ -81,11 +80,6 @@ NIGHT = Light(
 LIGHTS = {"noon": NOON, "overcast": OVERCAST, "dusk": DUSK, "night": NIGHT}
 
 
-def weather_of(environment: Environment) -> Weather:
-    """Weather of a scene as it weakens light and a LiDAR's returns."""
-    return Weather(environment.weather, environment.visibility_m, environment.rain_mm_h)
-
-
 def light_of(environment: Environment) -> Light:
     """Light of a scene's environment: fog and rain hide the sun and gray the sky, lamps are on.
 
@@ -93,7 +87,7 @@ def light_of(environment: Environment) -> Light:
     """
     light, fog = LIGHTS[environment.light], environment.weather == "fog"
     if environment.weather != "clear":
-        extinction = weather_of(environment).extinction_per_m + (0.0 if fog else light.extinction_per_m)
+        extinction = environment.extinction_per_m + (0.0 if fog else light.extinction_per_m)
         sky = np.add(light.sky_color, np.multiply(light.sun_color, 0.5 * light.sun[2]))
         gray = (sky + 2 * sky.mean()) / 3 * (1.0 if fog else 0.8)
         colors = np.multiply(light.sun_color, 0.06), gray, gray * 0.92, gray * (0.88 if fog else 0.7)

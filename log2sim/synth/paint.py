@@ -18,23 +18,10 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground, Surface
+from log2sim.synth.scene import AgentSpec
 from log2sim.synth.shapes import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line
 
 Index = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """Appearance of an actor; colors are sRGB from 0 to 255."""
-
-    category: str
-    size_m: tuple[float, float, float]  # length, width, height
-    color: tuple[int, int, int]
-    kind: str = ""  # body of a car
-    second_color: tuple[int, int, int] = (45, 50, 66)
-    skin: tuple[int, int, int] = (196, 150, 122)
-    hair: tuple[int, int, int] = (52, 38, 28)
-    seed: int = 0  # varies the folds of clothes
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +42,14 @@ def linear_bgr(rgb: tuple[int, int, int]) -> NDArray[np.float32]:
 class Patch:
     """Points of one material on an actor, to be painted."""
 
-    appearance: Appearance
+    spec: AgentSpec
     out: Paint  # of all points of the actor
     rows: Index  # (Q,) int64: rows of this patch in `out`
     p: Array  # (Q, 3), m: points in the agent frame
     z: Array  # (Q,), m: heights above the ground
     n: Array  # (Q, 3): normals
     part: Material
+    seed: int  # varies the folds of clothes
 
     def set(self, mask: NDArray[np.bool_], albedo: Any, gloss: float = 0.0, glow: float = 0.0) -> None:
         """Paint the points of a mask (Q,)."""
@@ -79,32 +67,32 @@ GLASS = (0.055, 0.05, 0.045)
 RUBBER = (0.028, 0.027, 0.026)
 
 
-def paint(appearance: Appearance, part: NDArray[np.int64], points: Array, normals: Array) -> Paint:
-    """Paint points (P, 3), m, agent frame (box center), with normals (P, 3) and materials (P,)."""
+def paint(spec: AgentSpec, part: NDArray[np.int64], points: Array, normals: Array, *, seed: int = 0) -> Paint:
+    """Paint points (P, 3), m, agent frame (box center), with normals (P, 3) and materials (P,); `seed` varies the folds of clothes."""
     count = len(part)
     out = Paint(np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros((count, 3), np.float32))
-    z = points[:, 2] + appearance.size_m[2] / 2
+    z = points[:, 2] + spec.box_m[2] / 2
     for value in np.unique(part):
         rows = np.flatnonzero(part == value)
-        patch = Patch(appearance, out, rows, points[rows], z[rows], normals[rows], Material(value))
+        patch = Patch(spec, out, rows, points[rows], z[rows], normals[rows], Material(value), seed)
         _PAINTERS.get(Material(value), _plain)(patch)
     return out
 
 
 def _car(patch: Patch) -> None:
-    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
-    length, width, height = appearance.size_m
+    spec, p, z, n = patch.spec, patch.p, patch.z, patch.n
+    length, width, height = spec.box_m
     x, y = p[:, 0], p[:, 1]
     u, h = x / length, z / height
-    line = roof_line(appearance.kind)
+    line = roof_line(spec.shape)
     top = np.interp(u, line[:, 0], line[:, 1])
-    patch.fill(linear_bgr(appearance.color), 0.16)
+    patch.fill(linear_bgr(spec.color), 0.16)
     side = np.abs(n[:, 1]) > 0.55
     # Seams of the doors, a dark sill and the handles.
     at_seam = np.min(np.abs(x[:, None] - length * np.array([0.165, -0.03, -0.235])), 1) < 0.008
-    patch.set(side & (h > 0.24) & (h < BELT) & at_seam, linear_bgr(appearance.color) * 0.25)
+    patch.set(side & (h > 0.24) & (h < BELT) & at_seam, linear_bgr(spec.color) * 0.25)
     at_handle = np.min(np.abs(x[:, None] - length * np.array([0.0, -0.2])), 1) < 0.07
-    patch.set(side & (np.abs(h - 0.565) < 0.012) & at_handle, linear_bgr(appearance.color) * 0.5, 0.1)
+    patch.set(side & (np.abs(h - 0.565) < 0.012) & at_handle, linear_bgr(spec.color) * 0.5, 0.1)
     patch.set(h < 0.225, (0.05, 0.05, 0.05))
     fender = np.min(np.hypot(x[:, None] - length * np.array([WHEEL_AT, -WHEEL_AT]), z[:, None] - WHEEL_RADIUS_M), 1)
     patch.set((fender < WHEEL_RADIUS_M + 0.055) & (np.abs(y) > 0.3 * width), (0.008, 0.008, 0.008))
@@ -139,11 +127,11 @@ def _car(patch: Patch) -> None:
 
 
 def _wheel(patch: Patch) -> None:
-    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
-    length = appearance.size_m[0]
-    big = appearance.category in ("truck", "bus")
+    spec, p, z, n = patch.spec, patch.p, patch.z, patch.n
+    length = spec.box_m[0]
+    big = spec.category in ("truck", "bus")
     radius = 0.48 if big else WHEEL_RADIUS_M
-    axles = np.array([WHEEL_AT, -WHEEL_AT]) * length if not big else truck_axles(appearance)
+    axles = np.array([WHEEL_AT, -WHEEL_AT]) * length if not big else truck_axles(spec)
     d = p[:, 0][:, None] - axles
     dx = np.take_along_axis(d, np.abs(d).argmin(1)[:, None], 1)[:, 0]
     dz = z - radius
@@ -160,21 +148,21 @@ def _wheel(patch: Patch) -> None:
     patch.set(face & (r < 0.09), (0.1, 0.1, 0.1))
 
 
-def truck_axles(appearance: Appearance) -> Array:
+def truck_axles(spec: AgentSpec) -> Array:
     """Axle positions (K,) in m along a truck or bus, as its shape has them."""
-    length = appearance.size_m[0]
-    if appearance.category == "bus":
+    length = spec.box_m[0]
+    if spec.category == "bus":
         return np.array([-0.26, 0.27]) * length
     front, rear = length / 2, -length / 2
     return np.array([front - 0.95, rear + 1.1] if length < 8 else [front - 0.95, rear + 2.4, rear + 1.2])
 
 
 def _cab(patch: Patch) -> None:
-    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
-    length, width, height = appearance.size_m
+    spec, p, z, n = patch.spec, patch.p, patch.z, patch.n
+    length, width, height = spec.box_m
     top, front = 0.8 * height, length / 2
     y, x = p[:, 1], p[:, 0]
-    patch.fill(linear_bgr(appearance.second_color), 0.12)
+    patch.fill(linear_bgr(spec.second_color), 0.12)
     patch.set((n[:, 0] > 0.3) & (z > 0.53 * top) & (z < 0.93 * top) & (np.abs(y) < 0.42 * width), GLASS, 0.36)
     window = (np.abs(n[:, 1]) > 0.6) & (z > 0.55 * top) & (z < 0.9 * top) & (x > front - 1.35) & (x < front - 0.28)
     patch.set(window, GLASS, 0.34)
@@ -189,33 +177,33 @@ def _cab(patch: Patch) -> None:
 
 
 def _cargo(patch: Patch) -> None:
-    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
-    length, width, height = appearance.size_m
-    patch.fill(linear_bgr(appearance.color), 0.03)
+    spec, p, z, n = patch.spec, patch.p, patch.z, patch.n
+    length, width, height = spec.box_m
+    patch.fill(linear_bgr(spec.color), 0.03)
     side, rear = np.abs(n[:, 1]) > 0.7, n[:, 0] < -0.7
     patch.set((side | rear) & ((z > height - 0.12) | (z < 0.36 * height + 0.12)), (0.3, 0.3, 0.3))
-    patch.set(side & (np.abs(np.mod(p[:, 0], 0.6) - 0.3) < 0.012), linear_bgr(appearance.color) * 0.7)
+    patch.set(side & (np.abs(np.mod(p[:, 0], 0.6) - 0.3) < 0.012), linear_bgr(spec.color) * 0.7)
     patch.set(rear & (np.abs(p[:, 1]) < 0.015), (0.05, 0.05, 0.05))
     patch.set(rear & (np.abs(np.abs(p[:, 1]) - 0.25) < 0.02) & (z > 0.5 * height), (0.35, 0.35, 0.35))
     patch.set(rear & (z < 0.36 * height + 0.12) & (np.abs(p[:, 1]) > 0.36 * width), (0.02, 0.02, 0.5), 0.1, 0.25)
     patch.set(side & (np.abs(z - 0.66 * height) < 0.14 * height) & (np.abs(p[:, 0] + 0.15 * length) < 0.22 * length),
-         linear_bgr(appearance.second_color), 0.03)  # fmt: skip
+         linear_bgr(spec.second_color), 0.03)  # fmt: skip
 
 
 def _bus(patch: Patch) -> None:
-    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
-    length, width, height = appearance.size_m
+    spec, p, z, n = patch.spec, patch.p, patch.z, patch.n
+    length, width, height = spec.box_m
     x, y = p[:, 0], p[:, 1]
-    patch.fill(linear_bgr(appearance.color), 0.12)
+    patch.fill(linear_bgr(spec.color), 0.12)
     side, front, rear = np.abs(n[:, 1]) > 0.55, n[:, 0] > 0.5, n[:, 0] < -0.5
     patch.set(z < 0.5, (0.06, 0.06, 0.06))
     row = side & (z > 0.43 * height) & (z < 0.80 * height) & (np.abs(x) < 0.475 * length)
     patch.set(row & (np.mod(x + 0.5 * length, 1.45) > 0.09), GLASS, 0.34)
-    patch.set(side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(appearance.second_color), 0.1)
+    patch.set(side & (np.abs(z - 0.37 * height) < 0.05), linear_bgr(spec.second_color), 0.1)
     at_door = np.min(np.abs(x[:, None] - length * np.array([0.42, 0.02])), 1) < 0.6
     doors = side & (n[:, 1] < 0) & (z > 0.42) & (z < 0.8 * height) & at_door
     patch.set(doors, GLASS, 0.3)
-    patch.set(doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(appearance.color) * 0.6)
+    patch.set(doors & (np.mod(x - 0.42 * length + 0.6, 0.6) < 0.05), linear_bgr(spec.color) * 0.6)
     patch.set(front & (z > 0.36 * height) & (z < 0.80 * height) & (np.abs(y) < 0.45 * width), GLASS, 0.36)
     display = front & (z > 0.84 * height) & (z < 0.93 * height) & (np.abs(y) < 0.3 * width)
     patch.set(display, (0.02, 0.12, 0.2), 0.0, 0.8)
@@ -223,15 +211,15 @@ def _bus(patch: Patch) -> None:
     patch.set(front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
     patch.set(rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
     patch.set((front | rear) & (np.abs(y) < 0.26) & (z > 0.5) & (z < 0.62), (0.75, 0.75, 0.75))
-    fender = np.min(np.hypot(x[:, None] - truck_axles(appearance), z[:, None] - 0.48), 1)
+    fender = np.min(np.hypot(x[:, None] - truck_axles(spec), z[:, None] - 0.48), 1)
     patch.set(side & (fender < 0.57), (0.01, 0.01, 0.01))
 
 
 def _cloth(patch: Patch) -> None:
-    appearance, p, z, n = patch.appearance, patch.p, patch.z, patch.n
-    color = linear_bgr(appearance.color if patch.part == Material.SHIRT else appearance.second_color)
+    spec, p, z, n = patch.spec, patch.p, patch.z, patch.n
+    color = linear_bgr(spec.color if patch.part == Material.SHIRT else spec.second_color)
     # Folds: waves that follow the body, fixed to it, so that they move along.
-    fold = np.sin(23 * z + 9 * p[:, 1] + appearance.seed) * np.sin(17 * p[:, 1] - 11 * z + 5 * p[:, 0])
+    fold = np.sin(23 * z + 9 * p[:, 1] + patch.seed) * np.sin(17 * p[:, 1] - 11 * z + 5 * p[:, 0])
     shade = 1.0 + 0.13 * fold
     patch.out.albedo[patch.rows] = color * shade[:, None]
     if patch.part == Material.SHIRT:
@@ -240,15 +228,15 @@ def _cloth(patch: Patch) -> None:
 
 
 def _plain(patch: Patch) -> None:
-    appearance = patch.appearance
-    body = linear_bgr(appearance.color)
+    spec = patch.spec
+    body = linear_bgr(spec.color)
     albedo, gloss = {
-        Material.SKIN: (linear_bgr(appearance.skin), 0.02),
-        Material.HAIR: (linear_bgr(appearance.hair), 0.03),
+        Material.SKIN: (linear_bgr(spec.skin), 0.02),
+        Material.HAIR: (linear_bgr(spec.hair), 0.03),
         Material.SHOE: (np.array((0.03, 0.03, 0.035)), 0.05),
         Material.FRAME: (body[::-1] * 0.6 + 0.02, 0.15),
         Material.TIRE: (np.array(RUBBER), 0.02),
-        Material.MIRROR: (body if appearance.category == "car" else np.array((0.35, 0.35, 0.35)), 0.12),
+        Material.MIRROR: (body if spec.category == "car" else np.array((0.35, 0.35, 0.35)), 0.12),
     }.get(patch.part, (np.array((0.02, 0.02, 0.02)), 0.0))
     patch.fill(albedo, gloss)
 

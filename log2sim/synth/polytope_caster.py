@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, rotation_from_rpy, wrap_angle
 from log2sim.synth.polytopes import Material, Polytope
 from log2sim.synth.returns import REFLECTANCE, LidarModel, ReturnModel, backscattered, detected, disturbed, reflected
@@ -178,7 +179,7 @@ MAX_GROUND_ERROR_M = 0.03  # departure of the ground's surface from the ray that
 
 
 @dataclass(frozen=True, eq=False)
-class Returns:
+class Returns(Columns):
     """Points of a sweep, motion compensated."""
 
     xyz_m: NDArray[np.float32]  # (N, 3), m: level frame

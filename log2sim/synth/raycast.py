@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Sweep
 from log2sim.geometry import NS_PER_S, Array, cross_slab, inverse, rotation_from_rpy, transform
 from log2sim.synth.actors import EGO_COLOR, MovingScene
-from log2sim.synth.light import weather_of
 from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
 from log2sim.synth.raster import first_hit
 from log2sim.synth.render import triangles_of
@@ -118,8 +117,8 @@ def cast_sweep(
     # Drawn for every ray, so that a change of the scene moves no other ray's noise.
     noise, lost = rng.normal(0.0, 1.0, len(ray)) * spec.noise_m, rng.random(len(ray)) < spec.dropout
     distance[distance > spec.range_m] = np.inf
-    weather = weather_of(scene.environment)
-    if weather.kind != "clear":  # some returns are lost to rain and fog, and others come back from the air
+    weather = scene.environment
+    if weather.weather != "clear":  # some returns are lost to rain and fog, and others come back from the air
         air = backscattered(distance.astype(np.float32), weather, rng)
         solid = np.flatnonzero(np.isfinite(distance))
         usual = np.ones(len(solid), np.float32)

@@ -62,7 +62,7 @@ class Body:
     def of(cls, actor: Actor, t_s: float) -> Body:
         """Take a road user at a time in s since the start."""
         pose = actor.at(t_s).map_T_agent()[0]
-        return cls(actor.mesh(t_s), pose, actor.spec.box_m, partial(paint, actor.appearance))
+        return cls(actor.mesh(t_s), pose, actor.spec.box_m, partial(paint, actor.spec, seed=actor.seed))
 
 
 def near_first(view: RenderCamera, bodies: Sequence[Body], nearness: Image) -> Iterator[int]:

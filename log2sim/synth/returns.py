@@ -4,8 +4,7 @@ Elevations are those of the makers' manuals: Velodyne VLP-16, HDL-32E, VLP-32C, 
 Pandar64, PandarGT; Ouster OS1.
 
 The power of a return goes with reflectance x incidence / range^2 x exp(-2 extinction x range), the LiDAR equation of an
-extended target; a return is lost when it falls below a threshold. Fog extinguishes 3.912 / visibility (Koschmieder, 1924),
-rain 1.076 x rate^0.67 dB/km (Carbonneau & Wisely, SPIE 1998); both send returns back from close by.
+extended target; a return is lost when it falls below a threshold. Fog and rain also send returns back from close by.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,7 @@ from log2sim.files.inputs import read_text
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array
 from log2sim.synth.polytopes import Material
+from log2sim.synth.scene import Environment
 
 MAX_FILE_BYTES = 65536
 MAX_RAYS = 4_000_000
@@ -128,31 +128,11 @@ REFLECTANCE: dict[Material, tuple[float, float]] = {
 # A target of reflectance 0.1 is seen to about 60 m, to what makers of sensors with a range of 100 to 150 m state.
 REFERENCE_RANGE_M = 60.0
 MIN_SIGNAL = 0.04
-DB_PER_NEPER = 4.343
 # Returns of fog and rain come from where the beams of sender and receiver overlap, near the sensor.
 BACKSCATTER_REACH_M = 15.0
 # Share of the extinguished light that comes back as a return of its own: droplets scatter a few percent backward.
 BACKSCATTER_SHARE = 0.08
-
-Kind = Literal["clear", "rain", "fog"]
-
-
-@dataclass(frozen=True)
-class Weather:
-    """Weather as a LiDAR feels it."""
-
-    kind: Kind = "clear"  # clear, rain or fog
-    visibility_m: float = 200.0  # meteorological visibility in fog, m
-    rain_mm_h: float = 10.0  # rate of rain, mm/h
-
-    @property
-    def extinction_per_m(self) -> float:
-        """Share of light that is lost on a meter, 1/m."""
-        if self.kind == "fog":
-            return 3.912 / self.visibility_m
-        if self.kind == "rain":
-            return float(1.076 * self.rain_mm_h**0.67 / DB_PER_NEPER / 1000)
-        return 0.0
+CLEAR = Environment()
 
 
 @dataclass(frozen=True)
@@ -162,11 +142,11 @@ class ReturnModel:
     noise_m: float = 0.02  # standard deviation of a distance, m
     dropout: float = 0.03  # share of returns that are lost whatever they hit
     mixed: float = 0.002  # share of returns that lie between two surfaces
-    weather: Weather = Weather()
+    weather: Environment = CLEAR
 
 
 def reflected(
-    range_m: NDArray[np.float32], reflectance: NDArray[np.float32], incidence: NDArray[np.float32], weather: Weather
+    range_m: NDArray[np.float32], reflectance: NDArray[np.float32], incidence: NDArray[np.float32], weather: Environment
 ) -> NDArray[np.float32]:
     """Signal (N,) of returns relative to a target of reflectance 1 at `REFERENCE_RANGE_M` in clear air.
 
@@ -184,7 +164,7 @@ def detected(signal: NDArray[np.float32], model: ReturnModel, rng: np.random.Gen
     return np.asarray(rng.random(len(signal), dtype=np.float32) < chance)
 
 
-def backscattered(range_m: NDArray[np.float32], weather: Weather, rng: np.random.Generator) -> Array:
+def backscattered(range_m: NDArray[np.float32], weather: Environment, rng: np.random.Generator) -> Array:
     """Distances (N,) at which rays come back from fog or rain before they reach a surface; inf where they do not.
 
     `range_m` (N,) float32, m: distances to the surfaces, inf without one.

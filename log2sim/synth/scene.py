@@ -154,6 +154,7 @@ class Shadow(Table):
 
 
 MAX_SCENE_BYTES = 4 * 1024 * 1024
+DB_PER_NEPER = 4.343
 
 
 class Origin(Table):
@@ -173,6 +174,13 @@ class Environment(Table):
     rain_mm_h: Number = key("Rate of rain.", 15.0, "mm/h", ge=0.1, le=200)
     wetness: Number | None = key("Wetness of the road; by default as the weather makes it.", None, "1", ge=0, le=1)
     glare: Annotated[bool, Field(strict=True)] = key("Whether a wet road mirrors the sun and lamps.", False)
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Share of light lost on a meter, 1/m: fog after Koschmieder (1924), rain after Carbonneau & Wisely (SPIE 1998)."""
+        if self.weather == "rain":
+            return float(1.076 * self.rain_mm_h**0.67 / DB_PER_NEPER / 1000)
+        return 3.912 / self.visibility_m if self.weather == "fog" else 0.0
 
 
 class Ego(Table):

@@ -80,13 +80,6 @@ def _fan(ring: Array, part: int) -> Mesh:
     return surface(vertices, np.stack([k, (k + 1) % len(ring), np.full(len(ring), len(ring))], 1), part)
 
 
-def _across(axis: Array) -> Array:
-    """Find a unit vector perpendicular to `axis`."""
-    side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 * np.linalg.norm(axis) else np.array([1.0, 0.0, 0.0])
-    across = cross_products(side, axis)
-    return np.asarray(across / np.linalg.norm(across))
-
-
 def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 10) -> Mesh:
     """Make a round-ended tube along points (P, 3) with a radius at each."""
     p = np.asarray(points, dtype=np.float64)
@@ -94,7 +87,10 @@ def limb(points: ArrayLike, radii: Sequence[float], part: int, *, count: int = 1
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     angle = np.arange(count) * 2 * np.pi / count
     rings = []
-    u = _across(p[-1] - p[0])
+    axis = p[-1] - p[0]
+    side = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 * np.linalg.norm(axis) else np.array([1.0, 0.0, 0.0])
+    u = cross_products(side, axis)
+    u /= np.linalg.norm(u)
     ends = ((0, -1, ((1.0, 0.05), (0.8, 0.6))), (-1, 1, ((0.8, 0.6), (1.0, 0.05))))
     caps = [
         [(p[k] + s * tangent[k] * radii[k] * h, radii[k] * c, tangent[k]) for h, c in steps] for k, s, steps in ends

@@ -6,17 +6,17 @@ park along, across and at an angle; people, riders and what is no road user stan
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array, Camera, inverse, rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import Array, Camera, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import traffic_shapes as clutter
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
 from log2sim.synth.polytopes import Polytope
-from log2sim.synth.returns import LIDAR_MODELS, LidarModel, ReturnModel, Weather, lidar_model
+from log2sim.synth.returns import LIDAR_MODELS, LidarModel, ReturnModel, lidar_model
 from log2sim.synth.scene import Environment
 from log2sim.synth.terrain import Road, Surface
 from log2sim.synth.traffic_shapes import draw_user, own_car
@@ -60,16 +60,6 @@ class TrafficScene:
     # (LidarModel, SensorState) or None: another LiDAR that sees the scene too
     second: tuple[LidarModel, SensorState] | None = None
 
-    def at(self, t_s: float) -> TrafficScene:
-        """Return the scene at another time; the sensor stays in the origin's frame and moves with its velocity."""
-        moved = []
-        for item in self.objects:
-            position, yaw = item.pose_at(t_s)
-            position[2] = self.surface.elevation(position)
-            moved.append(replace(item, position_m=position, yaw_rad=yaw) if item.speed_mps else item)
-        start = self.sensor.position_m + np.append(self.sensor.velocity_mps, 0.0) * t_s
-        return replace(self, objects=tuple(moved), sensor=replace(self.sensor, position_m=start))
-
     def cast(self, rng: np.random.Generator) -> Returns:
         """Cast the sweep whose middle is at time 0."""
         solids = []
@@ -81,7 +71,7 @@ class TrafficScene:
         if self.second is None:
             return one
         two = cast_polytopes(*self.second, solids, self.surface, rng, self.returns)
-        return Returns(**{k: np.concatenate([v, getattr(two, k)]) for k, v in vars(one).items()})
+        return Returns.join([one, two])
 
 
 @dataclass(frozen=True, eq=False)
@@ -447,7 +437,7 @@ def draw_scene(
     rng: np.random.Generator,
     *,
     lidar: LidarModel | None = None,
-    weather: Weather | None = None,
+    weather: Environment | None = None,
     without: frozenset[str] = frozenset(),
 ) -> TrafficScene:
     """Draw a random scene.
@@ -471,7 +461,12 @@ def draw_scene(
         parts = own_car(float(sensor.position_m[2]), rng)
         speed = float(np.hypot(*sensor.velocity_mps))
         objects.append(TrafficObject("", np.zeros(3), sensor_forward, OWN_CAR_M, parts, speed, kind="own car"))
-    weather = weather or _draw_weather(rng)
+    if weather is None:
+        kind, weather = rng.random(), Environment()
+        if kind < 0.05:
+            weather = Environment(weather="fog", visibility_m=float(rng.uniform(60, 400)))
+        elif kind < 0.1:
+            weather = Environment(weather="rain", rain_mm_h=float(rng.uniform(2, 30)))
     noise = model.noise_m if lidar else float(rng.uniform(0.008, 0.03))
     returns = ReturnModel(noise, float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 0.006)), weather)
     two = mount == "vehicle" and not lidar and rng.random() < 0.2
@@ -567,15 +562,6 @@ def _draw_second(sensor: SensorState, forward: float, rng: np.random.Generator) 
     return model, SensorState(rotation_from_rpy(0.0, pitch, yaw), place, sensor.velocity_mps)
 
 
-def _draw_weather(rng: np.random.Generator) -> Weather:
-    kind = rng.random()
-    if kind < 0.05:
-        return Weather("fog", visibility_m=float(rng.uniform(60, 400)))
-    if kind < 0.1:
-        return Weather("rain", rain_mm_h=float(rng.uniform(2, 30)))
-    return Weather()
-
-
 # KITTI's camera 2, which sits 0.27 m ahead of the LiDAR and 0.08 m lower (Geiger et al., IJRR 2013).
 KITTI_SIZE_PX, KITTI_FOCAL_PX, KITTI_CENTER_PX = (1242, 375), 721.5377, (609.5593, 172.854)
 KITTI_OFFSET_M = (0.27, 0.0, -0.08)
@@ -602,16 +588,6 @@ class Rig:
     lidar_height_m: float  # above the ground below it
 
 
-def camera_for(mount: Mount) -> tuple[int, int, Array]:
-    """Width, height and intrinsics (3, 3) of the camera at a mount."""
-    if mount == "vehicle":
-        (width, height), focal, (cx, cy) = KITTI_SIZE_PX, KITTI_FOCAL_PX, KITTI_CENTER_PX
-    else:
-        (width, height), focal = ROADSIDE_SIZE_PX, ROADSIDE_FOCAL_PX
-        cx, cy = (width - 1) / 2, (height - 1) / 2
-    return width, height, np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
-
-
 def rig_of(scene: TrafficScene) -> Rig:
     """Place the camera of a scene at time 0: it looks where the LiDAR does, level on a vehicle, down at the roadside."""
     R, position = scene.sensor.rotation, scene.sensor.position_m
@@ -621,16 +597,14 @@ def rig_of(scene: TrafficScene) -> Rig:
     eye = position + rotation_from_rpy(0.0, 0.0, yaw) @ np.array(offset)
     level = transform(rotation_from_rpy(0.0, 0.0, yaw) @ FORWARD_R_CAM, eye)
     map_T_cam = transform(rotation_from_rpy(0.0, pitch, yaw) @ FORWARD_R_CAM, eye)
-    width, height, K = camera_for(scene.mount)
+    if scene.mount == "vehicle":
+        (width, height), focal, (cx, cy) = KITTI_SIZE_PX, KITTI_FOCAL_PX, KITTI_CENTER_PX
+    else:
+        (width, height), focal = ROADSIDE_SIZE_PX, ROADSIDE_FOCAL_PX
+        cx, cy = (width - 1) / 2, (height - 1) / 2
+    K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
     camera = Camera("camera", width, height, K, "map", map_T_cam)
     return Rig(camera, map_T_cam, transform(R, position), level, float(position[2] - scene.surface.elevation(position)))
-
-
-def mount_T_cam_of(mount: Mount, rig: Rig) -> Array:
-    """Pose of the camera relative to the LiDAR, for a rig that moves as one piece."""
-    if mount == "roadside":
-        return np.asarray(inverse(rig.map_T_lidar) @ rig.map_T_cam)
-    return transform(FORWARD_R_CAM, np.array(KITTI_OFFSET_M))
 
 
 def sensor_named(name: str | None, mount: Mount) -> LidarModel | None:

@@ -23,12 +23,12 @@ from log2sim.files.documents import check_folder, refuse_folder
 from log2sim.files.outputs import replaced_folder
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth import traffic
-from log2sim.synth.light import light_of, weather_of
+from log2sim.synth.light import light_of
 from log2sim.synth.polytope_caster import SensorState
 from log2sim.synth.render import Visibility, render, segment
 from log2sim.synth.scene import Environment
+from log2sim.synth.synthesis import MIN_LABEL_PX, MIN_UNOCCLUDED
 from log2sim.synth.traffic_picture import TrafficPainter
-from log2sim.synth.truth import MIN_LABEL_PX, MIN_UNOCCLUDED
 
 FOLDERS = {"image_2": ".png", "velodyne": ".bin", "calib": ".txt", "label_2": ".txt"}
 TYPES = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian", "cyclist": "Cyclist"}
@@ -49,16 +49,13 @@ def calibration_text(rig: traffic.Rig) -> str:
     cam_R_level = (inverse(rig.map_T_cam)[:3, :3] @ rig.map_T_level[:3, :3]).round(12) + 0.0
     P = np.column_stack([rig.camera.K @ cam_R_level, np.zeros(3)])
     level_T_lidar = inverse(rig.map_T_level) @ rig.map_T_lidar
-    rows = {f"P{k}": P for k in range(4)}
-    rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": level_T_lidar[:3], "Tr_imu_to_velo": _lidar_T_imu(rig)[:3]}
-    return "".join(f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(values))}\n" for name, values in rows.items())
-
-
-def _lidar_T_imu(rig: traffic.Rig) -> Array:
-    """Place KITTI's IMU, by which readers know how high the LiDAR is above the ground."""
+    # KITTI's IMU, by which readers know how high the LiDAR is above the ground.
     level = rig.map_T_level[:3, :3] @ traffic.FORWARD_R_CAM.T
     away = np.append(LIDAR_FROM_IMU_M, rig.lidar_height_m - IMU_HEIGHT_M)
-    return np.asarray(inverse(transform(level.T @ rig.map_T_lidar[:3, :3], away)))
+    lidar_T_imu = inverse(transform(level.T @ rig.map_T_lidar[:3, :3], away))
+    rows = {f"P{k}": P for k in range(4)}
+    rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": level_T_lidar[:3], "Tr_imu_to_velo": lidar_T_imu[:3]}
+    return "".join(f"{name}: {' '.join(f'{v:.12e}' for v in np.ravel(values))}\n" for name, values in rows.items())
 
 
 def label_text(objects: Sequence[traffic.TrafficObject], seen: Sequence[Visibility | None], rig: traffic.Rig) -> str:
@@ -81,13 +78,6 @@ def label_text(objects: Sequence[traffic.TrafficObject], seen: Sequence[Visibili
     return "".join(labels + regions)
 
 
-def kitti_type(item: traffic.TrafficObject) -> str:
-    """KITTI's name of a road user's kind."""
-    if item.category == "car" and item.size_m[2] >= MIN_VAN_HEIGHT_M:
-        return VAN
-    return TYPES.get(item.category, OTHER)
-
-
 def _label(item: traffic.TrafficObject, share: float, box_2d: str, rig: traffic.Rig) -> str:
     level_T_map = inverse(rig.map_T_level)
     x, y, z = apply(level_T_map, item.position_m[None])[0]
@@ -97,8 +87,9 @@ def _label(item: traffic.TrafficObject, share: float, box_2d: str, rig: traffic.
     occlusion = int(np.sum(share < np.array(OCCLUSION_LIMITS)))
     length, width, height = item.size_m
     size = f"{height:.2f} {width:.2f} {length:.2f}"
+    van = item.category == "car" and height >= MIN_VAN_HEIGHT_M
     return (
-        f"{kitti_type(item)} {truncation(item, rig):.2f} {occlusion} {alpha:.2f} {box_2d} {size} "
+        f"{VAN if van else TYPES.get(item.category, OTHER)} {truncation(item, rig):.2f} {occlusion} {alpha:.2f} {box_2d} {size} "
         f"{x:.2f} {y:.2f} {z:.2f} {rotation:.2f}\n"
     )
 
@@ -245,11 +236,11 @@ def log_of(
     run = run_of(scene, duration_s)
     rig = traffic.rig_of(scene)
     mount = "map" if scene.mount == "roadside" else "ego"
-    mount_T_lidar = rig.map_T_lidar
-    if mount == "ego":
+    mount_T_lidar, lidar_T_cam = rig.map_T_lidar, inverse(rig.map_T_lidar) @ rig.map_T_cam
+    if mount == "ego":  # a rig that moves as one piece
         place = np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])])
         mount_T_lidar = transform(np.eye(3), place)
-    lidar_T_cam = traffic.mount_T_cam_of(scene.mount, rig)
+        lidar_T_cam = transform(traffic.FORWARD_R_CAM, np.array(traffic.KITTI_OFFSET_M))
     camera = replace(rig.camera, name=CAMERA, mount=mount, mount_T_cam=mount_T_lidar @ lidar_T_cam)  # type: ignore[arg-type]
     film = _Film(run, environment, camera, lidar_T_cam, seed)
     # A sweep's middle lies within the log, and so do its first and last point.
@@ -257,6 +248,12 @@ def log_of(
     t_sweep = np.arange(period / 2, duration_s - period / 2 + 1e-9, period)
     t_image = np.arange(0.5 / camera_rate_hz, duration_s + 1e-9, 1.0 / camera_rate_hz)
     t_pose = np.arange(int(np.ceil(duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
+
+    def sweep(i: int) -> Sweep:
+        returns = run.at(float(t_sweep[i])).cast(np.random.default_rng([seed, 4, i]))
+        t_ns = stamps_of(t_sweep[i] + returns.t_s.astype(np.float64))
+        return Sweep(int(stamps_of(t_sweep[i : i + 1] + period / 2)[0]), returns.xyz_m, "map", t_ns)
+
     return Log(
         name=name,
         format="synthetic",
@@ -264,7 +261,7 @@ def log_of(
         lidars={LIDAR: Lidar(LIDAR, mount, mount_T_lidar)},  # type: ignore[arg-type]
         streams={
             CAMERA: Stream(CAMERA, stamps_of(t_image), lambda i: film.image(float(t_image[i]), i)),
-            LIDAR: Stream(LIDAR, stamps_of(t_sweep + period / 2), _sweeps(run, t_sweep, period, seed)),
+            LIDAR: Stream(LIDAR, stamps_of(t_sweep + period / 2), sweep),
         },
         ego=poses_of(run, mount_T_lidar, t_pose) if mount == "ego" else None,
         ego_vehicle=EgoVehicle(CAR_SIZE_M, REAR_AXLE_OFFSET_M),
@@ -290,17 +287,6 @@ def poses_of(run: TrafficRun, ego_T_lidar: Array, t_s: Array) -> PoseTrack:
     """Return the poses of the ego at times (F,), s."""
     poses = np.array([map_T_lidar_of(run.at(float(t))) @ inverse(ego_T_lidar) for t in t_s])
     return PoseTrack(stamps_of(t_s), poses)
-
-
-def _sweeps(run: TrafficRun, t_s: Array, period_s: float, seed: int) -> Callable[[int], Sweep]:
-    """Return the reader of sweeps whose middles are at times (F,); their stamps are their ends."""
-
-    def read(i: int) -> Sweep:
-        returns = run.at(float(t_s[i])).cast(np.random.default_rng([seed, 4, i]))
-        t_ns = stamps_of(t_s[i] + returns.t_s.astype(np.float64))
-        return Sweep(int(stamps_of(t_s[i : i + 1] + period_s / 2)[0]), returns.xyz_m, "map", t_ns)
-
-    return read
 
 
 class _Film:
@@ -382,6 +368,8 @@ def write_traffic(
     Raises `ConfigError` for an unknown sensor, KITTI's layout without pictures, or when the folder may not be replaced
     or cannot be written.
     """
+    from log2sim.logs.native.writer import write_log
+
     if settings.layout == "kitti" and not settings.pictures:
         raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")
     traffic.sensor_named(settings.sensor, settings.mount)
@@ -395,7 +383,12 @@ def write_traffic(
             if settings.layout == "kitti":
                 write_frame(folder / "training", index, scene, environment, seed)
             else:
-                _write_log(settings, scene, environment, folder / f"scene_{index:06d}", seed)
+                name, pictures = f"scene_{index:06d}", settings.pictures
+                log = log_of(scene, environment, name, settings.duration_s, seed, image_labels=pictures)
+                if not pictures:
+                    sweeps = {lidar: log.streams[lidar] for lidar in log.lidars}
+                    log = log.changed(cameras={}, streams=sweeps, image_labels={}, reference_camera=None)
+                write_log(log, folder / name)
             users = [o.category for o in scene.objects if o.category]
             counts = {category: users.count(category) for category in sorted(set(users))}
             about = {"environment": environment.model_dump(), "lidar": scene.lidar.name, "road_users": counts}
@@ -422,7 +415,7 @@ def draw_traffic(settings: TrafficSettings, index: int) -> tuple[traffic.Traffic
     )
     lidar = traffic.sensor_named(settings.sensor, settings.mount)
     rng = np.random.default_rng([settings.seed, index, 0])
-    return traffic.draw_scene(settings.mount, rng, lidar=lidar, weather=weather_of(environment)), environment
+    return traffic.draw_scene(settings.mount, rng, lidar=lidar, weather=environment), environment
 
 
 def write_frame(folder: Path, index: int, scene: traffic.TrafficScene, environment: Environment, seed: int) -> None:
@@ -442,15 +435,3 @@ def write_frame(folder: Path, index: int, scene: traffic.TrafficScene, environme
         path = folder / name / f"{index:06d}{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-
-
-def _write_log(
-    settings: TrafficSettings, scene: traffic.TrafficScene, environment: Environment, folder: Path, seed: int
-) -> None:
-    from log2sim.logs.native.writer import write_log
-
-    log = log_of(scene, environment, folder.name, settings.duration_s, seed, image_labels=settings.pictures)
-    if not settings.pictures:
-        sweeps = {name: log.streams[name] for name in log.lidars}
-        log = log.changed(cameras={}, streams=sweeps, image_labels={}, reference_camera=None)
-    write_log(log, folder)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, RELATED_GROUPS, Measurements
+from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, period_of
 
 # Standard deviation of the change of the velocity in 1 s, by group.
@@ -316,7 +317,7 @@ class ForwardTracker:
 
 
 @dataclass(frozen=True, eq=False)
-class _Columns:
+class _Columns(Columns):
     """Placed measurements as arrays (M, ...) for the filter; `row` is that of each among all, `age_s` relative to its tick."""
 
     row: Index
@@ -342,9 +343,6 @@ class _Columns:
             (found.t_ns[row] - now_ns[row]) / NS_PER_S, group, (category == "bicycle").astype(np.float64),
             group == _NAMES.index("two_wheeler"),
         )  # fmt: skip
-
-    def take(self, rows: slice) -> _Columns:
-        return _Columns(*(column[rows] for column in vars(self).values()))
 
 
 def _joined(moving: Array, standing: Array, probability: Array) -> Array:

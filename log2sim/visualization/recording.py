@@ -35,22 +35,6 @@ def require_cameras(log: Log, asked: Sequence[str]) -> None:
         raise ConfigError(f"--cameras: no camera '{unknown[0]}'; the log has: {there}")
 
 
-def choose_cameras(log: Log, scenario: Scenario, asked: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Return the cameras to show, from left to right: those asked for, else those that the scenario was made with, else all.
-
-    Raises `ConfigError` for a camera that the log does not have.
-    """
-    require_cameras(log, asked)
-    used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
-
-    def place(name: str) -> tuple[int, float]:  # those that look back come after the others, then those at the road
-        x, y = log.cameras[name].mount_T_cam[:2, 2]
-        azimuth = float(np.arctan2(y, x))
-        return (int(abs(azimuth) > BACK_RAD), -azimuth) if log.cameras[name].mount == "ego" else (2, 0.0)
-
-    return tuple(sorted(asked or used or log.cameras, key=place))
-
-
 def require_overlap(log: Log, scenario: Scenario) -> None:
     """Require that a log has records during a scenario.
 
@@ -461,7 +445,16 @@ def recording_document(scenario: Scenario, recorded: Recorded, budget_bytes: int
     """
     log, report = recorded.log, recorded.progress
     reader = RecordSource(log)
-    cameras = choose_cameras(log, scenario, recorded.cameras)
+    # The cameras to show, from left to right: those asked for, else those that the scenario was made with, else all
+    require_cameras(log, recorded.cameras)
+    used = tuple(str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras)
+
+    def place(name: str) -> tuple[int, float]:  # those that look back come after the others, then those at the road
+        x, y = log.cameras[name].mount_T_cam[:2, 2]
+        azimuth = float(np.arctan2(y, x))
+        return (int(abs(azimuth) > BACK_RAD), -azimuth) if log.cameras[name].mount == "ego" else (2, 0.0)
+
+    cameras = tuple(sorted(recorded.cameras or used or log.cameras, key=place))
     share = POINT_SHARE if cameras else 1.0
     points = point_document(
         log, scenario, int(share * budget_bytes), reader, lambda done, total: report("page: sweeps", done, total)

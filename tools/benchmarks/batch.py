@@ -115,7 +115,7 @@ def measure(root: Path, out: Path, jobs: int, format: str) -> dict[str, str]:
         return [time.perf_counter(), *(u.ru_utime + u.ru_stime for u in used)]
 
     before = spent()
-    with progress(quiet=False) as report:
+    with progress() as report:
         rows = run_batch(batch, lambda: local_workers(jobs), progress=lambda done, total: report("logs", done, total))
     wall, own, workers = (b - a for a, b in zip(before, spent()))
     rows = [row for row in rows if row.name in missing]

@@ -16,8 +16,9 @@ from log2sim.datatypes import COLOR_NAMES
 from log2sim.datatypes.color_names import name_indices
 from log2sim.geometry import Array
 from log2sim.road.colors import CONTEXT, SIDE_PX
-from log2sim.synth.paint import Appearance, paint
+from log2sim.synth.paint import paint
 from log2sim.synth.raster import Samples, nearest_of
+from log2sim.synth.scene import AgentSpec
 from log2sim.synth.shapes import bus, car, truck
 
 Values = NDArray[np.float32]
@@ -107,9 +108,9 @@ def draw_shape(rng: np.random.Generator) -> Shape:
     normals += rng.uniform(0, 0.12) * np.sin(points @ wave + rng.uniform(0, 6, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     second = tuple(int(c) for c in rng.integers(20, 200, 3))
+    look = AgentSpec.model_construct(category=category, size_m=size, shape=kind, second_color=second)
     bare, full = (
-        paint(Appearance(category, size, (c,) * 3, kind, second), mesh.part[found.face], points, normals)
-        for c in (0, 255)
+        paint(look.model_copy(update={"color": (c,) * 3}), mesh.part[found.face], points, normals) for c in (0, 255)
     )
 
     def image(values: Values, channels: int, rest: float = 0.0) -> Values:

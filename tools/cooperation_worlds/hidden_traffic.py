@@ -19,7 +19,8 @@ from log2sim.evaluation.detection.evaluation import average_precision
 from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import NS_PER_S, rotation_from_rpy, transform
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
-from log2sim.synth.returns import LIDAR_MODELS, LidarModel, Weather
+from log2sim.synth.returns import LIDAR_MODELS, LidarModel
+from log2sim.synth.scene import Environment
 from log2sim.synth.traffic import TrafficScene, draw_scene
 from log2sim.synth.traffic_data import (
     REAR_AXLE_OFFSET_M,
@@ -98,7 +99,7 @@ def drawn(seed: int, attempt: int) -> HiddenTraffic:
     """Draw a scene and a pole beside its road, 10 to 35 m from the vehicle."""
     rng = np.random.default_rng([seed, 11, attempt])
     model = LIDAR_MODELS[str(rng.choice(VEHICLE_MODELS))]
-    scene = draw_scene("vehicle", np.random.default_rng([seed, 12, attempt]), lidar=model, weather=Weather())
+    scene = draw_scene("vehicle", np.random.default_rng([seed, 12, attempt]), lidar=model, weather=Environment())
     road, height = scene.roads[0], float(rng.uniform(*POLE_HEIGHTS_M))
     along, side = float(rng.choice([-1, 1], p=[0.3, 0.7])) * float(rng.uniform(10, 35)), float(rng.choice([-1, 1]))
     # The line passes the vehicle; ahead of it is where its LiDAR looks.

@@ -21,7 +21,7 @@ from kitti.tracks import (
 )
 from log2sim.datatypes import Measurements
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.tracking.stitch import MAX_PEDESTRIAN_SPEED_MPS
+from log2sim.tracking.tracker import MAX_PEDESTRIAN_SPEED_MPS
 
 # Log-odds that a box of a car lies on a labeled one, of detected and of predicted boxes, with all frames at hand and with those
 # so far: logistic regression by `bench.py kitti --fit` on sequences 0000, 0002, 0004, 0005, 0007, 0009 and 0011, all of the part on

@@ -36,6 +36,7 @@ from log2sim.agents.smooth.quadratic import (
     weighted_sum,
     zero_motion,
 )
+from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index
 
 # A place is known before to some car lengths: the gates of the tracker reach as far.
@@ -55,20 +56,12 @@ MAX_ROUNDS, NEIGHBORS = 12, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Positions:
+class Positions(Columns):
     """Positions of a track."""
 
     t_s: Array  # (n,), s: in rising order
     xy_m: Array  # (n, 2), m: along any two axes
     variance: Array  # (n, 2), m2: of a position along each of them, changing views included
-
-    def __len__(self) -> int:
-        """Return the number of positions."""
-        return len(self.t_s)
-
-    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Positions:
-        """Return some of the rows."""
-        return Positions(self.t_s[rows], self.xy_m[rows], self.variance[rows])
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,7 @@ MOST = {"acceleration": "most_mps2", "lateral_acceleration": "most_mps2", "curva
 
 
 def broken_limits(
-    t_s: Array,
-    acceleration_mps2: Array,
-    yaw_rad: Array,
-    curvature_1pm: Array,
-    sigma: Mapping[str, Array] | None = None,
+    t_s: Array, acceleration_mps2: Array, yaw_rad: Array, curvature_1pm: Array, sigma: Mapping[str, Array] | None = None
 ) -> tuple[Finding, ...]:
     """Find the limits that a motion breaks anywhere.
 

@@ -37,19 +37,7 @@ from log2sim.evaluation.road import cell
 from log2sim.files.documents import check
 from log2sim.files.version import __version__
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.visualization.plot.style import (
-    CROWD_COLOR,
-    FONT,
-    INK,
-    MUTED,
-    PALETTE,
-    PAPER,
-    halo,
-    new_figure,
-    printable_label,
-    save_png,
-    style_axes,
-)
+from log2sim.visualization.plot import style
 
 __all__ = ["Benchmark", "Panel", "ScoreScope", "bench"]
 OWN_STAGES = {"detect": ("detect",), "measure": ("measure", "fuse"), "smooth": ("smooth",)}
@@ -194,20 +182,9 @@ def bench(
     Raises `LogError` or `ConfigError` or `MissingExtra` for a log that cannot be read or has neither a camera nor
     LiDARs at both ends, invalid settings, or a detector whose package is missing.
 
-    Parameters
-    ----------
-    log : Log
-        From `open_log`.
-    config : Config, optional
-        The present settings; the defaults without.
-    truth : Scenario, optional
-        Without it only figures that need no truth are computed.
-    scope : Scope
-        Which objects are compared with the truth.
-    detectors : tuple of str
-        Detectors to compare with that of `config`.
-    progress : callable, optional
-        Called as `progress(what, done, total)`.
+    `log`: from `open_log`. `config`: the present settings; the defaults without. `truth`: without it only figures that need no truth
+    are computed. `scope`: which objects are compared with the truth. `detectors`: detectors to compare with that of `config`.
+    `progress`: called as `progress(what, done, total)`.
     """
     report = progress or (lambda what, done, total: None)
     config = config or Config()
@@ -266,7 +243,7 @@ def place_point_labels(ax: Axes, points: Sequence[settings.Point], xy: Array, li
         if not points[k].covers_as_many_as(present):
             key, share = min(points[k].coverage.items(), key=lambda item: item[1])
             name = f"{name} ({share:.0%} {settings.COVERAGE[key]})"
-        name = printable_label(name, 42)
+        name = style.printable_label(name, 42)
         size = np.array([len(name) * LETTER_PT, LINE_PT])
         middle = at[k] + np.column_stack([CANDIDATES[:, 0] + CANDIDATES[:, 1] * size[0] / 2, CANDIDATES[:, 2]])
         boxes = np.hstack([middle - size / 2, middle + size / 2])
@@ -275,11 +252,11 @@ def place_point_labels(ax: Axes, points: Sequence[settings.Point], xy: Array, li
         taken.append(box)
         end = np.clip(at[k], box[:2], box[2:])
         if np.hypot(*(end - at[k])) > MIN_LEADER_PT:
-            ax.plot(*to_data.transform(pt * np.stack([at[k], end])).T, color=CROWD_COLOR, lw=0.6, zorder=1.5)
+            ax.plot(*to_data.transform(pt * np.stack([at[k], end])).T, color=style.CROWD_COLOR, lw=0.6, zorder=1.5)
         x, y = to_data.transform(pt * np.array([box[0], box[1::2].mean()]))
         ax.text(
-            x, y, name, fontsize=SIZE_PT, family=FONT, color=INK, va="center_baseline", ha="left", parse_math=False,
-            weight="bold" if points[k].present else "normal", path_effects=halo(1.8), zorder=5,
+            x, y, name, fontsize=SIZE_PT, family=style.FONT, color=style.INK, va="center_baseline", ha="left", parse_math=False,
+            weight="bold" if points[k].present else "normal", path_effects=style.halo(1.8), zorder=5,
         )  # fmt: skip
 
 
@@ -293,14 +270,14 @@ COLUMNS = 3
 CELL_IN = (4.3, 3.6)
 MARGIN_IN = {"left": 0.62, "right": 0.2, "top": 0.62, "bottom": 0.56}
 HEAD_IN = 0.62
-FRONT, CHOSEN = PALETTE[0], PALETTE[4]
+FRONT, CHOSEN = style.PALETTE[0], style.PALETTE[4]
 
 
 def write_picture(result: Benchmark, path: Path) -> None:
     """Draw all panels into a PNG, atomically; the last cell explains the marks and gives the recommendations."""
     rows = -(-(len(result.panels) + 1) // COLUMNS)
     width, height = COLUMNS * CELL_IN[0], rows * CELL_IN[1] + HEAD_IN
-    figure, context = new_figure(width, height), result.context
+    figure, context = style.new_figure(width, height), result.context
     against = f"truth: {context.truth.name}" if context.truth is not None else "no truth"
     cameras, lidars = len(context.plan.cameras), len(context.log.lidars)
     counts = [(len(context.schedule), "tick"), (cameras, "camera") if cameras else (lidars, "LiDAR")]
@@ -310,11 +287,11 @@ def write_picture(result: Benchmark, path: Path) -> None:
     if context.truth is not None and context.scope.categories is not None:
         parts.append(", ".join(context.scope.categories))
     text = " · ".join([*parts, against, "one stage's setting changed at a time"])
-    style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
+    look: dict[str, Any] = {"family": style.FONT, "ha": "left", "va": "baseline", "parse_math": False}
     x = MARGIN_IN["left"] / figure.get_figwidth()
-    title = printable_label(f"{context.log.name}: error against run time", 90)
-    figure.text(x, 1 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
-    figure.text(x, 1 - 0.6 / height, printable_label(text, 150), fontsize=8, color=MUTED, **style)
+    title = style.printable_label(f"{context.log.name}: error against run time", 90)
+    figure.text(x, 1 - 0.38 / height, title, fontsize=13, fontweight="bold", color=style.INK, **look)
+    figure.text(x, 1 - 0.6 / height, style.printable_label(text, 150), fontsize=8, color=style.MUTED, **look)
     w = CELL_IN[0] - MARGIN_IN["left"] - MARGIN_IN["right"]
     h = CELL_IN[1] - MARGIN_IN["bottom"] - MARGIN_IN["top"]
     for k, panel in enumerate([*result.panels, None]):
@@ -325,22 +302,22 @@ def write_picture(result: Benchmark, path: Path) -> None:
             _draw_recommendations(ax, result)
         else:
             _draw_panel(ax, panel)
-    save_png(figure, path, 150)
+    style.save_png(figure, path, 150)
 
 
 def _draw_panel(ax: Axes, panel: Panel) -> None:
     shown = [(p, f) for p, f in zip(panel.points, panel.on_front, strict=True) if p.error is not None]
     ax.set_facecolor("#FBFCFD")
-    style_axes(ax)
-    ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=MUTED, family=FONT)
-    style: dict[str, Any] = {"transform": ax.transAxes, "family": FONT, "va": "baseline", "parse_math": False}
-    ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=INK, **style)
+    style.style_axes(ax)
+    ax.set_xlabel("run time (ms a tick)", fontsize=7.2, color=style.MUTED, family=style.FONT)
+    look: dict[str, Any] = {"transform": ax.transAxes, "family": style.FONT, "va": "baseline", "parse_math": False}
+    ax.text(0, 1.1, panel.stage, fontsize=10, fontweight="bold", color=style.INK, **look)
     label = f"{panel.label}{f' ({panel.unit})' * bool(panel.unit)}"
-    ax.text(0, 1.035, printable_label(label, 90), fontsize=6.8, color=MUTED, **style)
+    ax.text(0, 1.035, style.printable_label(label, 90), fontsize=6.8, color=style.MUTED, **look)
     hidden = [p.setting for p in panel.points if p.error is None]
     if hidden:
-        unknown = printable_label(f"no error known: {', '.join(hidden)}")
-        ax.text(0.02, 0.025, unknown, fontsize=6.8, color=MUTED, **style)
+        unknown = style.printable_label(f"no error known: {', '.join(hidden)}")
+        ax.text(0.02, 0.025, unknown, fontsize=6.8, color=style.MUTED, **look)
     if not shown:
         ax.set(xticks=[], yticks=[])
         return
@@ -350,7 +327,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
     present = next((p for p in points if p.present), None)
     spread = None if present is None else settings.error_interval(present.by_object)
     if present is not None and spread is not None:
-        ax.vlines(present.ms_per_tick, *spread, color=CROWD_COLOR, lw=1.0, alpha=0.6, zorder=1.8)
+        ax.vlines(present.ms_per_tick, *spread, color=style.CROWD_COLOR, lw=1.0, alpha=0.6, zorder=1.8)
     _limits(ax, x, np.append(y, spread or ()))
     front = sorted((p.ms_per_tick, float(p.error or 0.0)) for p, f in shown if f)
     ax.step(*zip(*front), where="post", color=FRONT, lw=1.3, alpha=0.55, zorder=2)
@@ -358,7 +335,7 @@ def _draw_panel(ax: Axes, panel: Panel) -> None:
         at = np.array([[point.ms_per_tick], [point.error]], dtype=np.float64)
         if point.setting == panel.recommendation.supported:
             ax.plot(*at, "o", ms=13, mfc="none", mec=CHOSEN, mew=1.6, zorder=3)
-        face, edge = (FRONT, PAPER) if on_front else (PAPER, CROWD_COLOR)
+        face, edge = (FRONT, style.PAPER) if on_front else (style.PAPER, style.CROWD_COLOR)
         shape, size = ("D", 6.5) if point.present else ("o", 5.5)
         ax.plot(*at, shape, ms=size, mfc=face, mec=edge, mew=1.1, zorder=4)
     corners = [k for (a, b), (c, d) in pairwise(front) for k in ((a, b), (c, b), (c, d))]
@@ -387,28 +364,33 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
     ax.set(xlim=(0, 1), ylim=(0, 1))
     mark: dict[str, Any] = {"ls": "none", "mew": 1.1}
     handles = [
-        (Line2D([], [], marker="D", ms=6.5, mfc=FRONT, mec=PAPER, **mark), "present setting, on the front"),
-        (Line2D([], [], marker="D", ms=6.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "present setting, behind it"),
+        (Line2D([], [], marker="D", ms=6.5, mfc=FRONT, mec=style.PAPER, **mark), "present setting, on the front"),
+        (
+            Line2D([], [], marker="D", ms=6.5, mfc=style.PAPER, mec=style.CROWD_COLOR, **mark),
+            "present setting, behind it",
+        ),
         (Line2D([], [], marker="o", ms=12, mfc="none", mec=CHOSEN, ls="none", mew=1.6), "what the figures support"),
-        (Line2D([], [], marker="o", ms=5.5, mfc=FRONT, mec=PAPER, **mark), "on the Pareto front"),
-        (Line2D([], [], marker="o", ms=5.5, mfc=PAPER, mec=CROWD_COLOR, **mark), "behind it"),
-        (Line2D([], [], color=CROWD_COLOR, lw=1.0, alpha=0.6), "5 to 95 % of resamples"),
+        (Line2D([], [], marker="o", ms=5.5, mfc=FRONT, mec=style.PAPER, **mark), "on the Pareto front"),
+        (Line2D([], [], marker="o", ms=5.5, mfc=style.PAPER, mec=style.CROWD_COLOR, **mark), "behind it"),
+        (Line2D([], [], color=style.CROWD_COLOR, lw=1.0, alpha=0.6), "5 to 95 % of resamples"),
     ]
     ax.legend(
         [h for h, _ in handles], [t for _, t in handles], loc="upper left", bbox_to_anchor=(-0.03, 1.14), frameon=False,
-        ncols=2, prop={"family": FONT, "size": 7.0}, labelcolor=INK, handletextpad=0.5, columnspacing=1.2, labelspacing=0.7,
+        ncols=2, prop={"family": style.FONT, "size": 7.0}, labelcolor=style.INK, handletextpad=0.5, columnspacing=1.2, labelspacing=0.7,
     )  # fmt: skip
     y = 0.86
     for panel in result.panels:
-        for k, line in enumerate(wrap(printable_label(panel.recommendation.reason, 240), 50)):
+        for k, line in enumerate(wrap(style.printable_label(panel.recommendation.reason, 240), 50)):
             head = panel.stage if k == 0 else ""
-            ax.text(0, y, head, fontsize=7.2, family=FONT, color=INK, weight="bold", va="top", parse_math=False)
-            ax.text(0.23, y, line, fontsize=7.2, family=FONT, color=INK, va="top", parse_math=False)
+            ax.text(
+                0, y, head, fontsize=7.2, family=style.FONT, color=style.INK, weight="bold", va="top", parse_math=False
+            )
+            ax.text(0.23, y, line, fontsize=7.2, family=style.FONT, color=style.INK, va="top", parse_math=False)
             y -= 0.058
         y -= 0.03
     for note in result.notes:
-        for line in wrap(printable_label(f"Note: {note}", 240), 70):
-            ax.text(0, y, line, fontsize=6.6, family=FONT, color=MUTED, va="top", parse_math=False)
+        for line in wrap(style.printable_label(f"Note: {note}", 240), 70):
+            ax.text(0, y, line, fontsize=6.6, family=style.FONT, color=style.MUTED, va="top", parse_math=False)
             y -= 0.05
 
 

@@ -14,18 +14,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import ENDS, ROAD, Detections, Frame, Log, Scenario, end_of
 from log2sim.errors import LogError, NothingToReconstruct, RecordError
-from log2sim.evaluation.bench.scores import (
-    EVERYTHING,
-    Score,
-    ScoreScope,
-    check_scope,
-    lidar_positions,
-    score_homographies,
-    score_measurements,
-    score_scenario,
-    split_holdout,
-    true_positions,
-)
+from log2sim.evaluation.bench import scores as scoring
 from log2sim.evaluation.bench.settings import Grid, Point, Setting
 from log2sim.evaluation.detection.detect_log import take_ticks
 from log2sim.files.stages import StageClock
@@ -112,7 +101,7 @@ class BenchContext:
     plan: Plan
     schedule: Schedule
     truth: Scenario | None
-    scope: ScoreScope
+    scope: scoring.ScoreScope
     grid: Grid
     found: dict[str, RecordedDetections]  # detections by setting of the detector
     shared_s: dict[str, float]  # time of stages that all runs share
@@ -132,8 +121,8 @@ class BenchRun:
     """A whole run with one setting."""
 
     setting: Setting
-    score: Score  # of the scenario
-    measurement_score: Score  # of the measured centers; empty without truth
+    score: scoring.Score  # of the scenario
+    measurement_score: scoring.Score  # of the measured centers; empty without truth
     stages_s: dict[str, float]  # time of each stage, including those shared with other runs
 
     @property
@@ -143,10 +132,10 @@ class BenchRun:
 
 
 def make_context(
-    log: Log, grid: Grid, truth: Scenario | None, report: Progress, scope: ScoreScope = EVERYTHING
+    log: Log, grid: Grid, truth: Scenario | None, report: Progress, scope: scoring.ScoreScope = scoring.EVERYTHING
 ) -> BenchContext:
     """Synchronize the log and detect once with every setting of the detector."""
-    check_scope(truth, scope)
+    scoring.check_scope(truth, scope)
     config, clock = grid.present.config, StageClock()
     sensors = select_sensors(log, config)
     with clock.stage("sync"):
@@ -186,13 +175,13 @@ def run_settings(
 
     Settings take turns `REPEATS` times; the least time of each stage counts.
     """
-    (observations, before_s), measurement_score = observed, Score({})
+    (observations, before_s), measurement_score = observed, scoring.Score({})
     if context.truth is not None:
         across = context.plan.keeps(Stage.FUSION)
         fused = replace(observations, measurements=fuse(observations.measurements, across=across))
-        known = true_positions(context.log, context.schedule, fused, context.truth)
-        measurement_score = score_measurements(fused, known)
-    scores: dict[str, Score] = {}
+        known = scoring.true_positions(context.log, context.schedule, fused, context.truth)
+        measurement_score = scoring.score_measurements(fused, known)
+    scores: dict[str, scoring.Score] = {}
     spent: dict[str, list[dict[str, float]]] = {s.key: [] for s in settings}
     for repeat in range(REPEATS):
         for k, setting in enumerate(settings):
@@ -204,14 +193,14 @@ def run_settings(
     return [BenchRun(s, scores[s.key], measurement_score, {**before_s, **least_s[s.key]}) for s in settings]
 
 
-def _concluded(context: BenchContext, setting: Setting, observations: Observations, clock: StageClock) -> Score:
+def _concluded(context: BenchContext, setting: Setting, observations: Observations, clock: StageClock) -> scoring.Score:
     detectors = Detectors(context.found[context.grid.present.name], None)
     try:
         run = Run(context.log, setting.config, context.plan, context.schedule, detectors, clock, lambda *_: None)
         result = infer_scenario(run, observations)
     except NothingToReconstruct:
-        return Score({"agents": 0})
-    return score_scenario(result.scenario, context.truth, context.tick_s, context.scope)
+        return scoring.Score({"agents": 0})
+    return scoring.score_scenario(result.scenario, context.truth, context.tick_s, context.scope)
 
 
 def run_all(context: BenchContext, report: Progress) -> tuple[list[BenchRun], Observations]:
@@ -239,10 +228,10 @@ def homography_points(context: BenchContext, observations: Observations, report:
     """Score every homography method on held-out obstacles; empty when no obstacle was measured."""
     truth, seed = context.truth, context.grid.present.config.seed
     if truth is not None:
-        known = true_positions(context.log, context.schedule, observations, truth, when="imaged")
+        known = scoring.true_positions(context.log, context.schedule, observations, truth, when="imaged")
     else:
-        known = lidar_positions(observations, context.tick_s)
-    holdout = split_holdout(context.log, context.schedule, observations, known, np.random.default_rng(seed))
+        known = scoring.lidar_positions(observations, context.tick_s)
+    holdout = scoring.split_holdout(context.log, context.schedule, observations, known, np.random.default_rng(seed))
     if not len(holdout):
         return []
     settings = (*context.grid.homography, *context.grid.hypotheses)
@@ -258,7 +247,7 @@ def homography_points(context: BenchContext, observations: Observations, report:
             report("homographies", repeat * len(spent) + k + 1, REPEATS * len(spent))
     out = []
     for setting in settings:
-        score = score_homographies(context.log, holdout, fits[setting.name])
+        score = scoring.score_homographies(context.log, holdout, fits[setting.name])
         ms, grounds = context.ms_per_tick(min(spent[setting.name])), list(fits[setting.name].values())
         jitters = [v for v in (g.fit.jitter_m for g in grounds) if np.isfinite(v)]
         residuals = [v for v in (g.fit.error_m for g in grounds) if np.isfinite(v)]
@@ -276,14 +265,16 @@ STAGE = "ends"
 DETECTOR = "lidar:vehicle"  # searches sweeps where the settings name no detector for them
 
 
-def make_context_of_ends(log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: ScoreScope) -> BenchContext:
+def make_context_of_ends(
+    log: Log, ends: Sequence[Setting], truth: Scenario | None, scope: scoring.ScoreScope
+) -> BenchContext:
     """Synchronize a log without cameras, of which the ends alone are compared.
 
     Raises `LogError` for a log without LiDARs at both ends.
     """
     if not ends:
         raise LogError(f"{log.name}: has no camera, and bench compares methods for images; use detect and evaluate")
-    check_scope(truth, scope)
+    scoring.check_scope(truth, scope)
     config = ends[0].config
     sensors = select_sensors(log, config)
     schedule = schedule_of(sensors.restrict(log), sensors.cameras, config)
@@ -316,7 +307,7 @@ def whole_points(
     log: Log,
     settings: Sequence[Setting],
     truth: Scenario | None,
-    scope: ScoreScope,
+    scope: scoring.ScoreScope,
     report: Callable[[str, int, int], None],
 ) -> list[Point]:
     """Run every setting once, as `reconstruct` does, and score its scenario.
@@ -329,9 +320,9 @@ def whole_points(
         begin = time.perf_counter()
         try:
             result = infer_scenario(replace(run, plan=run.plan.only_agents()), observe_log(run))
-            score = score_scenario(result.scenario, truth, period_of(run.schedule.t_ns), scope)
+            score = scoring.score_scenario(result.scenario, truth, period_of(run.schedule.t_ns), scope)
         except NothingToReconstruct:
-            score = Score({"agents": 0})
+            score = scoring.Score({"agents": 0})
         ms = (time.perf_counter() - begin) * 1e3 / len(run.schedule)
         stages = {stage: s * 1e3 / len(run.schedule) for stage, s in run.clock.seconds.items()}
         error = "error_m" if truth is not None else "jitter_m"

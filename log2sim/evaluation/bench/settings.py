@@ -45,27 +45,6 @@ def error_interval(sums: ErrorSums) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def confidence_not_worse(sums: ErrorSums, other: ErrorSums, allowance: float) -> float:
-    """Compute the fraction of resamples in which an error is at most another one times `1 + allowance`.
-
-    It is 0 with fewer than `MIN_OBJECTS` objects.
-
-    Paired bootstrap (Efron, 1979) over objects, because errors of one object at successive ticks are correlated. An object of
-    one side only, such as a false one, adds nothing to the other.
-    """
-    names = sorted({*sums, *other})
-    if len(names) < MIN_OBJECTS:
-        return 0.0
-    mine, theirs = (np.array([side.get(n, (0.0, 0.0)) for n in names]).reshape(-1, 2) for side in (sums, other))
-    drawn = _resamples(len(names))
-    a, b = drawn @ mine, drawn @ theirs
-    usable = (a[:, 1] > 0) & (b[:, 1] > 0)
-    if not usable.any():
-        return 0.0
-    a, b = a[usable], b[usable]
-    return float(np.mean(a[:, 0] * b[:, 1] <= b[:, 0] * a[:, 1] * (1 + allowance) ** 2))
-
-
 TILES = (0, 1, 2, 3, 5)  # numbers of tiles to try besides the present one; 0 is "auto"
 SIDES_PX = (320, 416, 640, 960)  # input sizes to try with models that accept any
 HYPOTHESES = (8, 30, 100, 300, 1000, 3000)  # numbers of RANSAC hypotheses to try besides the present one
@@ -191,25 +170,21 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
         if not isinstance(detector, OnnxDetector):
             out.append(Setting("detect", name, own, not out))
             continue
-        for title, key, value in _inputs(log, own, detector):
+        # List names and settings of a detector with different inputs, the present one first
+        inputs, seen = [], set()
+        side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
+        cameras = [log.cameras[name] for name in own.cameras or log.cameras]
+        for tiles in dict.fromkeys([own.detect.tiles, *TILES]):
+            plan = tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
+            if plan not in seen:
+                seen.add(plan)
+                inputs.append(({0: "auto tiles", 1: "no tiles"}.get(tiles, f"{tiles} tiles"), "tiles", tiles))
+        if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
+            usual = detector.layout.preprocessing.default_px
+            inputs += [(f"input {side} px", "input_px", side) for side in SIDES_PX if side != usual]
+        for title, key, value in inputs:
             out.append(Setting("detect", f"{label}{title}", own.changed(detect={key: value}), not out))
     return out
-
-
-def _inputs(log: Log, config: Config, detector: OnnxDetector) -> list[tuple[str, str, int]]:
-    """List names and settings of a detector with different inputs, the present one first."""
-    inputs, seen = [], set()
-    side = detector.model.spec.width_px or detector.layout.preprocessing.default_px
-    cameras = [log.cameras[name] for name in config.cameras or log.cameras]
-    for tiles in dict.fromkeys([config.detect.tiles, *TILES]):
-        plan = tuple(len(plan_tiles(c.width_px, c.height_px, tiles or "auto", side)) for c in cameras)
-        if plan not in seen:
-            seen.add(plan)
-            inputs.append(({0: "auto tiles", 1: "no tiles"}.get(tiles, f"{tiles} tiles"), "tiles", tiles))
-    if detector.model.spec.width_px is None and detector.model.spec.height_px is None:
-        usual = detector.layout.preprocessing.default_px
-        inputs += [(f"input {side} px", "input_px", side) for side in SIDES_PX if side != usual]
-    return inputs
 
 
 NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"
@@ -312,9 +287,22 @@ def _confidence(point: Point, present: Point) -> float:
     """Compute the confidence that a setting is no worse than the present one; 1 when contributions of objects are unknown."""
     if not point.by_object or not present.by_object:
         return 1.0
-    return confidence_not_worse(
-        point.by_object, present.by_object, ERROR_TOLERANCE if point.ms_per_tick < present.ms_per_tick else 0.0
+    # The fraction of resamples in which an error is at most another one times `1 + allowance`
+    allowance = ERROR_TOLERANCE if point.ms_per_tick < present.ms_per_tick else 0.0
+    names = sorted({*point.by_object, *present.by_object})
+    if len(names) < MIN_OBJECTS:
+        return 0.0
+    mine, theirs = (
+        np.array([side.get(n, (0.0, 0.0)) for n in names]).reshape(-1, 2)
+        for side in (point.by_object, present.by_object)
     )
+    drawn = _resamples(len(names))
+    a, b = drawn @ mine, drawn @ theirs
+    usable = (a[:, 1] > 0) & (b[:, 1] > 0)
+    if not usable.any():
+        return 0.0
+    a, b = a[usable], b[usable]
+    return float(np.mean(a[:, 0] * b[:, 1] <= b[:, 0] * a[:, 1] * (1 + allowance) ** 2))
 
 
 def _fastest_of_best(points: Sequence[Point]) -> Point:

@@ -13,12 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes import Boxes3D
 from log2sim.errors import LogError
+from log2sim.files.arrays import Columns
 from log2sim.files.documents import check, load_schema, read_json, rounded, short_repr, write_json
 from log2sim.geometry import Array
 
 
 @dataclass(frozen=True, eq=False)
-class SceneBoxes:
+class SceneBoxes(Columns):
     """Boxes of several scenes, one row a box: those that a detector found, or the true ones."""
 
     # (M,) number of the scene (one sweep, one sample) that each box belongs to; only boxes of one scene match.
@@ -43,10 +44,6 @@ class SceneBoxes:
                 raise ValueError(f"{name} has the shape {column.shape}, expected ({rows},)")
         if not np.isfinite(self.score).all():
             raise ValueError("a score is not finite")
-
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.scene)
 
     @classmethod
     def of(
@@ -77,26 +74,14 @@ class SceneBoxes:
         return cls(*named, counts, column(away, np.float64), column(ignored, np.bool_))
 
     @classmethod
-    def join(cls, scenes: Sequence[SceneBoxes]) -> SceneBoxes:
+    def join(cls, parts: Sequence[Self]) -> Self:
         """Join one table for each scene; scenes are numbered by their place in the sequence.
 
         The number of points is kept when all tables that are not empty have it.
         """
-        if not scenes:
-            return cls.of(np.zeros((0, 7)))
-        columns = {
-            k: np.concatenate([getattr(s, k) for s in scenes])
-            for k in ("box", "category", "score", "range_m", "ignored")
-        }
-        counts, points = [len(s) for s in scenes], [s.points for s in scenes if s.points is not None]
-        known = all(s.points is not None for s in scenes if len(s))
-        joined = np.concatenate([*points, np.zeros(0, np.int64)]) if known else None
-        return cls(scene=np.repeat(np.arange(len(scenes), dtype=np.int64), counts), points=joined, **columns)
-
-    def take(self, index: Any) -> Self:
-        """Take the rows at `index`, integers or a mask."""
-        columns: dict[str, Any] = {k: None if v is None else v[index] for k, v in vars(self).items()}
-        return type(self)(**columns)
+        numbered = [replace(part, scene=np.full(len(part), k)) for k, part in enumerate(parts)]
+        some = [part for part in numbered if len(part)] or numbered[:1]
+        return super().join(some) if some else cls.of(np.zeros((0, 7)))
 
     def ignoring(self, rows: NDArray[np.bool_]) -> Self:
         """Return the table with the boxes of a mask (M,) ignored, too."""

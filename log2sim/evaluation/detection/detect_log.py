@@ -68,12 +68,8 @@ def detect_log(
     Raises `ConfigError` for a detector that is none for LiDARs, or when no sweep is left. Raises `LogError` for a log
     without LiDAR, or when no sweep can be searched.
 
-    Parameters
-    ----------
-    config : Config, optional
-        `detect.name` is a LiDAR detector, "lidar:vehicle" by default; its settings are in the section `lidar`.
-    progress : callable, optional
-        Called with (sweeps done, all sweeps).
+    `config`: `detect.name` is a LiDAR detector, "lidar:vehicle" by default; its settings are in the section `lidar`. `progress`:
+    called with (sweeps done, all sweeps).
     """
     config = config or Config(detect="lidar:vehicle")
     if config.detect.in_images or not config.detect.in_sweeps:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from log2sim import geometry
 from log2sim.datatypes import CATEGORIES, GROUPS, Agent, LabelView, Log, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.evaluation.metrics import comparison, verdicts
@@ -19,22 +20,13 @@ from log2sim.evaluation.metrics.truth import load_truth
 from log2sim.evaluation.road import color_figures, map_figures, signal_figures
 from log2sim.export.exporters import on_map
 from log2sim.files.plugins import nearest
-from log2sim.geometry import (
-    NS_PER_S,
-    Array,
-    choose_pairs,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-    rotation_from_rpy,
-    wrap_angle,
-)
 
 if TYPE_CHECKING:
     from log2sim.report import Result
 
 
 # Similarity thresholds 0.05, 0.10, ... 0.95 over which the figures are averaged.
-ALPHAS: Array = np.arange(1, 20) / 20
+ALPHAS: geometry.Array = np.arange(1, 20) / 20
 
 
 def hota(
@@ -67,7 +59,9 @@ def hota(
     score = alignment[pairs.truth, pairs.other] * pairs.similarity
     parts = pairwise(pairs.bounds(ticks))
     matched = pairs.take(
-        np.concatenate([a + choose_pairs(pairs.truth[a:b], pairs.other[a:b], -score[a:b], 0.0) for a, b in parts])
+        np.concatenate(
+            [a + geometry.choose_pairs(pairs.truth[a:b], pairs.other[a:b], -score[a:b], 0.0) for a, b in parts]
+        )
     )
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
@@ -143,7 +137,7 @@ def rounded_tree(value: Any) -> Any:
 
 
 # Takes states (N, 4), x, y, z in m and heading in rad, at times (N,), s of the truth, to those in the other map.
-Move = Callable[[Array, Array], Array]
+Move = Callable[[geometry.Array, geometry.Array], geometry.Array]
 
 
 def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str, Any]]:
@@ -167,18 +161,20 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
         rise_m = 0.0 if altitudes[0] is None or altitudes[1] is None else altitudes[0] - altitudes[1]
         target = on_map(theirs, ours.projection, ours.offset_m)
 
-        def reproject(states: Array, _t_s: Array) -> Array:
+        def reproject(states: geometry.Array, _t_s: geometry.Array) -> geometry.Array:
             return np.asarray(target.forward(states) + np.array([0, 0, rise_m, 0]))
 
         def around_ego(
-            states: Array, t_s: Array
-        ) -> Array:  # what is around the ego is kept as it is, and the ego moved
+            states: geometry.Array, t_s: geometry.Array
+        ) -> geometry.Array:  # what is around the ego is kept as it is, and the ego moved
             assert truth.ego is not None
             s = truth.ego.at(np.clip(t_s, truth.ego.waypoints.t_s[0], truth.ego.waypoints.t_s[-1]))
             before = np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)
             after = reproject(before, t_s)
             turn = after[:, 3] - before[:, 3]
-            xyz = np.einsum("nij,nj->ni", rotation_from_rpy(0 * turn, 0 * turn, turn), states[:, :3] - before[:, :3])
+            xyz = np.einsum(
+                "nij,nj->ni", geometry.rotation_from_rpy(0 * turn, 0 * turn, turn), states[:, :3] - before[:, :3]
+            )
             return np.column_stack([xyz + after[:, :3], states[:, 3] + turn])
 
         method = "projection"
@@ -206,18 +202,18 @@ def describe_placement(placement: dict[str, Any]) -> str | None:
     return how if apart_m is None else f"{how}; then the boxes of the egos are {apart_m:.2f} m apart (median)"
 
 
-def _common_egos(truth: Scenario, scenario: Scenario) -> tuple[Array, Array]:
+def _common_egos(truth: Scenario, scenario: Scenario) -> tuple[geometry.Array, geometry.Array]:
     """Return states (K, 4) of the true ego and of the other at the times of the latter at which both are known."""
     if truth.ego is None or scenario.ego is None:
         return np.zeros((0, 4)), np.zeros((0, 4))
     t_s = scenario.ego.waypoints.t_s
-    true = truth.ego.at(t_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S)
+    true = truth.ego.at(t_s + (scenario.t0_ns - truth.t0_ns) / geometry.NS_PER_S)
     ours = scenario.ego.at(t_s)
     both = true.valid & ours.valid
     return tuple(np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)[both] for s in (true, ours))  # type: ignore[return-value]
 
 
-def _ego_apart_m(truth: Scenario, scenario: Scenario, shift_m: Array) -> float | None:
+def _ego_apart_m(truth: Scenario, scenario: Scenario, shift_m: geometry.Array) -> float | None:
     true, ours = _common_egos(truth, scenario)
     gap = true[:, :2] + shift_m[:2] - ours[:, :2]
     return float(np.median(np.hypot(gap[:, 0], gap[:, 1]))) if len(gap) else None
@@ -239,9 +235,9 @@ def _fit_egos(truth: Scenario, scenario: Scenario) -> Move:
     turn = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))
     rise_m = float(np.mean(ours[:, 2] - true[:, 2]))
 
-    def move(states: Array, _t_s: Array) -> Array:
+    def move(states: geometry.Array, _t_s: geometry.Array) -> geometry.Array:
         pivot, goal = np.array([*from_m, 0.0]), np.array([*to_m, rise_m])
-        xyz = (states[:, :3] - pivot) @ rotation_from_rpy(0.0, 0.0, turn).T + goal
+        xyz = (states[:, :3] - pivot) @ geometry.rotation_from_rpy(0.0, 0.0, turn).T + goal
         return np.column_stack([xyz, states[:, 3] + turn])
 
     return move
@@ -253,15 +249,15 @@ def _moved(truth: Scenario, near: Move, far: Move) -> Scenario:
     def agent(a: Agent) -> Agent:
         w = a.waypoints
         x, y, z, yaw = near(np.stack([w.x_m, w.y_m, w.z_m, w.yaw_rad], axis=1), w.t_s).T
-        return replace(a, waypoints=replace(w, x_m=x, y_m=y, z_m=z, yaw_rad=wrap_angle(yaw)))
+        return replace(a, waypoints=replace(w, x_m=x, y_m=y, z_m=z, yaw_rad=geometry.wrap_angle(yaw)))
 
     def view(v: LabelView) -> LabelView:
         states = near(np.column_stack([v.translation_m, np.zeros(len(v.t_s))]), v.t_s)
-        turn = rotation_from_rpy(0 * states[:, 3], 0 * states[:, 3], states[:, 3])
-        rotation = quaternion_from_rotation(turn @ rotation_from_quaternion(v.rotation_wxyz))
+        turn = geometry.rotation_from_rpy(0 * states[:, 3], 0 * states[:, 3], states[:, 3])
+        rotation = geometry.quaternion_from_rotation(turn @ geometry.rotation_from_quaternion(v.rotation_wxyz))
         return replace(v, translation_m=states[:, :3], rotation_wxyz=rotation)
 
-    def points(xyz_m: Array) -> Array:
+    def points(xyz_m: geometry.Array) -> geometry.Array:
         return far(np.column_stack([xyz_m, np.zeros(len(xyz_m))]), np.zeros(len(xyz_m)))[:, :3]
 
     regions = truth.ignore_regions
@@ -292,26 +288,13 @@ def evaluate(
     Raises `ConfigError` for an unknown category, a range that is not positive, or a range without an ego to measure it
     from. Raises `LogError` when the log has no labels. Raises `ScenarioError` when the two do not overlap in time.
 
-    Parameters
-    ----------
-    scenario : Scenario, Result, Path or str
-        A scenario or its file, or what `log2sim.reconstruct` returns.
-    truth : Scenario, Log, Path or str
-        A scenario or its file, or a log or its path, whose labels in view of the cameras that the scenario used are taken.
-        Start time and map may be others. The ego (id "ego") is compared separately from the other agents.
-    max_range_m : float, m, optional
-        Only agents within this distance of the ego are compared, in both scenarios.
-    categories : sequence of str, optional
-        Only agents of these categories or groups ("vehicle", "two_wheeler") are compared, in both scenarios.
+    `scenario`: a scenario or its file, or what `log2sim.reconstruct` returns. `truth`: a scenario or its file, or a log or its path,
+    whose labels in view of the cameras that the scenario used are taken. Start time and map may be others. The ego (id "ego") is
+    compared separately from the other agents. `max_range_m`, m: only agents within this distance of the ego are compared, in both
+    scenarios. `categories`: only agents of these categories or groups ("vehicle", "two_wheeler") are compared, in both scenarios.
+    Returns the document of `schemas/metrics-1.json`. Keys carry the unit: `_m` meters, `_mps` m/s, `_deg` degrees, `_s` seconds;
+    recall, precision, MOTA and HOTA are fractions. A figure that cannot be computed is None.
 
-    Returns
-    -------
-    dict
-        The document of `schemas/metrics-1.json`. Keys carry the unit: `_m` meters, `_mps` m/s, `_deg` degrees, `_s` seconds;
-        recall, precision, MOTA and HOTA are fractions. A figure that cannot be computed is None.
-
-    Notes
-    -----
     CLEAR MOT (Bernardin and Stiefelhagen, 2008) and HOTA (Luiten et al., 2021) with matches by the distance of box centers.
     Recall and precision count agent-ticks; position, speed and size errors are over matched agent-ticks. Quarantined agents, which
     replays and exports leave out, are left out here too, and listed; static agents are compared from their first to their last
@@ -335,7 +318,7 @@ def evaluate(
     selection = comparison.Selection(max_range_m, _selected(categories))
     compared, ticks_s, ego = compare_scenarios(scenario, truth, selection)
     ours, tick_s = compared.other, _tick_s(ticks_s)
-    truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
+    truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / geometry.NS_PER_S
     everywhere = np.ones_like(compared.counted), np.ones_like(compared.false)
     sides = compared.truth, compared.other
     by_range = {
@@ -398,7 +381,7 @@ def evaluate(
 
 def compare_scenarios(
     scenario: Scenario, truth: Scenario, selection: comparison.Selection
-) -> tuple[comparison.Comparison, Array, comparison.StateTable | None]:
+) -> tuple[comparison.Comparison, geometry.Array, comparison.StateTable | None]:
     """Match the agents of a scenario with those of its truth; also the ticks (T,), s of the scenario, and the ego, one row.
 
     Raises `ConfigError` and `ScenarioError` as `evaluate`.
@@ -406,14 +389,14 @@ def compare_scenarios(
     ticks_s = comparison.evaluation_ticks_s(scenario, truth)
     if len(ticks_s) == 0 and scenario.agents and truth.agents:
         spans = [
-            f"{min(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
-            f"{max(s.t0_ns / NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
+            f"{min(s.t0_ns / geometry.NS_PER_S + float(a.waypoints.t_s[0]) for a in s.agents):.3f} to "
+            f"{max(s.t0_ns / geometry.NS_PER_S + float(a.waypoints.t_s[-1]) for a in s.agents):.3f} s"
             for s in (scenario, truth)
         ]
         raise ScenarioError(
             f"the scenario covers {spans[0]}, the truth {spans[1]}: they share no time; are both of the same log?"
         )
-    truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / NS_PER_S
+    truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / geometry.NS_PER_S
     shift_m = truth.shift_to(scenario)
     ego = comparison.states_of_ego(scenario, truth, ticks_s, truth_ticks_s, shift_m)
     ego_xy = None if ego is None else ego.xy_m[0]
@@ -428,7 +411,7 @@ def compare_scenarios(
     return comparison.drop_ignored(compared, truth.ignore_regions, truth_ticks_s, shift_m), ticks_s, ego
 
 
-def _tick_s(ticks_s: Array) -> float:
+def _tick_s(ticks_s: geometry.Array) -> float:
     """Return the median interval of ticks (T,), s; 0 for fewer than two."""
     return float(np.median(np.diff(ticks_s))) if len(ticks_s) > 1 else 0.0
 

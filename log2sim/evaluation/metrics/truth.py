@@ -233,7 +233,20 @@ def truth_from_log(
     else:
         visible = np.ones(len(labels.t_ns), dtype=bool) if counts is None else counts >= MIN_POINTS
         if used:
-            visible &= in_some_image(log, labels, used, visible)
+            # Mark (L,) those of the boxes `candidates` (L,) that are at least half inside some camera's image
+            found = np.zeros(len(labels.t_ns), dtype=bool)
+            for name in used:
+                stream = log.streams.get(name)
+                if stream is None or len(stream.t_ns) == 0:
+                    continue
+                index, near = nearest_record(stream.t_ns, labels.t_ns)
+                poses, known = log.map_T_sensor(name, stream.t_ns)
+                open_rows = np.flatnonzero(visible & ~found & near & known[index])
+                for i in np.unique(index[open_rows]):
+                    rows = open_rows[index[open_rows] == i]
+                    boxes = labels.center_m[rows], labels.size_m[rows], labels.yaw_rad[rows]
+                    found[rows] = image_shares(log.cameras[name], inverse(poses[i]), *boxes) >= MIN_IMAGE_SHARE
+            visible &= found
     ego_t_ns, map_T_ego = _ego_poses(log)
     t0_ns = int(min([labels.t_ns.min(), *ego_t_ns[:1]]))
     agents = []
@@ -312,23 +325,6 @@ def _points_in_boxes(
             counts[rows] = points_of_boxes(xyz, center_m[rows], size_m[rows], np.asarray(yaw_rad)[rows]).count
         step()
     return counts
-
-
-def in_some_image(log: Log, labels: Labels, cameras: Sequence[str], candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark (L,) those of the boxes `candidates` (L,) that are at least half inside some camera's image."""
-    found = np.zeros(len(labels.t_ns), dtype=bool)
-    for name in cameras:
-        stream = log.streams.get(name)
-        if stream is None or len(stream.t_ns) == 0:
-            continue
-        index, near = nearest_record(stream.t_ns, labels.t_ns)
-        poses, known = log.map_T_sensor(name, stream.t_ns)
-        open_rows = np.flatnonzero(candidates & ~found & near & known[index])
-        for i in np.unique(index[open_rows]):
-            rows = open_rows[index[open_rows] == i]
-            boxes = labels.center_m[rows], labels.size_m[rows], labels.yaw_rad[rows]
-            found[rows] = image_shares(log.cameras[name], inverse(poses[i]), *boxes) >= MIN_IMAGE_SHARE
-    return found
 
 
 def nearest_record(

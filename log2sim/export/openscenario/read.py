@@ -23,53 +23,6 @@ VERTEX_LIMIT = 10_000_000
 MAX_HEADING_RAD = 1e6
 
 
-def vertices_by_entity(root: Element) -> dict[str, Array]:
-    """Return by entity the vertices (V, 5) t, x, y, z, heading of all its trajectories.
-
-    Many entities may share one trajectory, so a small file may expand to very many vertices: they are counted per
-    entity.
-    """
-    found: dict[str, list[Array]] = {}
-    count = 0
-    for group in root.iter("ManeuverGroup"):
-        names = [ref.get("entityRef", "") for ref in group.iterfind("Actors/EntityRef")]
-        for follow in group.iter("FollowTrajectoryAction") if names else ():
-            rows = _polyline(follow, f"entity '{names[0][:100]}'")
-            count += len(names) * len(rows)
-            if count > VERTEX_LIMIT:
-                raise ScenarioError(
-                    f"its entities have more than {VERTEX_LIMIT} vertices together; cut the file into parts"
-                )
-            for name in names:
-                found.setdefault(name, []).append(rows)
-    return {name: np.concatenate(parts) for name, parts in found.items()}
-
-
-def _polyline(follow: Element, where: str) -> Array:
-    timing = follow.find("TimeReference/Timing")
-    if timing is None or timing.get("domainAbsoluteRelative") != "absolute":
-        raise ScenarioError(
-            f"{where}: its trajectory has no <Timing> with an absolute domain; without it nothing has a time"
-        )
-    nodes = list(follow.iter("Vertex"))
-    if not nodes:
-        raise ScenarioError(f"{where}: its trajectory has no vertices of a polyline, expected at least one")
-    scale, offset = (require_number(timing.get(key), f"{where}: Timing {key}") for key in ("scale", "offset"))
-    rows = np.array([[require_number(n.get("time"), f"{where}: Vertex time"), *_pose(n, where)] for n in nodes])
-    rows[:, 0] = offset + scale * rows[:, 0]
-    # Fill in the direction of travel for vertices (V, 5) without a heading: leaving it out does not mean 0.
-    absent = np.isnan(rows[:, 4])
-    steps = np.diff(rows[:, 1:3], axis=0)
-    moving = np.flatnonzero(np.hypot(*steps.T) > 0)
-    if absent.any():
-        travel = np.zeros(len(rows))
-        if len(moving):
-            last = moving[np.clip(np.searchsorted(moving, np.arange(len(rows)), side="right") - 1, 0, None)]
-            travel = np.arctan2(steps[last, 1], steps[last, 0])
-        rows[absent, 4] = travel[absent]
-    return rows
-
-
 def _pose(node: Element, where: str) -> list[float]:
     """Return x, y, z, heading of the `WorldPosition` within an element; NaN for a missing heading."""
     world = node.find("Position/WorldPosition")
@@ -128,7 +81,44 @@ def _scenario(root: Element, path: Path) -> Scenario:
     target = parameters.get("log2sim_projection")
     target = None if target is None else unescaped(target)
     placement = ExportPlacement((origin[0], origin[1], origin[2]), frame.offset_m, frame.projection, target)
-    vertices = vertices_by_entity(root)
+    # Return by entity the vertices (V, 5) t, x, y, z, heading of all its trajectories
+    found: dict[str, list[Array]] = {}
+    count = 0
+    for group in root.iter("ManeuverGroup"):
+        names = [ref.get("entityRef", "") for ref in group.iterfind("Actors/EntityRef")]
+        for follow in group.iter("FollowTrajectoryAction") if names else ():
+            where = f"entity '{names[0][:100]}'"
+            timing = follow.find("TimeReference/Timing")
+            if timing is None or timing.get("domainAbsoluteRelative") != "absolute":
+                raise ScenarioError(
+                    f"{where}: its trajectory has no <Timing> with an absolute domain; without it nothing has a time"
+                )
+            nodes = list(follow.iter("Vertex"))
+            if not nodes:
+                raise ScenarioError(f"{where}: its trajectory has no vertices of a polyline, expected at least one")
+            scale, offset = (require_number(timing.get(key), f"{where}: Timing {key}") for key in ("scale", "offset"))
+            traced = np.array(
+                [[require_number(n.get("time"), f"{where}: Vertex time"), *_pose(n, where)] for n in nodes]
+            )
+            traced[:, 0] = offset + scale * traced[:, 0]
+            # Fill in the direction of travel for vertices (V, 5) without a heading: leaving it out does not mean 0.
+            absent = np.isnan(traced[:, 4])
+            steps = np.diff(traced[:, 1:3], axis=0)
+            moving = np.flatnonzero(np.hypot(*steps.T) > 0)
+            if absent.any():
+                travel = np.zeros(len(traced))
+                if len(moving):
+                    last = moving[np.clip(np.searchsorted(moving, np.arange(len(traced)), side="right") - 1, 0, None)]
+                    travel = np.arctan2(steps[last, 1], steps[last, 0])
+                traced[absent, 4] = travel[absent]
+            count += len(names) * len(traced)
+            if count > VERTEX_LIMIT:
+                raise ScenarioError(
+                    f"its entities have more than {VERTEX_LIMIT} vertices together; cut the file into parts"
+                )
+            for name in names:
+                found.setdefault(name, []).append(traced)
+    vertices = {name: np.concatenate(parts) for name, parts in found.items()}
     last_s = max((rows[-1, 0] for rows in vertices.values()), default=0.0)
     # By entity its initial position in the file.
     starts: dict[str, Element] = {}

@@ -82,23 +82,7 @@ def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external
         axles = element("Axles", body)
         element("FrontAxle", axles, maxSteering=number(kind.max_steering_rad), positionX=number(wheelbase), **shared)
         element("RearAxle", axles, maxSteering="0", positionX="0", **shared)
-    _add_properties(body, agent, minor)
-    if external and minor > 0:
-        controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
-        properties = element("Properties", controller)
-        element("Property", properties, name="esminiController", value="ExternalController")
-        element("Property", properties, name="useGhost", value="false")
-
-
-def _add_box(parent: Element, agent: Agent) -> None:
-    length, width, height = agent.size_m
-    box = element("BoundingBox", parent)
-    element("Center", box, x=number(agent.rear_axle_offset_m), y="0", z=number(height / 2))
-    element("Dimensions", box, width=number(width), length=number(length), height=number(height))
-
-
-def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
-    """Add the properties that players use (`type` of ScenarioRunner, `color` in its form or esmini's), then those for an import."""
+    # The properties that players use (`type` of ScenarioRunner, `color` in its form or esmini's), then those for an import
     w = agent.waypoints
     values = {"type": "ego_vehicle" if agent.id == "ego" else "simulation"}
     if agent.color is not None:
@@ -119,9 +103,21 @@ def _add_properties(parent: Element, agent: Agent, minor: int) -> None:
             values[PREFIX + key] = " ".join(number(v, 4) for v in column)
     if agent.doubts:
         values[PREFIX + "doubts"] = escaped(json.dumps([doubt.to_dict() for doubt in agent.doubts]))
-    properties = element("Properties", parent)
+    properties = element("Properties", body)
     for name, value in values.items():
         element("Property", properties, name=name, value=value)
+    if external and minor > 0:
+        controller = element("Controller", element("ObjectController", scenario_object), name="ExternalController")
+        properties = element("Properties", controller)
+        element("Property", properties, name="esminiController", value="ExternalController")
+        element("Property", properties, name="useGhost", value="false")
+
+
+def _add_box(parent: Element, agent: Agent) -> None:
+    length, width, height = agent.size_m
+    box = element("BoundingBox", parent)
+    element("Center", box, x=number(agent.rear_axle_offset_m), y="0", z=number(height / 2))
+    element("Dimensions", box, width=number(width), length=number(length), height=number(height))
 
 
 # Each waiting agent has a depth of its own, so that none overlaps another.
@@ -308,8 +304,13 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     require_start_as_in_scenario(scenario.agents, boxes)
     root = element("OpenSCENARIO")
     # A leading "CARLA:" in the description would switch ScenarioRunner to left-handed axes.
+    # When the scenario begins: the file's date too, so that the same scenario gives the same file
+    try:
+        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=scenario.t0_ns // 1_000_000_000)
+    except OverflowError:
+        moment = datetime(1970, 1, 1, tzinfo=UTC)
     element(
-        "FileHeader", root, revMajor="1", revMinor=str(minor), date=_date(scenario.t0_ns), author="log2sim",
+        "FileHeader", root, revMajor="1", revMinor=str(minor), date=moment.replace(tzinfo=None).isoformat(timespec="seconds"), author="log2sim",
         description=f"log2sim: {escaped(scenario.name)}",
     )  # fmt: skip
     # What an import needs of the scenario as a whole; 1.0 and 1.1 have no properties without an agent.
@@ -332,12 +333,3 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         add_entity(entities, agent, name, minor, external=flag)
     add_storyboard(root, stories, duration_s, minor)
     xml_text.write(root, folder / "scenario.xosc")
-
-
-def _date(t0_ns: int) -> str:
-    """When the scenario begins: the file's date too, so that the same scenario gives the same file."""
-    try:
-        moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=t0_ns // 1_000_000_000)
-    except OverflowError:
-        moment = datetime(1970, 1, 1, tzinfo=UTC)
-    return moment.replace(tzinfo=None).isoformat(timespec="seconds")

@@ -379,7 +379,23 @@ def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]
         parts = cut_together(lanes, refused)
         by_id = {lane.id: lane for lane in parts}
         crossing = {lane.id for lane in parts if is_connection(lane, by_id)}
-        sides = _with_opposites(_groups([lane for lane in parts if lane.id not in crossing], by_id))
+        # Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road
+        groups = _groups([lane for lane in parts if lane.id not in crossing], by_id)
+        by_left = {group[0].id: group for group in groups}
+        sides: list[tuple[list[MapLane], list[MapLane]]] = []
+        taken: set[str] = set()
+        for group in groups:
+            if group[0].id in taken:
+                continue
+            other = by_left.get(str(group[0].opposite), [])
+            if other:  # begins and ends with the lane, to the left of it
+                leftmost, facing = group[0], _turned(other[0])
+                heading = float(Polyline(leftmost.points_m).heading_rad[0])
+                gap = facing.points_m[0] - leftmost.points_m[0]
+                left = gap[1] * np.cos(heading) > gap[0] * np.sin(heading)
+                other = other if other[0].opposite == leftmost.id and left and _aligned(leftmost, facing) else []
+            taken |= {side[0].id for side in (group, other) if side}
+            sides.append((group, other) if _surest([*group, *other]) in group else (other, group))
         plain = {k + 1: pair for k, pair in enumerate(sides)}
         place: dict[str, _Place] = {}
         for number, (group, opposite) in plain.items():
@@ -447,26 +463,6 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
                 group.insert(0 if side == "left_lane" else len(group), by_id[name])
         seen |= {member.id for member in group}
         found.append(group)
-    return found
-
-
-def _with_opposites(groups: Sequence[list[MapLane]]) -> list[tuple[list[MapLane], list[MapLane]]]:
-    """Join groups whose leftmost lanes lead opposite ways, each to the left of the other; the surest lane leads along the road."""
-    by_left = {group[0].id: group for group in groups}
-    found: list[tuple[list[MapLane], list[MapLane]]] = []
-    taken: set[str] = set()
-    for group in groups:
-        if group[0].id in taken:
-            continue
-        other = by_left.get(str(group[0].opposite), [])
-        if other:  # begins and ends with the lane, to the left of it
-            lane, facing = group[0], _turned(other[0])
-            heading = float(Polyline(lane.points_m).heading_rad[0])
-            gap = facing.points_m[0] - lane.points_m[0]
-            left = gap[1] * np.cos(heading) > gap[0] * np.sin(heading)
-            other = other if other[0].opposite == lane.id and left and _aligned(lane, facing) else []
-        taken |= {side[0].id for side in (group, other) if side}
-        found.append((group, other) if _surest([*group, *other]) in group else (other, group))
     return found
 
 

@@ -116,21 +116,6 @@ def road_objects(
     return crosswalks, signals
 
 
-def _add_crosswalk(parent: Element, road: Road, marking: Marking, s: float, t: float) -> None:
-    heading = float(road.line.at(np.array([s]))[0, 2])
-    gap = marking.points_m[:, :2] - marking.points_m[:, :2].mean(axis=0)
-    c, s_ = np.cos(heading), np.sin(heading)
-    u, v = gap[:, 0] * c + gap[:, 1] * s_, gap[:, 1] * c - gap[:, 0] * s_
-    node = element(
-        "object", parent, id=escaped(marking.id), name=escaped(marking.id), type="crosswalk", s=number(s, DIGITS), t=number(t, DIGITS),
-        zOffset="0", orientation="none", hdg="0", pitch="0", roll="0", length=number(float(np.ptp(u)), DIGITS),
-        width=number(float(np.ptp(v)), DIGITS), height="0",
-    )  # fmt: skip
-    outline = element("outline", element("outlines", node), id="0", closed="true", outer="true")
-    for k, (a, b) in enumerate(zip(u.tolist(), v.tolist())):
-        element("cornerLocal", outline, u=number(a, DIGITS), v=number(b, DIGITS), z="0", height="0", id=str(k))
-
-
 def _add_signals(
     parent: Element, road: Road, own: Sequence[tuple[Signal, MapLane]], placement: ExportPlacement
 ) -> None:
@@ -217,10 +202,6 @@ def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tu
     root = read(map_path)
     require_roads(root, str(map_path))
     shutil.copyfile(map_path, folder / FILE_NAME)
-    return FILE_NAME, _placement_on(root, scenario, map_path)
-
-
-def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> ExportPlacement:
     offset, turned = root.find("header/offset"), "0"
     values = [0.0, 0.0, 0.0]
     if offset is not None:
@@ -244,7 +225,7 @@ def _placement_on(root: Element, scenario: Scenario, map_path: Path) -> ExportPl
             f"--map {map_path}: its roads are {min(gaps) / 1000:.0f} km away from all agents; is it the map of this place, and do"
             " its geoReference and offset, and the scenario's map, say where they lie?"
         )
-    return placement
+    return FILE_NAME, placement
 
 
 def _document(scenario: Scenario, placement: ExportPlacement) -> Element:
@@ -259,7 +240,7 @@ def _document(scenario: Scenario, placement: ExportPlacement) -> Element:
         "header", root, revMajor="1", revMinor="7", name=escaped(scenario.name), version="1", vendor="log2sim",
         north=number(north), south=number(south), east=number(east), west=number(west),
     )  # fmt: skip
-    # Add the geographic reference: projected coordinates are those of the file plus its offset.
+    # The geographic reference: projected coordinates are those of the file plus its offset.
     if scenario.map.projection is not None:
         element("geoReference", header).text = geo_reference(scenario.map.projection)
     x, y, z = (float(a + b) for a, b in zip(scenario.map.offset_m, placement.origin_m))
@@ -271,7 +252,18 @@ def _document(scenario: Scenario, placement: ExportPlacement) -> Element:
         own = crosswalks.get(road.number, ())
         nodes = element("objects", node) if own else node
         for marking, s, t in own:
-            _add_crosswalk(nodes, road, marking, s, t)
+            heading = float(road.line.at(np.array([s]))[0, 2])
+            gap = marking.points_m[:, :2] - marking.points_m[:, :2].mean(axis=0)
+            c, s_ = np.cos(heading), np.sin(heading)
+            u, v = gap[:, 0] * c + gap[:, 1] * s_, gap[:, 1] * c - gap[:, 0] * s_
+            crossing = element(
+                "object", nodes, id=escaped(marking.id), name=escaped(marking.id), type="crosswalk", s=number(s, DIGITS), t=number(t, DIGITS),
+                zOffset="0", orientation="none", hdg="0", pitch="0", roll="0", length=number(float(np.ptp(u)), DIGITS),
+                width=number(float(np.ptp(v)), DIGITS), height="0",
+            )  # fmt: skip
+            outline = element("outline", element("outlines", crossing), id="0", closed="true", outer="true")
+            for k, (a, b) in enumerate(zip(u.tolist(), v.tolist())):
+                element("cornerLocal", outline, u=number(a, DIGITS), v=number(b, DIGITS), z="0", height="0", id=str(k))
         _add_signals(node, road, signals.get(road.number, ()), placement)
     for junction, name in junctions.items():
         parent = element("junction", root, name=escaped(name), id=str(junction), type="default")

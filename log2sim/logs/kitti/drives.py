@@ -22,23 +22,7 @@ from log2sim.errors import LogError
 from log2sim.files.inputs import is_present, require_links_inside
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, transform
 from log2sim.logs.excerpt import digest_of
-from log2sim.logs.kitti.labels import (
-    CAMERA,
-    EGO_T_IMU,
-    Calibration,
-    DriveLabels,
-    LabelRows,
-    Rig,
-    drive_log,
-    labels_of_rows,
-    parse_labels,
-    parse_oxts,
-    poses_from_oxts,
-    poses_of_rect,
-    read_labels,
-    read_text,
-    sweep_stream,
-)
+from log2sim.logs.kitti import labels as kitti_labels
 from log2sim.logs.records import FolderReader, first_image_size, image_stream, list_numbered_files, read_sweep, sweep_of
 from log2sim.logs.stamps import note_damaged_rows, strictly_increasing
 
@@ -69,12 +53,12 @@ class KittiRawReader(FolderReader):
         drive = self.find(path)[sequence]
         files = [drive.parent / name for name in CALIBRATION]
         require_links_inside(drive, drive.parent, path, files=files)
-        cam, velo, imu = calibrations = [Calibration(file) for file in files]
+        cam, velo, imu = calibrations = [kitti_labels.Calibration(file) for file in files]
         numbers = [k for k in range(4) if (drive / f"image_{k:02d}").is_dir()]
         rect = cam.rotation("R_rect_00")
         projections = {k: cam.projection(f"P_rect_{k:02d}") for k in numbers}
         velo_T_imu, cam_T_velo = (transform(c.rotation("R"), c.entry((3,), "T")) for c in (imu, velo))
-        rig = Rig.of(velo_T_imu, cam_T_velo, rect, projections)
+        rig = kitti_labels.Rig.of(velo_T_imu, cam_T_velo, rect, projections)
         notes = list[str]()
         cameras, streams = dict[str, Camera](), dict[str, Stream]()
         for number in numbers:
@@ -86,15 +70,15 @@ class KittiRawReader(FolderReader):
         if (drive / "velodyne_points").is_dir():
             streams["velodyne"] = _sweeps(drive / "velodyne_points", notes)
         ego_t_ns, oxts, _ = _records(drive / "oxts", (".txt",), notes)
-        records = [parse_oxts(read_text(file), str(file)) for file in oxts]
+        records = [kitti_labels.parse_oxts(kitti_labels.read_text(file), str(file)) for file in oxts]
         for file, record in zip(oxts, records):
             if len(record) != 1:
                 raise LogError(f"{file}: {len(record)} lines, expected one oxts record")
-        poses, map_frame = poses_from_oxts(np.concatenate(records))
+        poses, map_frame = kitti_labels.poses_from_oxts(np.concatenate(records))
         if not streams:
             raise LogError(f"{drive}: neither images (image_00 to image_03) nor velodyne_points in it")
         track = PoseTrack(ego_t_ns, poses)
-        path, times = drive / "label_02.txt", drive / CAMERA / "timestamps.txt"
+        path, times = drive / "label_02.txt", drive / kitti_labels.CAMERA / "timestamps.txt"
 
         def stamp_of(frame: NDArray[np.int64]) -> NDArray[np.int64]:
             stamps = _stamps(times)
@@ -104,8 +88,8 @@ class KittiRawReader(FolderReader):
                 raise LogError(f"{path}: frame {strange[0]}, but {has}; is it of another drive?")
             return stamps[frame]
 
-        labels = read_labels(path, rig, track, stamp_of, notes)
-        return drive_log(
+        labels = kitti_labels.read_labels(path, rig, track, stamp_of, notes)
+        return kitti_labels.drive_log(
             rig, cameras, streams, track, labels, name=drive.name, format=self.name, map=map_frame,
             reference_camera=next((c for c in REFERENCE_CAMERAS if c in cameras), None),
             digest=digest_of([*(c.text for c in calibrations), labels.text], sorted(drive.glob("*/data/*"))),
@@ -132,7 +116,7 @@ def _sweeps(folder: Path, notes: list[str]) -> Stream:
         if len(rows):
             count, advice = f"{len(rows)} of {len(numbers)}", "check timestamps_start.txt and timestamps_end.txt"
             notes.append(f"{folder.name}: {count} sweeps {what}, first number {numbers[rows[0]]:010d}; {advice}")
-    return sweep_stream(t_ns, begin, end, files)
+    return kitti_labels.sweep_stream(t_ns, begin, end, files)
 
 
 def _records(
@@ -160,7 +144,7 @@ def _files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 
 def _stamps(path: Path) -> NDArray[np.int64]:
-    text = read_text(path).rstrip()
+    text = kitti_labels.read_text(path).rstrip()
     stamps = list[Any]()
     for k, line in enumerate(map(str.strip, text.split("\n") if text else ()), start=1):
         # A date alone, of a line that was cut, would be a time.
@@ -193,12 +177,12 @@ class KittiTrackingReader(FolderReader):
         """Open a sequence."""
         base = _base(path)
         require_links_inside(base, path)
-        c = Calibration(base / "calib" / f"{sequence}.txt")
+        c = kitti_labels.Calibration(base / "calib" / f"{sequence}.txt")
         numbers = [k for k in (2, 3) if (base / f"image_{k:02d}" / sequence).is_dir()]
         projections = {k: c.projection(f"P{k}") for k in numbers}
         rect = c.rotation("R0_rect", "R_rect")
         velo_T_imu, cam_T_velo = (c.rigid(f"Tr_{link}", f"Tr_{link.replace('to_', '')}") for link in LINKS)
-        rig = Rig.of(velo_T_imu, cam_T_velo, rect, projections)
+        rig = kitti_labels.Rig.of(velo_T_imu, cam_T_velo, rect, projections)
         cameras, streams = dict[str, Camera](), dict[str, Stream]()
         for number in numbers:
             files = _files(base / f"image_{number:02d}" / sequence, PICTURES)
@@ -210,13 +194,13 @@ class KittiTrackingReader(FolderReader):
         if (base / "velodyne" / sequence).is_dir():
             sweeps = _files(base / "velodyne" / sequence, (".bin",))
             t_ns, half = _nominal_stamps(sweeps), PERIOD_NS // 2
-            streams["velodyne"] = sweep_stream(t_ns, t_ns - half, t_ns + half, list(sweeps.values()))
+            streams["velodyne"] = kitti_labels.sweep_stream(t_ns, t_ns - half, t_ns + half, list(sweeps.values()))
         oxts_file = base / "oxts" / f"{sequence}.txt"
-        oxts = read_text(oxts_file)
-        rows = parse_oxts(oxts, str(oxts_file))
+        oxts = kitti_labels.read_text(oxts_file)
+        rows = kitti_labels.parse_oxts(oxts, str(oxts_file))
         if not len(rows):
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
-        poses, map_frame = poses_from_oxts(rows)
+        poses, map_frame = kitti_labels.poses_from_oxts(rows)
         track = PoseTrack(_nominal_stamps(range(len(rows))), poses)
         notes = [NO_STAMPS]
         for name, stream in streams.items():
@@ -225,9 +209,9 @@ class KittiTrackingReader(FolderReader):
                 count = f"{len(missing)} of {len(rows)} records"
                 notes.append(f"{name}: {count} are missing, first number {missing[0]:06d}")
         label_file = base / "label_02" / f"{sequence}.txt"
-        labels = read_labels(label_file, rig, track, lambda frame: frame * PERIOD_NS, notes)
+        labels = kitti_labels.read_labels(label_file, rig, track, lambda frame: frame * PERIOD_NS, notes)
         records = sorted(p for folder in streams for p in (base / folder / sequence).iterdir())
-        return drive_log(
+        return kitti_labels.drive_log(
             rig, cameras, streams, track, labels, name=f"kitti-tracking-{sequence}", format=self.name, map=map_frame,
             reference_camera="image_02", digest=digest_of([c.text, oxts, labels.text], records),
             notes=tuple(notes), calibrations=dict.fromkeys(streams, str(c.path)),
@@ -290,9 +274,9 @@ class KittiObjectReader(FolderReader):
         images = list_numbered_files(base / IMAGES, PICTURES)
         if images:
             size_px = first_image_size(list(images.values()))
-            cameras[CAMERA] = first.camera(*size_px)
-            streams[CAMERA] = image_stream(
-                CAMERA, _nominal_stamps(images, OBJECT_PERIOD_NS), list(images.values()), size_px
+            cameras[kitti_labels.CAMERA] = first.camera(*size_px)
+            streams[kitti_labels.CAMERA] = image_stream(
+                kitti_labels.CAMERA, _nominal_stamps(images, OBJECT_PERIOD_NS), list(images.values()), size_px
             )
         ego = PoseTrack(t_ns, np.repeat(np.eye(4)[None], len(t_ns), axis=0))
         notes = [SINGLE_FRAMES]
@@ -313,10 +297,10 @@ class KittiObjectReader(FolderReader):
         others = sum(not np.allclose(frame.P, first.P, rtol=1e-2, atol=1e-3) for frame in frames.values())
         if others:
             notes.append(f"{others} of {len(t_ns)} frames have another P2 by more than 1 %; that of the first is used")
-        return drive_log(
-            Rig(first.ego_T_rect @ first.rect_T_velo, first.ego_T_rect, {}), cameras, streams, ego, labels,
+        return kitti_labels.drive_log(
+            kitti_labels.Rig(first.ego_T_rect @ first.rect_T_velo, first.ego_T_rect, {}), cameras, streams, ego, labels,
             name=f"kitti-object-{base.name}", format=self.name, ground_z_ego_m=ground_z_m,
-            reference_camera=CAMERA if cameras else None, digest=digest_of([*known, labels.text], files),
+            reference_camera=kitti_labels.CAMERA if cameras else None, digest=digest_of([*known, labels.text], files),
             notes=tuple(notes), calibrations=dict.fromkeys(streams, str(next(iter(places.values())))),
         )  # fmt: skip
 
@@ -345,14 +329,14 @@ class _Frame:
         K, rotation = K * sign, sign[:, None] * rotation
         K = K / K[2, 2]
         cam_T_rect = transform(rotation, np.linalg.solve(K, self.P[:, 3] / np.linalg.norm(self.P[2, :3])))
-        return Camera(CAMERA, width_px, height_px, K, "ego", self.ego_T_rect @ inverse(cam_T_rect))
+        return Camera(kitti_labels.CAMERA, width_px, height_px, K, "ego", self.ego_T_rect @ inverse(cam_T_rect))
 
 
 def _frame_of(path: Path, known: dict[str, _Frame]) -> _Frame:
-    text = read_text(path)
+    text = kitti_labels.read_text(path)
     if text in known:
         return known[text]
-    c = Calibration(path)
+    c = kitti_labels.Calibration(path)
     names_imu = "Tr_imu_to_velo" in c.values
     c.entry((3, 3), "R0_rect", "R_rect")
     P = c.entry((3, 4), "P2")
@@ -363,31 +347,33 @@ def _frame_of(path: Path, known: dict[str, _Frame]) -> _Frame:
     velo_T_imu = c.rigid("Tr_imu_to_velo") if names_imu else np.eye(4)
     knows_ground = not np.array_equal(velo_T_imu, np.eye(4))
     if not knows_ground:
-        velo_T_imu = transform(np.eye(3), [0.0, 0.0, EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
+        velo_T_imu = transform(np.eye(3), [0.0, 0.0, kitti_labels.EGO_T_IMU[2, 3] - LIDAR_HEIGHT_M])
     rect_T_velo = transform(c.rotation("R0_rect", "R_rect"), np.zeros(3)) @ c.rigid("Tr_velo_to_cam")
-    velo_ego = (EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
+    velo_ego = (kitti_labels.EGO_T_IMU @ inverse(velo_T_imu))[:3, 3]
     ego_T_rect = transform(EGO_R_RECT, velo_ego - EGO_R_RECT @ rect_T_velo[:3, 3])
     known[text] = _Frame(ego_T_rect, rect_T_velo, P, knows_ground, names_imu)
     return known[text]
 
 
-def _labels(base: Path, sweeps: Mapping[int, Path], first: _Frame, ego: PoseTrack, notes: list[str]) -> DriveLabels:
+def _labels(
+    base: Path, sweeps: Mapping[int, Path], first: _Frame, ego: PoseTrack, notes: list[str]
+) -> kitti_labels.DriveLabels:
     """Read the labels of all frames; each object is a track of its own."""
-    parts, texts, labeled, damaged = list[LabelRows](), [], [], list[str]()
+    parts, texts, labeled, damaged = list[kitti_labels.LabelRows](), [], [], list[str]()
     for number, file in sweeps.items():
         path = base / "label_2" / f"{file.stem}.txt"
         if is_present(path):
-            texts.append(read_text(path))
+            texts.append(kitti_labels.read_text(path))
             lines = [
                 f"{number} {number}-{k} {line}" * bool(line.strip()) for k, line in enumerate(texts[-1].splitlines())
             ]
-            parts.append(parse_labels("\n".join(lines), path, damaged))
+            parts.append(kitti_labels.parse_labels("\n".join(lines), path, damaged))
             labeled.append(number)
     if not parts:
-        return DriveLabels()
-    rows = LabelRows(*(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts))))
+        return kitti_labels.DriveLabels()
+    rows = kitti_labels.LabelRows.join(parts)
     note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
-    poses_at = poses_of_rect(ego, first.ego_T_rect)
-    found = labels_of_rows(rows, poses_at, lambda frame: frame * OBJECT_PERIOD_NS, "\n".join(texts))
+    poses_at = kitti_labels.poses_of_rect(ego, first.ego_T_rect)
+    found = kitti_labels.labels_of_rows(rows, poses_at, lambda frame: frame * OBJECT_PERIOD_NS, "\n".join(texts))
     assert found.boxes_3d is not None
     return replace(found, boxes_3d=replace(found.boxes_3d, labeled_ns=_nominal_stamps(labeled, OBJECT_PERIOD_NS)))

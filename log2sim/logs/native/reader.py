@@ -13,18 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import (
-    CATEGORIES,
-    EgoVehicle,
-    ImageLabels,
-    ImageRegions,
-    Labels,
-    Lidar,
-    Log,
-    MapFrame,
-    Stream,
-    Sweep,
-)
+from log2sim import datatypes
 from log2sim.datatypes.log import camera_of
 from log2sim.errors import LogError
 from log2sim.files.documents import JSON_LIMIT_BYTES, check, is_plain, read_json
@@ -174,7 +163,7 @@ REGION_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS,
 BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
 
 
-def boxes_3d(table: CsvTable) -> Labels:
+def boxes_3d(table: CsvTable) -> datatypes.Labels:
     """Labels of a table with `BOX_3D_COLUMNS` and, optionally, some of `BOX_3D_OPTIONAL`."""
     _check_categories(table)
     visible, kind, occlusion = (table.columns.get(name) for name in BOX_3D_OPTIONAL)
@@ -183,7 +172,7 @@ def boxes_3d(table: CsvTable) -> Labels:
     if occlusion is not None:
         table.refuse(~np.isin(occlusion, OCCLUSIONS), "occlusion", "VALUE, expected 0, 1, 2 or 3")
     center, size = table.stack("x_m", "y_m", "z_m"), table.stack(*SIZE_FIELDS)
-    return Labels(
+    return datatypes.Labels(
         table["t_ns"], table["track_id"], table["category"], center, size, table["yaw_rad"], visible, kind=kind,
         occlusion=occlusion,
     )  # fmt: skip
@@ -200,8 +189,8 @@ def boxes_by_camera(table: CsvTable, cameras: Iterable[str]) -> dict[str, tuple[
 
 
 def _check_categories(table: CsvTable) -> None:
-    words = f"'VALUE', expected one of {', '.join(CATEGORIES)}"
-    table.refuse(~np.isin(table["category"], CATEGORIES), "category", words)
+    words = f"'VALUE', expected one of {', '.join(datatypes.CATEGORIES)}"
+    table.refuse(~np.isin(table["category"], datatypes.CATEGORIES), "category", words)
 
 
 OFFSET_STEP_M = 1000.0
@@ -228,7 +217,7 @@ class NativeReader(FolderReader):
             return {path.resolve().name: path}
         return {p.parent.name: p.parent for p in path.glob(f"*/{MANIFEST}") if _is_manifest(p)}
 
-    def open(self, path: Path, sequence: str) -> Log:
+    def open(self, path: Path, sequence: str) -> datatypes.Log:
         """Open a sequence."""
         root = path if (path / MANIFEST).is_file() else path / sequence
         require_link_inside(root / MANIFEST, root, path)
@@ -265,7 +254,7 @@ class _Folder:
             raise LogError(f"{self.file}: {error}") from None
         self.hash = hashlib.sha256(read_file(self.file, JSON_LIMIT_BYTES, LogError))
 
-    def log(self) -> Log:
+    def log(self) -> datatypes.Log:
         m = self.manifest
         map_frame, track = self._ego()
         sensors = [self._sensor(k, entry) for k, entry in enumerate(m["sensors"])]
@@ -277,34 +266,34 @@ class _Folder:
         places = [mount_T_sensor[:3, 3] for mount_T_sensor in (mounts if track is None else track.map_T_ego[:1])]
         places += [] if labels is None else list(labels.center_m[:1])
         offset = OFFSET_STEP_M * np.round((places[0] if places else np.zeros(3)) / OFFSET_STEP_M) + 0.0
-        cameras, lidars = dict[str, Camera](), dict[str, Lidar]()
+        cameras, lidars = dict[str, Camera](), dict[str, datatypes.Lidar]()
         for sensor in sensors:
             shift = offset if sensor.mount == "map" else np.zeros(3)
             if isinstance(sensor, Camera):
                 cameras[sensor.name] = replace(sensor, mount_T_cam=shift_poses(sensor.mount_T_cam, shift))
             else:
                 lidars[sensor.name] = replace(sensor, mount_T_lidar=shift_poses(sensor.mount_T_lidar, shift))
-        image_labels, ignored = dict[str, ImageLabels](), dict[str, ImageRegions]()
+        image_labels, ignored = dict[str, datatypes.ImageLabels](), dict[str, datatypes.ImageRegions]()
         if boxes is not None:
             _check_categories(boxes)
             for name, (rows, box) in boxes_by_camera(boxes, cameras).items():
-                image_labels[name] = ImageLabels(boxes["t_ns"][rows], box, boxes["category"][rows])
+                image_labels[name] = datatypes.ImageLabels(boxes["t_ns"][rows], box, boxes["category"][rows])
         if regions is not None:
             for name, (rows, box) in boxes_by_camera(regions, cameras).items():
-                ignored[name] = ImageRegions(regions["t_ns"][rows], box)
-        ego, vehicle = m.get("ego", {}), EgoVehicle()
+                ignored[name] = datatypes.ImageRegions(regions["t_ns"][rows], box)
+        ego, vehicle = m.get("ego", {}), datatypes.EgoVehicle()
         length, width, height = (float(v) for v in ego.get("size_m", vehicle.size_m))
         axle_m = float(ego.get("rear_axle_offset_m", vehicle.rear_axle_offset_m))
         # Without an ego the height of the road is one of the map.
         roadside = track is None and all(sensor.mount == "map" for sensor in sensors)
-        return Log(
+        return datatypes.Log(
             name=m["name"],
             format=READER.name,
             cameras=cameras,
             lidars=lidars,
             streams={e["name"]: self._stream(k, e, offset) for k, e in enumerate(m["sensors"])},
             ego=None if track is None else PoseTrack(track.t_ns, shift_poses(track.map_T_ego, offset)),
-            ego_vehicle=EgoVehicle((length, width, height), axle_m),
+            ego_vehicle=datatypes.EgoVehicle((length, width, height), axle_m),
             map=replace(map_frame, offset_m=tuple(offset.tolist())),
             labels=None if labels is None else replace(labels, center_m=labels.center_m - offset),
             image_labels=image_labels,
@@ -328,9 +317,11 @@ class _Folder:
             raise LogError(f"{table.path}: no records below the header; a stream needs at least one")
         return table
 
-    def _ego(self) -> tuple[MapFrame, PoseTrack | None]:
+    def _ego(self) -> tuple[datatypes.MapFrame, PoseTrack | None]:
         m = self.manifest.get("map", {})
-        map_frame = MapFrame(m.get("latitude_deg"), m.get("longitude_deg"), m.get("altitude_m"), m.get("projection"))
+        map_frame = datatypes.MapFrame(
+            m.get("latitude_deg"), m.get("longitude_deg"), m.get("altitude_m"), m.get("projection")
+        )
         ego = self.manifest.get("ego")
         if ego is None or not {"poses", "gnss"} & set(ego):
             return map_frame, None
@@ -348,14 +339,14 @@ class _Folder:
         keep = strictly_increasing(table["t_ns"], "ego", self.notes)
         return map_frame, PoseTrack(table["t_ns"][keep], poses[keep])
 
-    def _sensor(self, k: int, entry: Mapping[str, Any]) -> Camera | Lidar:
+    def _sensor(self, k: int, entry: Mapping[str, Any]) -> Camera | datatypes.Lidar:
         where = f"{self.file}, sensors[{k}] '{entry['name']}'"
         norm = float(np.linalg.norm(entry["rotation_wxyz"]))
         if abs(norm - 1) > QUATERNION_TOLERANCE:
             raise LogError(f"{where}: rotation_wxyz has norm {norm:.6g}, expected a unit quaternion (scalar first)")
         mount_T_sensor = transform(rotation_from_quaternion(entry["rotation_wxyz"]), entry["translation_m"])
         if entry["kind"] == "lidar":
-            return Lidar(entry["name"], entry["mount"], mount_T_sensor)
+            return datatypes.Lidar(entry["name"], entry["mount"], mount_T_sensor)
         i = entry["intrinsics"]
         model, count = i.get("distortion_model", "none"), len(i.get("distortion", ()))
         if count not in DISTORTION_LENGTHS[model]:
@@ -365,7 +356,7 @@ class _Folder:
         shutter = None if lines is None else RollingShutter(lines["direction"], float(lines["readout_s"]))
         return replace(camera_of(entry["name"], i, entry["mount"], mount_T_sensor), rolling_shutter=shutter)
 
-    def _check_sensors(self, sensors: list[Camera | Lidar]) -> None:
+    def _check_sensors(self, sensors: list[Camera | datatypes.Lidar]) -> None:
         names = [sensor.name for sensor in sensors]
         for k, sensor in enumerate(sensors):
             where = f"{self.file}, sensors[{k}] '{sensor.name}'"
@@ -379,7 +370,7 @@ class _Folder:
             there = f"no camera '{reference}'; there are: {', '.join(cameras)}"
             raise LogError(f"{self.file}, field 'reference_camera': {there}")
 
-    def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> Stream:
+    def _stream(self, k: int, entry: Mapping[str, Any], offset: Array) -> datatypes.Stream:
         frame = entry.get("points_frame", "lidar")
         compensable = COMPENSATED if entry["kind"] == "lidar" and frame == "lidar" else None
         table = self.table(entry["index"], f"sensors[{k}].index", INDEX_COLUMNS, compensable)
@@ -394,7 +385,7 @@ class _Folder:
         compensated = table.columns.get("compensated_ns")
         compensated_ns = None if compensated is None else compensated[keep]
 
-        def read(i: int) -> Sweep:
+        def read(i: int) -> datatypes.Sweep:
             sweep = read_sweep(files[i], int(t_ns[i]), frame)
             if compensated_ns is not None:
                 return replace(sweep, compensated_ns=int(compensated_ns[i]))
@@ -402,9 +393,9 @@ class _Folder:
                 return replace(sweep, xyz_m=sweep.xyz_m.astype(np.float64) - offset)
             return sweep
 
-        return Stream(entry["name"], t_ns, read)
+        return datatypes.Stream(entry["name"], t_ns, read)
 
-    def _labels(self) -> Labels | None:
+    def _labels(self) -> datatypes.Labels | None:
         entry = self.manifest.get("labels", {})
         table = self._label_table("boxes_3d", BOX_3D_COLUMNS, BOX_3D_OPTIONAL)
         if table is None:

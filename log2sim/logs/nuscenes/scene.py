@@ -430,7 +430,15 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
     stamps = np.array([stamp_ns_of(sample, sample_path) for sample in scene.samples], dtype=np.int64)
     rows = _rows_of(scene, annotations, samples, notes)
     rows = replace(rows, t_ns=scanned_ns(scene, lidar, stamps[rows.sample], rows.center_m))
-    ends_ns = turn_ends(stamps if lidar is None else np.union1d(stamps, lidar.t_ns))
+    # Stamps of all turns of the LiDAR: those known (F,), and others about every 50 ms where they are farther apart
+    t_ns = stamps if lidar is None else np.union1d(stamps, lidar.t_ns)
+    t_ns = t_ns[np.diff(t_ns, prepend=t_ns[0] - MIN_STEP_NS) >= MIN_STEP_NS]
+    step = np.diff(t_ns)
+    missing = np.where(step <= MAX_GAP_NS, np.maximum(np.round(step / TURN_NS).astype(np.int64) - 1, 0), 0)
+    first = np.repeat(np.arange(len(missing)), missing)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
+    step_ns = (step // (missing + 1))[first]
+    ends_ns = np.union1d(t_ns, t_ns[first] + number * step_ns)
     parts = [rows, _between(scene, lidar, rows, stamps, ends_ns)]
     rows = _Rows(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(rows)})
     rows = rows.take(np.argsort(rows.t_ns, kind="stable"))
@@ -438,20 +446,6 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
         rows.t_ns, rows.track_id, rows.category, rows.center_m - offset_m, rows.size_m, rows.yaw_rad, rows.visible,
         kind=rows.kind, labeled_ns=np.unique(stamps - (0 if lidar is None else TURN_NS // 2)),
     )  # fmt: skip
-
-
-def turn_ends(t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Stamps of all turns of the LiDAR: those known (F,), and others about every 50 ms where they are farther apart.
-
-    Tables with key frames alone know two turns a second. What is nearer than 10 ms to the one before is no turn.
-    """
-    t_ns = t_ns[np.diff(t_ns, prepend=t_ns[0] - MIN_STEP_NS) >= MIN_STEP_NS]
-    step = np.diff(t_ns)
-    missing = np.where(step <= MAX_GAP_NS, np.maximum(np.round(step / TURN_NS).astype(np.int64) - 1, 0), 0)
-    first = np.repeat(np.arange(len(missing)), missing)
-    number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
-    step_ns = (step // (missing + 1))[first]
-    return np.union1d(t_ns, t_ns[first] + number * step_ns)
 
 
 def scanned_ns(scene: Scene, lidar: Channel | None, t_ns: NDArray[np.int64], center_m: Array) -> NDArray[np.int64]:

@@ -24,19 +24,10 @@ from log2sim.errors import LogError, RecordError
 from log2sim.files.documents import JSON_LIMIT_BYTES, read_json
 from log2sim.files.inputs import is_present, read_file, read_text, require_links_inside
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, nearest_rotation, transform, wrap_angle
+from log2sim.logs import records
 from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.pandaset.unpickle import MAX_TABLE_BYTES, Columns, read_pickled_table
-from log2sim.logs.records import (
-    MAX_POSITION_M,
-    FolderReader,
-    checked_poses,
-    first_image_size,
-    image_stream,
-    list_folders,
-    list_numbered_files,
-    sweep_of,
-)
 from log2sim.logs.stamps import (
     MAX_TIME_S,
     compute_scan_offset_ns,
@@ -159,7 +150,7 @@ def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Swe
     if not timed.all():
         xyz, t_s, strength = xyz[timed], t_s[timed], None if strength is None else strength[timed]
     offset_ns = np.round(t_s * NS_PER_S).astype(np.int64) - t_ns
-    return sweep_of(xyz, t_ns, offset_ns, "map", intensity=strength)
+    return records.sweep_of(xyz, t_ns, offset_ns, "map", intensity=strength)
 
 
 PERIOD_NS = 100_000_000
@@ -203,7 +194,14 @@ def read_labels(
     twice = flat = 0
     for number, path in files.items():
         if number < len(t_ns):
-            table = _checked(read_pickled_table(path, LogError), path)
+            found = read_pickled_table(path, LogError)
+            for name in LABEL_COLUMNS:
+                if name not in found:
+                    raise LogError(f"{path}: no column '{name}'; expected cuboids with {', '.join(LABEL_COLUMNS)}")
+                is_possible = found[name].dtype.kind in "fiu" and (np.abs(found[name]) <= records.MAX_POSITION_M).all()
+                if name not in ("uuid", "label") and not is_possible:
+                    raise LogError(f"{path}, column '{name}': expected finite numbers up to {records.MAX_POSITION_M:g}")
+            table = {name: np.full(len(found["uuid"]), value) for name, value in OPTIONAL.items()} | found
             twice += len(table["uuid"]) - len(np.unique(table["uuid"].astype(np.str_)))
             flat += int((_sizes(table) <= 0).any(axis=1).sum())
             parts.append(_frame(table, int(t_ns[number]), int(gt_t_ns[number]), map_T_lidar[number], left_out))
@@ -232,16 +230,6 @@ def read_labels(
         taken = f"{alone} bicycle{'s' * (alone != 1)} taken as unridden"
         notes.append(f"{taken}: no sweep states whether somebody rides them")
     return Labels(t_ns, track_id, category, center, size, yaw)
-
-
-def _checked(table: Columns, path: Path) -> Columns:
-    for name in LABEL_COLUMNS:
-        if name not in table:
-            raise LogError(f"{path}: no column '{name}'; expected cuboids with {', '.join(LABEL_COLUMNS)}")
-        is_possible = table[name].dtype.kind in "fiu" and (np.abs(table[name]) <= MAX_POSITION_M).all()
-        if name not in ("uuid", "label") and not is_possible:
-            raise LogError(f"{path}, column '{name}': expected finite numbers up to {MAX_POSITION_M:g}")
-    return {name: np.full(len(table["uuid"]), value) for name, value in OPTIONAL.items()} | table
 
 
 def _frame(c: Columns, t_ns: int, gt_t_ns: int, map_T_lidar: Array, left_out: list[str]) -> tuple[NDArray[Any], ...]:
@@ -286,7 +274,7 @@ MIN_GNSS_TRACK_M = 20.0
 MAX_GNSS_ANGLE_RAD = np.radians(1.0)
 
 
-class PandaSetReader(FolderReader):
+class PandaSetReader(records.FolderReader):
     """Reader of PandaSet sequences; the root is a sequence or a folder of sequences."""
 
     name = "pandaset"
@@ -294,7 +282,7 @@ class PandaSetReader(FolderReader):
 
     def find(self, path: Path) -> dict[str, Path]:
         """Find the sequences at a folder by name."""
-        places = [path] if _is_sequence(path) else [p for p in list_folders(path) if _is_sequence(p)]
+        places = [path] if _is_sequence(path) else [p for p in records.list_folders(path) if _is_sequence(p)]
         return {p.resolve().name if p == path else p.name: p for p in places}
 
     def open(self, path: Path, sequence: str) -> Log:
@@ -325,7 +313,7 @@ def _open(path: Path) -> Log:
     streams |= {lidar: sweeps.stream(lidar) for lidar in lidars}
     if not streams:
         raise LogError(f"{path}: neither images nor sweeps are there; a log needs at least one record")
-    cuboids = list_numbered_files(path / "annotations" / "cuboids", (TABLE,))
+    cuboids = records.list_numbered_files(path / "annotations" / "cuboids", (TABLE,))
     cuboids = {k: file for k, file in cuboids.items() if k in kept or k >= len(lidar_t_ns)}
     map_T_lidar = map_T_ego @ EGO_T_PANDAR64
 
@@ -353,7 +341,7 @@ def _open(path: Path) -> Log:
 
 def _files(path: Path, folder: str, suffix: str, count: int, notes: list[str]) -> dict[int, Path]:
     """Find the records of a sensor by their number and note missing ones: they are gaps."""
-    found = list_numbered_files(path / folder, (suffix,))
+    found = records.list_numbered_files(path / folder, (suffix,))
     files = {k: p for k, p in found.items() if k < count}
     beyond, missing = len(found) - len(files), sorted(set(range(count)) - set(files))
     if beyond:
@@ -365,10 +353,10 @@ def _files(path: Path, folder: str, suffix: str, count: int, notes: list[str]) -
 
 def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
     cameras, streams = {}, {}
-    for folder in list_folders(path / "camera"):
+    for folder in records.list_folders(path / "camera"):
         name = folder.name
         if not is_present(folder / "intrinsics.json"):
-            images = len(list_numbered_files(folder, (".jpg",)))
+            images = len(records.list_numbered_files(folder, (".jpg",)))
             if images:
                 notes.append(f"camera/{name}: {images} images left out: it has no intrinsics.json")
             continue
@@ -376,8 +364,19 @@ def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, 
         files = _files(path, f"camera/{name}", ".jpg", len(t_ns), notes)
         if not files:
             continue
-        size_px = first_image_size(list(files.values()))
-        mount = _mount(track, t_ns, map_T_cam, folder, notes)
+        size_px = records.first_image_size(list(files.values()))
+        # Mount `ego_T_cam` (4, 4) of a camera from its poses in the world: medians over its frames
+        map_T_ego, known = track.at(t_ns)
+        if not known.any():
+            apart = describe_gap(Span.of("ego poses", track.t_ns), Span.of("frames", t_ns))
+            raise LogError(f"{folder}/timestamps.json and lidar/timestamps.json: {apart}")
+        ego_T_cam = inverse(map_T_ego[known]) @ map_T_cam[known]
+        translation = np.median(ego_T_cam[:, :3, 3], axis=0)
+        rotation = nearest_rotation(np.median(ego_T_cam[:, :3, :3], axis=0))
+        spread_m = float(np.median(np.linalg.norm(ego_T_cam[:, :3, 3] - translation, axis=1)))
+        if spread_m > MAX_MOUNT_SPREAD_M:
+            notes.append(f"{folder.name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
+        mount = transform(rotation, translation)
         path_K = folder / "intrinsics.json"
         try:
             fx, fy, cx, cy = (float(read_json(path_K)[k]) for k in ("fx", "fy", "cx", "cy"))
@@ -389,7 +388,7 @@ def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, 
         cameras[name] = Camera(name, *size_px, K, "ego", mount)
         numbers = np.array(list(files))
         numbers = numbers[strictly_increasing(t_ns[numbers], name, notes)]
-        streams[name] = image_stream(name, t_ns[numbers], [files[int(n)] for n in numbers], size_px)
+        streams[name] = records.image_stream(name, t_ns[numbers], [files[int(n)] for n in numbers], size_px)
     if not cameras:
         notes.append("no images: camera/ has no folder with intrinsics.json, poses.json, timestamps.json and images")
     return cameras, streams
@@ -446,7 +445,7 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
     except (TypeError, KeyError, ValueError) as problem:
         expected = "expected records of position x, y, z and heading w, x, y, z"
         raise LogError(f"{folder}/poses.json: {expected}: {problem}") from None
-    sensor_poses = checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
+    sensor_poses = records.checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
     for k, stamp in enumerate(stamps):
         if not isinstance(stamp, (int, float)) or isinstance(stamp, bool) or not abs(stamp) < MAX_TIME_S:
             where, expected = (
@@ -455,22 +454,3 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
             )
             raise LogError(f"{where}: {str(stamp)[:40]!a}, {expected}")
     return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64), sensor_poses
-
-
-def _mount(track: PoseTrack, t_ns: NDArray[np.int64], map_T_cam: Array, folder: Path, notes: list[str]) -> Array:
-    """Mount `ego_T_cam` (4, 4) of a camera from its poses in the world: medians over its frames.
-
-    With the ego interpolated at the camera's own stamps, single frames of sequence 002 differ from it by 1 to 5 mm and
-    0.006 to 0.027 degrees (RMS by camera); with the pose of the sweep of the same number it would be up to 96 mm.
-    """
-    map_T_ego, known = track.at(t_ns)
-    if not known.any():
-        apart = describe_gap(Span.of("ego poses", track.t_ns), Span.of("frames", t_ns))
-        raise LogError(f"{folder}/timestamps.json and lidar/timestamps.json: {apart}")
-    ego_T_cam = inverse(map_T_ego[known]) @ map_T_cam[known]
-    translation = np.median(ego_T_cam[:, :3, 3], axis=0)
-    rotation = nearest_rotation(np.median(ego_T_cam[:, :3, :3], axis=0))
-    spread_m = float(np.median(np.linalg.norm(ego_T_cam[:, :3, 3] - translation, axis=1)))
-    if spread_m > MAX_MOUNT_SPREAD_M:
-        notes.append(f"{folder.name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
-    return transform(rotation, translation)

@@ -24,16 +24,6 @@ from log2sim.logs.ros import sensors as calibration
 from log2sim.logs.ros.bag import NAME_BYTES, SUFFIXES, Bag, Topic, find_recordings
 from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import BASE_FRAMES, FoundPoses, FrameTree, PoseSources
-from log2sim.logs.ros.messages import (
-    CameraTopic,
-    LidarTopic,
-    Stamped,
-    TopicSettings,
-    decode_bytes,
-    find_layout_problem,
-    read_settings,
-    stamp_messages,
-)
 from log2sim.logs.ros.sensors import COMPRESSED, camera_stream, lidar_stream
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -65,14 +55,14 @@ MAX_SENSOR_TOPICS = 1000
 class Roles:
     """What topics are used for: sensors by their name, with all topics filled in, other topics by kind, and why, by topic."""
 
-    cameras: dict[str, CameraTopic] = field(default_factory=dict)
-    lidars: dict[str, LidarTopic] = field(default_factory=dict)
+    cameras: dict[str, messages.CameraTopic] = field(default_factory=dict)
+    lidars: dict[str, messages.LidarTopic] = field(default_factory=dict)
     topics: dict[str, list[str]] = field(default_factory=dict)  # "camera info", "odometry", "pose", "gnss", "imu", "tf"
     reasons: dict[str, tuple[str, str]] = field(default_factory=dict)  # role and reason
     notes: list[str] = field(default_factory=list)
 
 
-def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
+def assign_roles(bag: Bag, settings: messages.TopicSettings, file: Path | None) -> Roles:
     """Decide what each topic is used for.
 
     Raises `ConfigError` when the settings name a topic that is not there or of another type, `LogError` for more than
@@ -82,7 +72,9 @@ def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
     usable: dict[str, list[Topic]] = {}
     for name, topic in bag.topics.items():
         kind = KINDS.get(topic.msgtype)
-        problem = "it has no messages" if not len(topic) else None if kind is None else find_layout_problem(topic)
+        problem = (
+            "it has no messages" if not len(topic) else None if kind is None else messages.find_layout_problem(topic)
+        )
         if kind is None or problem:
             roles.reasons[name] = ("unused", problem or f"log2sim has no use for {topic.msgtype}")
             if kind and problem:
@@ -93,20 +85,7 @@ def assign_roles(bag: Bag, settings: TopicSettings, file: Path | None) -> Roles:
         roles.reasons[name] = (kind, f"is {topic.msgtype}")
         usable.setdefault(kind, []).append(topic)
     roles.topics = {kind: [t.name for t in topics] for kind, topics in usable.items()}
-    _check_named(bag, settings, file)
-    for kind, listed in (("camera", settings.cameras), ("lidar", settings.lidars)):
-        if len(usable.get(kind, ())) > MAX_SENSOR_TOPICS and not listed:
-            raise LogError(
-                f"{bag.place}: {len(usable[kind])} topics of the kind '{kind}', more than the {MAX_SENSOR_TOPICS} of which log2sim "
-                "chooses; list those to use in the settings"
-            )
-    _assign_cameras(bag, usable.get("camera", []), settings, roles)
-    _assign_lidars(bag, usable.get("lidar", []), settings, roles)
-    return roles
-
-
-def _check_named(bag: Bag, settings: TopicSettings, file: Path | None) -> None:
-    """Check that the topics of the settings exist and have messages of the right type."""
+    # Check that the topics of the settings exist and have messages of the right type
     poses = settings.poses
     kinds = ("odometry", "pose", "gnss", "tf") if poses.source in ("auto", "none") else (poses.source,)
     required: list[tuple[str, str, tuple[str, ...]]] = [
@@ -127,13 +106,22 @@ def _check_named(bag: Bag, settings: TopicSettings, file: Path | None) -> None:
         if KINDS.get(topic.msgtype) not in expected:
             types = ", ".join(t for t, k in KINDS.items() if k in expected)
             problem = f"it holds {topic.msgtype}, expected {types}"
-        if problem or (problem := find_layout_problem(topic)):
+        if problem or (problem := messages.find_layout_problem(topic)):
             raise ConfigError(f"{file}: '{key}' is '{name}', but {problem}")
     if settings.reference_camera and settings.cameras and settings.reference_camera not in settings.cameras:
         raise ConfigError(f"{file}: 'reference_camera' is '{settings.reference_camera}', which is not listed")
+    for kind, listed in (("camera", settings.cameras), ("lidar", settings.lidars)):
+        if len(usable.get(kind, ())) > MAX_SENSOR_TOPICS and not listed:
+            raise LogError(
+                f"{bag.place}: {len(usable[kind])} topics of the kind '{kind}', more than the {MAX_SENSOR_TOPICS} of which log2sim "
+                "chooses; list those to use in the settings"
+            )
+    _assign_cameras(bag, usable.get("camera", []), settings, roles)
+    _assign_lidars(bag, usable.get("lidar", []), settings, roles)
+    return roles
 
 
-def _assign_cameras(bag: Bag, topics: list[Topic], settings: TopicSettings, roles: Roles) -> None:
+def _assign_cameras(bag: Bag, topics: list[Topic], settings: messages.TopicSettings, roles: Roles) -> None:
     infos = roles.topics.get("camera info", [])
     roles.reasons |= dict.fromkeys(infos, ("unused", "no images belong to it"))
     chosen = dict(settings.cameras)
@@ -151,7 +139,7 @@ def _assign_cameras(bag: Bag, topics: list[Topic], settings: TopicSettings, role
 
         best = _best_of(groups, rank, "image of the same camera", roles)
         names = _short_names([_TRANSPORT.sub("", t.name) for t in best])
-        chosen = {name: CameraTopic(topic=topic.name) for name, topic in zip(names, best)}
+        chosen = {name: messages.CameraTopic(topic=topic.name) for name, topic in zip(names, best)}
     else:
         _drop_unlisted(topics, {c.topic for c in chosen.values()}, "camera", roles)
     origin = "by the settings" if settings.cameras else "by its type"
@@ -168,7 +156,7 @@ def _assign_cameras(bag: Bag, topics: list[Topic], settings: TopicSettings, role
             roles.reasons[info] = (f"calibration of {name}", "named so" if camera.info else "same namespace or frame")
 
 
-def _assign_lidars(bag: Bag, topics: list[Topic], settings: TopicSettings, roles: Roles) -> None:
+def _assign_lidars(bag: Bag, topics: list[Topic], settings: messages.TopicSettings, roles: Roles) -> None:
     chosen = dict(settings.lidars)
     if chosen:
         _drop_unlisted(topics, {s.topic for s in chosen.values()}, "lidar", roles)
@@ -189,7 +177,7 @@ def _assign_lidars(bag: Bag, topics: list[Topic], settings: TopicSettings, roles
                     roles.reasons[topic.name] = ("unused", why)
         best = _best_of(groups, lambda t: (-len(t), len(t.name), t.name), "cloud of the same frame", roles)
         names = [f"{n}_lidar" if n in roles.cameras else n for n in _short_names([t.name for t in best])]
-        chosen = {name: LidarTopic(topic=topic.name) for name, topic in zip(names, best)}
+        chosen = {name: messages.LidarTopic(topic=topic.name) for name, topic in zip(names, best)}
     for name, lidar in chosen.items():
         frame = lidar.frame or bag.frame_id(bag.topics[lidar.topic])
         roles.lidars[name] = lidar.model_copy(update={"frame": frame})
@@ -269,7 +257,7 @@ class RosReader(FolderReader):
         if path.is_dir():
             for bag in recording.files:
                 require_link_inside(bag, path)
-        settings, file = read_settings(recording.settings)
+        settings, file = messages.read_settings(recording.settings)
         return _Opening(sequence, Bag(recording), settings, file).log()
 
 
@@ -279,10 +267,10 @@ READER = RosReader()
 class _Opening:
     """One log while it is opened; collects notes."""
 
-    def __init__(self, name: str, bag: Bag, settings: TopicSettings, file: Path | None) -> None:
+    def __init__(self, name: str, bag: Bag, settings: messages.TopicSettings, file: Path | None) -> None:
         self.name, self.bag, self.settings, self.file = name, bag, settings, file
         self.roles = roles = assign_roles(bag, settings, file)
-        self.sensors: dict[str, CameraTopic | LidarTopic] = {**roles.lidars, **roles.cameras}
+        self.sensors: dict[str, messages.CameraTopic | messages.LidarTopic] = {**roles.lidars, **roles.cameras}
         # Topics that are read at once, with the number of bytes; None for whole messages. An IMU is read for the orientation that
         # fixes lack.
         kinds = ("tf", "odometry", "pose", "gnss") + (("imu",) if "gnss" in roles.topics else ())
@@ -296,7 +284,7 @@ class _Opening:
             damaged = 0
             for i, raw in enumerate(self.messages[topic.name]):
                 try:
-                    self.tree.add(decode_bytes(topic, raw or b"", bag.where(topic, i)).transforms)
+                    self.tree.add(messages.decode_bytes(topic, raw or b"", bag.where(topic, i)).transforms)
                 except RecordError:
                     damaged += 1
             if damaged:
@@ -317,7 +305,7 @@ class _Opening:
         for name in roles.topics.get("odometry", ()):
             raw = next((raw for raw in self.messages[name] if raw is not None), None)
             if raw is not None:
-                child = printable(decode_bytes(bag.topics[name], raw, name).child_frame_id).lstrip("/")
+                child = printable(messages.decode_bytes(bag.topics[name], raw, name).child_frame_id).lstrip("/")
                 pose_frames += [child] if child else []
         named = settings.ego.base_frame
         base, why = ego.choose_base(self.tree, sensor_frames, pose_frames, FIXED_FRAMES, named)
@@ -395,17 +383,17 @@ class _Opening:
             raise ConfigError(f"{self.file}: 'poses' asks for source '{wanted.source}', which gives none: {reasons}")
         return found, considered
 
-    def _stamps(self) -> dict[str, Stamped]:
+    def _stamps(self) -> dict[str, messages.Stamped]:
         stamped, delays = {}, {}
         for name, sensor in self.sensors.items():
             topic = self.bag.topics[sensor.topic]
             recorded = sensor.stamps == "recorded"
-            own = stamp_messages(topic, self.messages[topic.name], self.notes, recorded=recorded)
+            own = messages.stamp_messages(topic, self.messages[topic.name], self.notes, recorded=recorded)
             delays[topic.name] = own.delay_s
             stamped[name] = replace(own, t_ns=own.t_ns + round(sensor.offset_s * NS_PER_S))
         for kind in ("odometry", "pose", "gnss"):
             for name in self.roles.topics.get(kind, ()):
-                delays[name] = stamp_messages(self.bag.topics[name], self.messages[name], []).delay_s
+                delays[name] = messages.stamp_messages(self.bag.topics[name], self.messages[name], []).delay_s
         # Topics whose header stamps are of another clock than most, by their delay to the recorder.
         known = {name: delay for name, delay in delays.items() if delay is not None}
         # The middle one by size: of two, that of the recorder's clock.
@@ -459,7 +447,7 @@ class _Opening:
                 )
         return cameras
 
-    def _info(self, chosen: CameraTopic) -> Any:
+    def _info(self, chosen: messages.CameraTopic) -> Any:
         """First readable CameraInfo of a camera; a later one that differs is noted."""
         if not chosen.info:
             raise calibration.CalibrationProblem("no CameraInfo belongs to it by namespace or frame")
@@ -470,7 +458,7 @@ class _Opening:
             try:
                 # A header of constant length precedes the calibration.
                 if info is None:
-                    info, first = decode_bytes(topic, raw, self.bag.where(topic, i)), raw[12:]
+                    info, first = messages.decode_bytes(topic, raw, self.bag.where(topic, i)), raw[12:]
                 elif raw[12:] != first:
                     self.notes.append(f"{chosen.info}: changes at message {i}; the first one is used throughout")
                     break

@@ -25,22 +25,10 @@ from log2sim.logs.arrow import Kind, ParquetRows, Row, read_columns
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import FolderReader
 from log2sim.logs.stamps import MAX_TIME_S
+from log2sim.logs.waymo import segment
 from log2sim.logs.waymo.messages import WireError
 from log2sim.logs.waymo.range_images import checked, shaped
-from log2sim.logs.waymo.reader import SegmentLog
-from log2sim.logs.waymo.segment import (
-    CAMERAS,
-    LASERS,
-    MAX_BEAMS,
-    BoxTable,
-    CameraCalibration,
-    FrameRow,
-    ImageTimes,
-    LaserCalibration,
-    RangeImages,
-    Segment,
-    rigid,
-)
+from log2sim.logs.waymo.reader import Segment
 
 Columns = dict[str, NDArray[Any]]
 
@@ -76,7 +64,7 @@ def read_poses(path: Path) -> tuple[list[int], list[Array], list[str]]:
     return [t for t, _ in usable], [pose for _, pose in usable], notes
 
 
-def read_camera_calibration(path: Path) -> dict[int, CameraCalibration]:
+def read_camera_calibration(path: Path) -> dict[int, segment.CameraCalibration]:
     """Read the calibration of the cameras by number."""
     extrinsic = f"{CAMERA_PREFIX}.extrinsic.transform"
     whole = [f"{CAMERA_PREFIX}.{name}" for name in ("width", "height", "rolling_shutter_direction")]
@@ -84,10 +72,10 @@ def read_camera_calibration(path: Path) -> dict[int, CameraCalibration]:
         path, {CAMERA: "text", extrinsic: "floats", **dict.fromkeys(INTRINSICS, "float"), **dict.fromkeys(whole, "int")}
     )
     out = {}
-    for row, number in enumerate(numbers_of(columns[CAMERA], CAMERAS).tolist()):
+    for row, number in enumerate(numbers_of(columns[CAMERA], segment.CAMERAS).tolist()):
         intrinsic = np.array([columns[name][row] for name in INTRINSICS], dtype=np.float64)
         pose, sizes = matrix(columns[extrinsic][row]), (int(columns[name][row]) for name in whole)
-        camera = None if pose is None else CameraCalibration(intrinsic, pose, *sizes)
+        camera = None if pose is None else segment.CameraCalibration(intrinsic, pose, *sizes)
         if camera is None or not camera.is_usable:
             expected = f"expected finite intrinsics, a rigid extrinsic, width and height of camera {number}"
             raise LogError(f"{path}, row {row}: {expected}")
@@ -95,26 +83,26 @@ def read_camera_calibration(path: Path) -> dict[int, CameraCalibration]:
     return out
 
 
-def read_laser_calibration(path: Path) -> dict[int, LaserCalibration]:
+def read_laser_calibration(path: Path) -> dict[int, segment.LaserCalibration]:
     """Read the calibration of the LiDARs by number."""
     extrinsic, values = f"{LASER_PREFIX}.extrinsic.transform", f"{LASER_PREFIX}.beam_inclination.values"
     limits = [f"{LASER_PREFIX}.beam_inclination.{name}" for name in ("min", "max")]
     wanted: dict[str, Kind] = {LASER: "text", extrinsic: "floats", values: "floats", **dict.fromkeys(limits, "float")}
     columns = read_columns(path, wanted, optional=(values,))
     out = {}
-    for row, number in enumerate(numbers_of(columns[LASER], LASERS).tolist()):
+    for row, number in enumerate(numbers_of(columns[LASER], segment.LASERS).tolist()):
         pose = matrix(columns[extrinsic][row])
         cell = columns[values][row] if values in columns else None
         beams = np.zeros(0) if cell is None else np.asarray(cell, dtype=np.float64)
         low, high = (float(columns[name][row]) for name in limits)
         known = np.isfinite(beams).all() if len(beams) else np.isfinite([low, high]).all()
-        if pose is None or not known or len(beams) > MAX_BEAMS:
+        if pose is None or not known or len(beams) > segment.MAX_BEAMS:
             raise LogError(f"{path}, row {row}: expected a rigid extrinsic and finite inclinations of LiDAR {number}")
-        out[number] = LaserCalibration(pose, beams, (low, high))
+        out[number] = segment.LaserCalibration(pose, beams, (low, high))
     return out
 
 
-def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int | None = None) -> BoxTable:
+def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int | None = None) -> segment.BoxTable:
     """Read 3D labels, or the 2D labels of a camera by number; `frame_of` gives the index of the frame of a stamp."""
     axes, track = ("xyz", "key.laser_object_id") if camera is None else ("xy", CAMERA)
     numbers = [f"{prefix}.box.{part}.{axis}" for part in ("center", "size") for axis in axes]
@@ -122,12 +110,14 @@ def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int
     kind = f"{prefix}.type"
     columns = read_columns(path, {STAMP: "int", track: "text", kind: "int", **dict.fromkeys(numbers, "float")})
     if camera is not None:
-        rows = numbers_of(columns[CAMERA], CAMERAS) == camera
+        rows = numbers_of(columns[CAMERA], segment.CAMERAS) == camera
         columns = {name: values[rows] for name, values in columns.items()}
     frame = np.array([frame_of.get(int(t), -1) for t in columns[STAMP]], dtype=np.int64)
     box = np.stack([columns[name].astype(np.float64) for name in numbers], axis=1)
     tracks = [str(word) for word in columns[track]]
-    return BoxTable.of(frame, tracks, columns[kind], box, int((frame < 0).sum())).take(np.flatnonzero(frame >= 0))
+    return segment.BoxTable.of(frame, tracks, columns[kind], box, int((frame < 0).sum())).take(
+        np.flatnonzero(frame >= 0)
+    )
 
 
 def numbers_of(words: NDArray[Any], names: Mapping[int, str]) -> NDArray[np.int64]:
@@ -138,7 +128,7 @@ def numbers_of(words: NDArray[Any], names: Mapping[int, str]) -> NDArray[np.int6
 
 def matrix(cell: Any) -> Any:
     """Return the transform (4, 4) of a cell; None when it is none."""
-    return None if cell is None else rigid(np.asarray(cell, dtype=np.float64))
+    return None if cell is None else segment.rigid(np.asarray(cell, dtype=np.float64))
 
 
 class SensorRows:
@@ -199,80 +189,62 @@ class WaymoParquetReader(FolderReader):
     def open(self, path: Path, sequence: str) -> Log:
         """Open a segment; no picture, range image or label is read."""
         require_links_inside(path)
-        return _SegmentFolder(path, sequence).log()
+        return _SegmentFolder(path, sequence).log(self.name)
 
 
 READER = WaymoParquetReader()
 
 
-class _SegmentFolder:
+class _SegmentFolder(Segment):
     def __init__(self, root: Path, name: str) -> None:
-        self.root, self.name = root, name
-        self.stamps_us, self.poses, self.notes = read_poses(self._file(POSES))
-        self.frame_of = {t: k for k, t in enumerate(self.stamps_us)}
+        def file(component: str) -> Path:
+            return root / component / f"{name}.parquet"
+
+        self.stamps_us, poses, notes = read_poses(file(POSES))
+        frame_of = {t: k for k, t in enumerate(self.stamps_us)}
         of_lidars: dict[str, Kind] = {STAMP: "int", LASER: "text"}
         second = [f"{LIDAR_RETURNS[1]}.{part}" for part in ("values", "shape")]
-        self.sweeps = self._rows("lidar", of_lidars, LASERS, _matrices(*LIDAR_RETURNS), second)
-        self.pixel_poses = self._rows("lidar_pose", of_lidars, LASERS, _matrices(PIXEL_POSES))
-        self.images = self._rows("camera_image", IMAGE_COLUMNS, CAMERAS, {f"{IMAGE}.image": "bytes"})
-
-    def log(self) -> Log:
+        self.sweeps = SensorRows(file("lidar"), of_lidars, segment.LASERS, frame_of, _matrices(*LIDAR_RETURNS), second)
+        self.pixel_poses = SensorRows(file("lidar_pose"), of_lidars, segment.LASERS, frame_of, _matrices(PIXEL_POSES))
+        self.images = SensorRows(
+            file("camera_image"), IMAGE_COLUMNS, segment.CAMERAS, frame_of, {f"{IMAGE}.image": "bytes"}
+        )
+        notes += [rows.note for rows in (self.sweeps, self.pixel_poses, self.images) if rows.note]
         # Boxes projected from 3D labels go before boxes drawn in the images.
         boxes, projected, drawn = (
-            partial(read_boxes, self._file(component), prefix, self.frame_of)
-            if is_present(self._file(component))
-            else None
+            partial(read_boxes, file(component), prefix, frame_of) if is_present(file(component)) else None
             for component, prefix in (LIDAR_BOXES, PROJECTED_BOXES, CAMERA_BOXES)
         )
-        in_images = projected or drawn
-        frames = [FrameRow(t * 1000, pose, {}, ()) for t, pose in zip(self.stamps_us, self.poses)]
+        frames = [segment.FrameRow(t * 1000, pose, {}, ()) for t, pose in zip(self.stamps_us, poses)]
         for (k, number), row in self.images.rows.items():
             # NaN counts as unknown.
             pose, *times = (self.images.columns[name][row] for name in IMAGE_COLUMNS if name not in (STAMP, CAMERA))
             seconds = (float(s) if np.isfinite(s) else 0.0 for s in times)
-            frames[k].images[number] = ImageTimes(matrix(pose), *seconds)
+            frames[k].images[number] = segment.ImageTimes(matrix(pose), *seconds)
         for k, number in self.sweeps.rows:
             frames[k] = replace(frames[k], lasers=(*frames[k].lasers, number))
-        statistics, stats = {}, self._file("stats")
-        if is_present(stats):
+        statistics = {}
+        if is_present(file("stats")):
             names: dict[str, Kind] = {f"[StatsComponent].{word}": "text" for word in STATISTICS}
-            columns = read_columns(stats, names, optional=tuple(names))
+            columns = read_columns(file("stats"), names, optional=tuple(names))
             statistics = {name.rpartition(".")[2]: str(values[0]) for name, values in columns.items() if len(values)}
-        files = sorted(self.root.glob(f"*/{self.name}.parquet"))
-        sizes = [f"{file.parent.name} {file.stat().st_size}" for file in files]
-        segment = Segment(
-            name=self.name,
-            path=self.root,
-            cameras=read_camera_calibration(self._file("camera_calibration")) if self.images.rows else {},
-            lasers=read_laser_calibration(self._file("lidar_calibration")) if self.sweeps.rows else {},
-            frames=frames,
-            image=self._image,
-            ranges=self._ranges,
-            boxes=boxes,
-            image_boxes=in_images and (lambda camera: in_images(camera=camera)),
-            image_boxes_are_projected=projected is not None,
-            pixel_poses_are_missing=not self.pixel_poses.rows,
-            where=lambda frame: f"{self.root}: segment {self.name}, frame {self.stamps_us[frame]}",
-            details={**statistics, "frames": len(self.poses)},
-            notes=self.notes,
-        )
-        digest = digest_of([self.name, repr(self.stamps_us), np.stack(self.poses).tobytes().hex(), *sizes], [])
-        return SegmentLog(segment).log(READER.name, digest)
+        cameras = read_camera_calibration(file("camera_calibration")) if self.images.rows else {}
+        lasers = read_laser_calibration(file("lidar_calibration")) if self.sweeps.rows else {}
+        super().__init__(name, root, frames, cameras, lasers, notes, {**statistics, "frames": len(poses)})
+        self.boxes, in_images = boxes, projected or drawn
+        self.image_boxes = in_images and (lambda camera: in_images(camera=camera))
+        self.image_boxes_are_projected = projected is not None
+        self.pixel_poses_are_missing = not self.pixel_poses.rows
+        sizes = [f"{f.parent.name} {f.stat().st_size}" for f in sorted(root.glob(f"*/{name}.parquet"))]
+        self.digest = digest_of([name, repr(self.stamps_us), np.stack(poses).tobytes().hex(), *sizes], [])
 
-    def _file(self, component: str) -> Path:
-        return self.root / component / f"{self.name}.parquet"
+    def where(self, frame: int) -> str:
+        return f"{self.path}: segment {self.name}, frame {self.stamps_us[frame]}"
 
-    def _rows(
-        self, component: str, index: Any, names: dict[int, str], kinds: Any, optional: Collection[str] = ()
-    ) -> SensorRows:
-        rows = SensorRows(self._file(component), index, names, self.frame_of, kinds, optional)
-        self.notes += [rows.note] if rows.note else []
-        return rows
-
-    def _image(self, frame: int, camera: int) -> bytes:
+    def image(self, frame: int, camera: int) -> bytes:
         return bytes((self.images.read(frame, camera) or {}).get(f"{IMAGE}.image") or b"")
 
-    def _ranges(self, frame: int, laser: int) -> RangeImages:
+    def ranges(self, frame: int, laser: int) -> segment.RangeImages:
         row, of_pixels = self.sweeps.read(frame, laser), self.pixel_poses.read(frame, laser)
         try:
             returns = [image for name in LIDAR_RETURNS if (image := _image_of(row, name)) is not None]

@@ -26,40 +26,7 @@ from log2sim.geometry import Camera, PoseTrack, RollingShutter, shift_poses, tra
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import sweep_of
 from log2sim.logs.stamps import MAX_TIME_S, defer_notes, strictly_increasing
-from log2sim.logs.waymo.messages import (
-    FrameIndex,
-    RecordFile,
-    Span,
-    WireError,
-    read_box,
-    read_calibration,
-    read_camera_labels,
-    read_index,
-    segment_name,
-    starts_like_tfrecord,
-    take_index,
-)
-from log2sim.logs.waymo.range_images import (
-    LabelsOnRequest,
-    image_labels_of,
-    intensities_of,
-    labels_of,
-    points_of,
-    read_range_images,
-)
-from log2sim.logs.waymo.segment import (
-    CAMERAS,
-    LASERS,
-    TOP,
-    BoxTable,
-    CameraCalibration,
-    FrameRow,
-    FrameTimes,
-    LaserCalibration,
-    RangeImages,
-    Segment,
-    plausible_stamp,
-)
+from log2sim.logs.waymo import messages, range_images, segment
 
 # From OpenCV's axes to x forward, y left, z up.
 CAMERA_T_OPENCV = transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -76,60 +43,109 @@ MAX_POSE_MISMATCH_M = 0.05
 Stamps = NDArray[np.int64]
 
 
-class SegmentLog:
-    """A segment with its frames in order; frames are counted in this order from here on."""
+class Segment:
+    """A segment of either version as a log, with its frames in the order of their stamps.
 
-    def __init__(self, segment: Segment) -> None:
-        self.segment, self.notes = segment, list(segment.notes)
-        stamps = np.array([frame.stamp_ns for frame in segment.frames], dtype=np.int64)
+    Subclasses read its records, `image` as a JPEG, `ranges`, and where there are labels `boxes` in 3D and `image_boxes` of a camera;
+    they count frames in the order in which they gave them here.
+    """
+
+    digest: str
+    boxes: Callable[[], segment.BoxTable] | None = None
+    image_boxes: Callable[[int], segment.BoxTable] | None = None
+    image_boxes_are_projected = False  # whether they are the 3D labels projected into the images, not drawn in them
+    pixel_poses_are_missing = False  # whether range images of the TOP LiDAR come without the poses that belong to them
+
+    def __init__(
+        self, name: str, path: Path, frames: list[segment.FrameRow], cameras: Mapping[int, segment.CameraCalibration],
+        lasers: Mapping[int, segment.LaserCalibration], notes: list[str], details: Mapping[str, Any],
+    ) -> None:  # fmt: skip
+        self.name, self.path, self.cameras, self.lasers = name, path, cameras, lasers
+        self.notes, self.details, self.given = notes, details, len(frames)
+        stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
         self.order = strictly_increasing(stamps, "frames", self.notes)
-        self.frames = [segment.frames[k] for k in self.order]
-        self.times = FrameTimes.of(self.frames, self.notes)
+        self.frames = [frames[k] for k in self.order]
+        self.times = segment.FrameTimes.of(self.frames, self.notes)
         world_T_vehicle = np.stack([frame.world_T_vehicle for frame in self.frames])
         self.offset_m = whole_kilometers(world_T_vehicle[:, :3, 3])
         self.map_T_vehicle = shift_poses(world_T_vehicle, self.offset_m)
 
-    def log(self, format: str, digest: str) -> Log:
+    def image(self, frame: int, camera: int) -> bytes:
+        """Read the JPEG of a camera; raises `RecordError`."""
+        raise NotImplementedError
+
+    def ranges(self, frame: int, laser: int) -> segment.RangeImages:
+        """Read the range images of a LiDAR; raises `RecordError`."""
+        raise NotImplementedError
+
+    def where(self, frame: int) -> str:
+        """Name a frame in errors."""
+        raise NotImplementedError
+
+    def log(self, format: str) -> Log:
         """Make a log of the segment; `LogError` when it has neither images nor points."""
         cameras, streams, image_ns = self._cameras()
         lidars, sweeps = self._lidars()
         if not cameras and not lidars:
             raise LogError(
-                f"{self.segment.path}: {len(self.frames)} frames with neither images nor range images that have a calibration"
+                f"{self.path}: {len(self.frames)} frames with neither images nor range images that have a calibration"
             )
-        self._note_limits(lidars)
+        # What the format lacks.
+        notes, top = self.notes, f"LIDAR_{segment.LASERS[segment.TOP]}"
+        if top in lidars:
+            notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
+            if not len(self.lasers[segment.TOP].inclinations_rad):  # only the short-range LiDARs have even beams
+                lacks = "the calibration lacks the inclinations of the TOP LiDAR's beams"
+                notes.append(f"{lacks}: they are taken to be even between the lowest and the highest")
+            if self.pixel_poses_are_missing:
+                lacks = "the poses of the pixels are missing"
+                notes.append(f"{lacks}: points of the TOP LiDAR are as measured, not compensated")
+        if set(lidars) - {top}:
+            notes.append("no times of points of the short-range LiDARs")
+        if self.boxes is not None:
+            lacks = "labels do not distinguish cars from trucks, buses and motorcycles"
+            notes.append(f"{lacks}: all vehicles are read as cars")
+        if self.image_boxes is not None:
+            how = "3D labels projected into them" if self.image_boxes_are_projected else "boxes drawn in them"
+            notes.append(f"labels of images are the {how}")
+        vehicle, size = ego_vehicle_of(self.lasers), "that of a Chrysler Pacifica is assumed"
+        if vehicle is not PACIFICA:
+            size = "length by the LiDARs at its bumpers, the rest as a Pacifica's"
+        notes.append(f"the size of the ego vehicle is not in the log: {size}")
 
         @cache
         def labels() -> Labels | None:
-            if self.segment.boxes is None:
+            if self.boxes is None:
                 return None
-            table, top = self._in_order(self.segment.boxes()), self.segment.lasers.get(TOP)
-            return labels_of(table, self.times, self.map_T_vehicle, top, self.notes)
+            table = self._in_order(self.boxes())
+            return range_images.labels_of(
+                table, self.times, self.map_T_vehicle, self.lasers.get(segment.TOP), self.notes
+            )
 
         image_labels = self._image_labels(cameras, image_ns)
         return Log(
-            name=f"waymo-{self.segment.name}",
+            name=f"waymo-{self.name}",
             format=format,
             cameras=cameras,
             lidars=lidars,
             streams=streams | sweeps,
             ego=self._ego(),
-            ego_vehicle=ego_vehicle_of(self.segment.lasers),
+            ego_vehicle=vehicle,
             map=MapFrame(offset_m=(float(self.offset_m[0]), float(self.offset_m[1]), float(self.offset_m[2]))),
-            labels=None if self.segment.boxes is None else labels,
+            labels=None if self.boxes is None else labels,
             image_labels=image_labels,
             reference_camera=next(iter(cameras), None),
-            digest=digest,
+            digest=self.digest,
             notes=defer_notes(self.notes, labels, *(partial(image_labels.get, name) for name in image_labels)),
-            calibrations=dict.fromkeys(streams | sweeps, f"{self.segment.path}, its calibrations"),
-            details=self.segment.details,
+            calibrations=dict.fromkeys(streams | sweeps, f"{self.path}, its calibrations"),
+            details=self.details,
         )
 
     def _cameras(self) -> tuple[dict[str, Camera], dict[str, Stream], dict[int, Stamps]]:
         """Cameras with images, their streams, and their stamp (F,) in each frame, -1 where there is none."""
         cameras, streams, image_ns = {}, {}, {}
-        for number, name in CAMERAS.items():
-            calibration = self.segment.cameras.get(number)
+        for number, name in segment.CAMERAS.items():
+            calibration = self.cameras.get(number)
             rows = np.array([k for k, frame in enumerate(self.frames) if number in frame.images], dtype=np.intp)
             if calibration is None or not len(rows):
                 if len(rows):
@@ -144,7 +160,8 @@ class SegmentLog:
                     f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
                 )
             stamped = [
-                (plausible_stamp(self.frames[k].images[number].middle_ns(), self.frames[k].stamp_ns), k) for k in rows
+                (segment.plausible_stamp(self.frames[k].images[number].middle_ns(), self.frames[k].stamp_ns), k)
+                for k in rows
             ]
             t_ns = np.array([self.times.pose_ns[k] if stamp is None else stamp for stamp, k in stamped], dtype=np.int64)
             keep = strictly_increasing(t_ns, name, self.notes)
@@ -156,10 +173,10 @@ class SegmentLog:
 
     def _image_stream(self, camera: Camera, number: int, rows: NDArray[np.intp], t_ns: Stamps) -> Stream:
         def encoded(i: int) -> bytes:
-            return self.segment.image(int(self.order[rows[i]]), number)
+            return self.image(int(self.order[rows[i]]), number)
 
         def read(i: int) -> NDArray[np.uint8]:
-            where = f"{self.segment.where(int(self.order[rows[i]]))}, {camera.name} (stamp {t_ns[i]})"
+            where = f"{self.where(int(self.order[rows[i]]))}, {camera.name} (stamp {t_ns[i]})"
             return decode_image(encoded(i), where, (camera.width_px, camera.height_px))
 
         return Stream(camera.name, t_ns, read, encoded)
@@ -167,8 +184,8 @@ class SegmentLog:
     def _lidars(self) -> tuple[dict[str, Lidar], dict[str, Stream]]:
         """LiDARs with range images, and their streams."""
         lidars, streams = {}, {}
-        for number, word in LASERS.items():
-            name, calibration = f"LIDAR_{word}", self.segment.lasers.get(number)
+        for number, word in segment.LASERS.items():
+            name, calibration = f"LIDAR_{word}", self.lasers.get(number)
             rows = np.array([k for k, frame in enumerate(self.frames) if number in frame.lasers], dtype=np.intp)
             if len(rows) and calibration is None:
                 self.notes.append(f"{name}: {len(rows)} sweeps left out: no calibration of this LiDAR")
@@ -182,20 +199,23 @@ class SegmentLog:
         return lidars, streams
 
     def _sweep_stream(self, name: str, number: int, rows: NDArray[np.intp]) -> Stream:
-        calibration, stamps = self.segment.lasers[number], self.times.pose_ns[rows]
+        calibration, stamps = self.lasers[number], self.times.pose_ns[rows]
 
         def read(i: int) -> Sweep:
             row, stamp_ns = rows[i], int(stamps[i])
-            images = self.segment.ranges(int(self.order[row]), number)
+            images = self.ranges(int(self.order[row]), number)
             try:
-                xyz_m, turn = points_of(images, calibration, self.frames[row].world_T_vehicle)
-            except WireError as error:
-                where = self.segment.where(int(self.order[row]))
-                raise RecordError(f"{where}, {name} (stamp {stamp_ns}): {error}") from None
+                xyz_m, turn = range_images.points_of(images, calibration, self.frames[row].world_T_vehicle)
+            except messages.WireError as error:
+                raise RecordError(f"{self.where(int(self.order[row]))}, {name} (stamp {stamp_ns}): {error}") from None
             # How the short-range LiDARs scan is not documented.
-            timed = self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == TOP else None
-            raw = number == TOP and self.segment.pixel_poses_are_missing
-            return sweep_of(xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns, intensities_of(images))
+            timed = (
+                self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == segment.TOP else None
+            )
+            raw = number == segment.TOP and self.pixel_poses_are_missing
+            return sweep_of(
+                xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns, range_images.intensities_of(images)
+            )
 
         return Stream(name, stamps, read)
 
@@ -205,7 +225,7 @@ class SegmentLog:
         off_m = [0.0]
         for frame, own_ns, own in zip(self.frames, self.times.pose_ns, self.map_T_vehicle):
             for image in frame.images.values():
-                stamp = plausible_stamp(image.pose_ns(), frame.stamp_ns)
+                stamp = segment.plausible_stamp(image.pose_ns(), frame.stamp_ns)
                 if stamp is None or image.world_T_vehicle is None:
                     continue
                 pose = shift_poses(image.world_T_vehicle, self.offset_m)
@@ -222,10 +242,10 @@ class SegmentLog:
         return PoseTrack(t_ns, np.stack(poses)[first])
 
     def _image_labels(self, cameras: dict[str, Camera], image_ns: dict[int, Stamps]) -> Mapping[str, ImageLabels]:
-        boxes = self.segment.image_boxes
+        boxes = self.image_boxes
         if boxes is None:
             return {}
-        number_of = {name: number for number, name in CAMERAS.items()}
+        number_of = {name: number for number, name in segment.CAMERAS.items()}
 
         def read(name: str) -> ImageLabels:
             number, camera = number_of[name], cameras[name]
@@ -233,44 +253,20 @@ class SegmentLog:
             lost = table.lost + int((image_ns[number][table.frame] < 0).sum())
             if lost:
                 self.notes.append(f"{lost} boxes in images of '{name}' are damaged or of no frame, and left out")
-            return image_labels_of(table, image_ns[number], (camera.width_px, camera.height_px))
+            return range_images.image_labels_of(table, image_ns[number], (camera.width_px, camera.height_px))
 
-        return LabelsOnRequest(tuple(cameras), read)
+        return range_images.LabelsOnRequest(tuple(cameras), read)
 
-    def _in_order(self, table: BoxTable) -> BoxTable:
+    def _in_order(self, table: segment.BoxTable) -> segment.BoxTable:
         """Count the frames of a table in their order; drops rows of frames that are not used."""
-        place = np.full(len(self.segment.frames), -1, dtype=np.int64)
+        place = np.full(self.given, -1, dtype=np.int64)
         place[self.order] = np.arange(len(self.order))
         frame = place[table.frame]
         rows = np.flatnonzero(frame >= 0)
         return replace(table, frame=frame, lost=table.lost + len(frame) - len(rows)).take(rows)
 
-    def _note_limits(self, lidars: dict[str, Lidar]) -> None:
-        """Note what the format lacks."""
-        segment, notes, top = self.segment, self.notes, f"LIDAR_{LASERS[TOP]}"
-        if top in lidars:
-            notes.append("no times of points: those of the TOP LiDAR are estimated from the column of the range image")
-            if not len(segment.lasers[TOP].inclinations_rad):  # only the short-range LiDARs have even beams
-                lacks = "the calibration lacks the inclinations of the TOP LiDAR's beams"
-                notes.append(f"{lacks}: they are taken to be even between the lowest and the highest")
-            if segment.pixel_poses_are_missing:
-                lacks = "the poses of the pixels are missing"
-                notes.append(f"{lacks}: points of the TOP LiDAR are as measured, not compensated")
-        if set(lidars) - {top}:
-            notes.append("no times of points of the short-range LiDARs")
-        if segment.boxes is not None:
-            lacks = "labels do not distinguish cars from trucks, buses and motorcycles"
-            notes.append(f"{lacks}: all vehicles are read as cars")
-        if segment.image_boxes is not None:
-            how = "3D labels projected into them" if segment.image_boxes_are_projected else "boxes drawn in them"
-            notes.append(f"labels of images are the {how}")
-        size = "that of a Chrysler Pacifica is assumed"
-        if ego_vehicle_of(segment.lasers) is not PACIFICA:
-            size = "length by the LiDARs at its bumpers, the rest as a Pacifica's"
-        notes.append(f"the size of the ego vehicle is not in the log: {size}")
 
-
-def camera_of(name: str, calibration: CameraCalibration, frames: list[FrameRow], number: int) -> Camera:
+def camera_of(name: str, calibration: segment.CameraCalibration, frames: list[segment.FrameRow], number: int) -> Camera:
     """Make a camera with OpenCV's axes; the readout is the median of its images in `frames`."""
     f_u, f_v, c_u, c_v, *lens = (float(v) for v in calibration.intrinsic)
     spans = [frame.images[number].readout_s() for frame in frames]
@@ -282,7 +278,7 @@ def camera_of(name: str, calibration: CameraCalibration, frames: list[FrameRow],
     return Camera(name, calibration.width_px, calibration.height_px, K, "ego", ego_T_cam, "brown", tuple(lens), shutter)
 
 
-def ego_vehicle_of(lasers: Mapping[int, LaserCalibration]) -> EgoVehicle:
+def ego_vehicle_of(lasers: Mapping[int, segment.LaserCalibration]) -> EgoVehicle:
     """Return the Pacifica, or a vehicle with the distance of the LiDARs at its bumpers as length where that differs."""
     if LASER_FRONT not in lasers or LASER_REAR not in lasers:
         return PACIFICA
@@ -310,7 +306,7 @@ class WaymoReader:
                 require_link_inside(file, path if path.is_dir() else file)
             except LogError:  # a link that must not be read, which opening it reports
                 return True
-            if starts_like_tfrecord(file):
+            if messages.starts_like_tfrecord(file):
                 return True
         return False
 
@@ -322,7 +318,7 @@ class WaymoReader:
         """Open a segment; no picture, range image or label is read."""
         file = path if path.is_file() else path / f"{sequence}{SUFFIX}"
         require_link_inside(file, file if path.is_file() else path)
-        return _SegmentFile(file).log()
+        return _SegmentFile(file).log(self.name)
 
 
 READER = WaymoReader()
@@ -335,26 +331,25 @@ def _files(path: Path) -> list[Path]:
         return []
 
 
-class _SegmentFile:
-    def __init__(self, path: Path) -> None:
-        self.path, self.file = path, RecordFile(path)
-        # Usable frames: number of the record and index of each.
-        self.record, self.index, self.frames = list[int](), list[FrameIndex](), list[FrameRow]()
-        self.boxes_by_camera: dict[int, list[tuple[int, str, int, list[float]]]] | None = None
+class _SegmentFile(Segment):
+    """The frames of the segment to which the first one of a file belongs; opening reads the index of each."""
 
-    def log(self) -> Log:
-        """Read the index of every frame of the segment to which the first one belongs, and make a log of them."""
+    def __init__(self, path: Path) -> None:
+        self.file = messages.RecordFile(path)
+        # Usable frames: number of the record and index of each.
+        self.record, self.index, frames = list[int](), list[messages.FrameIndex](), list[segment.FrameRow]()
+        self.boxes_by_camera: dict[int, list[tuple[int, str, int, list[float]]]] | None = None
         name, context, left_out = "", b"", list[str]()
-        cameras, lasers, stats = read_calibration(context)
+        cameras, lasers, stats = messages.read_calibration(context)
         for k in range(len(self.file.spans)):
             try:
                 with self.file.window(k) as window:
-                    index = read_index(window)
-                    own = segment_name(window, index.context)
+                    index = messages.read_index(window)
+                    own = messages.segment_name(window, index.context)
                     if not self.index:
-                        name, context = own, take_index(window, index.context)
-                        cameras, lasers, stats = read_calibration(context)
-            except (WireError, OSError) as error:
+                        name, context = own, messages.take_index(window, index.context)
+                        cameras, lasers, stats = messages.read_calibration(context)
+            except (messages.WireError, OSError) as error:
                 left_out.append(f"record {k}: not a readable frame: {error}")
                 continue
             if index.stamp_us is None or not 0 < index.stamp_us < MAX_TIME_S * 10**6:
@@ -365,62 +360,51 @@ class _SegmentFile:
                 expected = f"the file's first frame is of '{name}'; expected one segment a file"
                 left_out.append(f"record {k}: of segment '{own}', {expected}")
             else:
-                images = {number: times for number, (times, _) in index.images.items() if number in CAMERAS}
-                self.frames.append(FrameRow(index.stamp_us * 1000, index.pose, images, tuple(index.lasers)))
+                images = {number: times for number, (times, _) in index.images.items() if number in segment.CAMERAS}
+                frames.append(segment.FrameRow(index.stamp_us * 1000, index.pose, images, tuple(index.lasers)))
                 self.record.append(k)
                 self.index.append(index)
-        notes, index_of = [*self.file.notes], self.index
+        notes = [*self.file.notes]
         if left_out:
             notes.append(f"{len(left_out)} of {len(self.file.spans)} records left out; {left_out[0]}")
-        if not index_of:
-            raise LogError(f"{self.path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
-        self.projected = any(f.projected_labels for f in index_of)
-        zones = sum(f.no_label_zones > 0 for f in index_of)
+        if not frames:
+            raise LogError(f"{path}: no usable frame; {'; '.join(notes) or 'the file is empty'}")
+        zones = sum(f.no_label_zones > 0 for f in self.index)
         if zones:
-            notes.append(f"{zones} of {len(index_of)} frames have zones in which objects are not labeled")
-        segment = Segment(
-            name=name,
-            path=self.path,
-            cameras=cameras,
-            lasers=lasers,
-            frames=self.frames,
-            image=self._image,
-            ranges=self._ranges,
-            boxes=self._boxes if any(f.labels for f in index_of) else None,
-            image_boxes=self._image_boxes if any(f.projected_labels or f.camera_labels for f in index_of) else None,
-            image_boxes_are_projected=self.projected,
-            where=self._where,
-            details={**stats, "frames": len(index_of)},
-            notes=notes,
-        )
-        records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(self.record, index_of)]
-        return SegmentLog(segment).log(READER.name, digest_of([name, context.hex(), *records], []))
+            notes.append(f"{zones} of {len(frames)} frames have zones in which objects are not labeled")
+        super().__init__(name, path, frames, cameras, lasers, notes, {**stats, "frames": len(frames)})
+        self.boxes = self._boxes if any(f.labels for f in self.index) else None
+        self.image_boxes_are_projected = any(f.projected_labels for f in self.index)
+        drawn = any(f.camera_labels for f in self.index)
+        self.image_boxes = self._image_boxes if self.image_boxes_are_projected or drawn else None
+        records = [f"{f.stamp_us} {self.file.spans[k][1]}" for k, f in zip(self.record, self.index)]
+        self.digest = digest_of([name, context.hex(), *records], [])
 
-    def _where(self, frame: int) -> str:
+    def where(self, frame: int) -> str:
         return f"{self.path}: record {self.record[frame]}"
 
-    def _data(self, frame: int, span: Span) -> bytes:
+    def _data(self, frame: int, span: messages.Span) -> bytes:
         k, stamp_us = self.record[frame], self.index[frame].stamp_us
         return self.file.read(k, f"record {k}, stamp {stamp_us} us")[slice(*span)]
 
-    def _image(self, frame: int, camera: int) -> bytes:
+    def image(self, frame: int, camera: int) -> bytes:
         return self._data(frame, self.index[frame].images[camera][1])
 
-    def _ranges(self, frame: int, laser: int) -> RangeImages:
+    def ranges(self, frame: int, laser: int) -> segment.RangeImages:
         data = self._data(frame, self.index[frame].lasers[laser])
         try:
-            return read_range_images(data)
-        except WireError as error:
-            raise RecordError(f"{self._where(frame)}, LiDAR {laser}: {error}") from None
+            return range_images.read_range_images(data)
+        except messages.WireError as error:
+            raise RecordError(f"{self.where(frame)}, LiDAR {laser}: {error}") from None
 
-    def _boxes(self) -> BoxTable:
-        found, lost = self._read_all(lambda index: index.labels, lambda data: read_box(data, 3))
+    def _boxes(self) -> segment.BoxTable:
+        found, lost = self._read_all(lambda index: index.labels, lambda data: messages.read_box(data, 3))
         return _table([(frame, *box) for frame, box in found if box is not None], 3, lost)
 
-    def _image_boxes(self, camera: int) -> BoxTable:
+    def _image_boxes(self, camera: int) -> segment.BoxTable:
         if self.boxes_by_camera is None:
-            spans = (lambda f: f.projected_labels) if self.projected else (lambda f: f.camera_labels)
-            found, self.lost_boxes = self._read_all(spans, read_camera_labels)
+            spans = (lambda f: f.projected_labels) if self.image_boxes_are_projected else (lambda f: f.camera_labels)
+            found, self.lost_boxes = self._read_all(spans, messages.read_camera_labels)
             self.boxes_by_camera = {}
             for frame, (number, boxes) in found:
                 self.boxes_by_camera.setdefault(number, []).extend((frame, *box) for box in boxes)
@@ -429,7 +413,7 @@ class _SegmentFile:
         return _table(self.boxes_by_camera.get(camera, []), 2, lost)
 
     def _read_all(
-        self, spans: Callable[[FrameIndex], list[Span]], parse: Callable[[bytes], Any]
+        self, spans: Callable[[messages.FrameIndex], list[messages.Span]], parse: Callable[[bytes], Any]
     ) -> tuple[list[tuple[int, Any]], int]:
         """Parse messages of all frames: frame and content of each, and how many cannot be read."""
         out, lost = list[tuple[int, Any]](), 0
@@ -437,13 +421,15 @@ class _SegmentFile:
             with self.file.window(k) as window:
                 for span in spans(index):
                     try:
-                        out.append((frame, parse(take_index(window, span))))
-                    except WireError:
+                        out.append((frame, parse(messages.take_index(window, span))))
+                    except messages.WireError:
                         lost += 1
         return out, lost
 
 
-def _table(rows: list[tuple[int, str, int, list[float]]], dimensions: int, lost: int) -> BoxTable:
+def _table(rows: list[tuple[int, str, int, list[float]]], dimensions: int, lost: int) -> segment.BoxTable:
     """Make a table of rows: frame, id, type, and the numbers of a box."""
     frame, track_id, kind, box = zip(*rows) if rows else ((), (), (), ())
-    return BoxTable.of(frame, track_id, kind, np.array(box, dtype=np.float64).reshape(-1, 2 * dimensions + 1), lost)
+    return segment.BoxTable.of(
+        frame, track_id, kind, np.array(box, dtype=np.float64).reshape(-1, 2 * dimensions + 1), lost
+    )

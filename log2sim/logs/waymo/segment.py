@@ -5,9 +5,7 @@ Letters in shapes: F frames, B boxes, H rows and W columns of a range image.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -138,27 +136,6 @@ class BoxTable:
     def take(self, rows: NDArray[Any]) -> BoxTable:
         """Return some of the rows."""
         return replace(self, **{name: column[rows] for name, column in vars(self).items() if name != "lost"})
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """One segment of either version, with functions that read its records by index of the frame and number of the sensor."""
-
-    name: str
-    path: Path  # its file or folder, for errors
-    cameras: Mapping[int, CameraCalibration]
-    lasers: Mapping[int, LaserCalibration]
-    frames: list[FrameRow]  # at least one; not yet in order
-    image: Callable[[int, int], bytes]  # returns a JPEG; raises `RecordError`
-    ranges: Callable[[int, int], RangeImages]  # raises `RecordError`
-    boxes: Callable[[], BoxTable] | None  # reads the 3D labels; None for a segment without any
-    image_boxes: Callable[[int], BoxTable] | None  # reads the 2D labels of a camera by number; None without any
-    image_boxes_are_projected: bool  # whether they are the 3D labels projected into the images, not drawn in them
-    where: Callable[[int], str]  # names a frame by index in errors
-    # Whether range images of the TOP LiDAR come without the poses that belong to them
-    pixel_poses_are_missing: bool = False
-    details: Mapping[str, Any] = field(default_factory=dict)  # for `log2sim inspect`
-    notes: list[str] = field(default_factory=list)
 
 
 def rigid(numbers: Array) -> Array | None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, rectangle_overlap, wrap_angle
 from log2sim.perception.detect3d.network import NetworkInfo
 
@@ -73,7 +74,7 @@ MIN_HEAT_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class LevelBoxes:
+class LevelBoxes(Columns):
     """M boxes; x and y along the map's axes, z above the ground."""
 
     center_m: Array  # `center_m`, `size_m`: (M, 3)
@@ -84,14 +85,6 @@ class LevelBoxes:
     category: NDArray[np.str_]  # (M,)
     heat: Array  # `heat`, `quality`: (M,): logits of the object being there, and of the expected IoU
     quality: Array
-
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.group)
-
-    def take(self, index: NDArray[Any]) -> LevelBoxes:
-        """Take the boxes at `index`, integers or a mask."""
-        return LevelBoxes(**{k: v[index] for k, v in vars(self).items()})
 
     @property
     def rectangles(self) -> Array:

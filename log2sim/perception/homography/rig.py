@@ -11,13 +11,13 @@ one bundle over the feet of boxes in all cameras finds where boxes end, and how 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array, Camera, apply_homography, inverse, shift_poses
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
@@ -133,7 +133,7 @@ SHARED, OF_CAMERA = 1, 4
 
 
 @dataclass(frozen=True, eq=False)
-class RigRows:
+class RigRows(Columns):
     """Correspondences of all cameras of a rig, sorted by tick."""
 
     camera: NDArray[np.int64]  # (N,): number of the camera within the rig
@@ -159,18 +159,10 @@ class RigRows:
         return cls.join(parts)
 
     @classmethod
-    def join(cls, parts: list[RigRows]) -> RigRows:
-        """Concatenate several tables."""
-        out = cls(*(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts))))
+    def join(cls, parts: Sequence[RigRows]) -> RigRows:
+        """Concatenate several tables, by tick."""
+        out = super().join(parts)
         return out.take(np.argsort(out.tick, kind="stable"))
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return len(self.camera)
-
-    def take(self, index: Any) -> RigRows:
-        """Select rows by integers or a mask."""
-        return RigRows(*(column[index] for column in vars(self).values()))
 
 
 def heights_of(rig: Rig, rows: RigRows) -> HeightRows:
@@ -246,7 +238,7 @@ TILT_SIGMA = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class HeightRows:
+class HeightRows(Columns):
     """Heights of the ground at positions, by all cameras and ticks."""
 
     xy1: Array  # (N, 3): positions, m, rig frame, homogeneous
@@ -258,10 +250,6 @@ class HeightRows:
         """Compute the bounded losses (K,) of planes (K, 3)."""
         squared = ((planes @ self.xy1.T - self.height) / self.sigma) ** 2
         return np.asarray(np.minimum(squared, CHI2_1DOF_99).mean(axis=1))
-
-    def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> HeightRows:
-        """Select rows."""
-        return HeightRows(self.xy1[index], self.height[index], self.sigma[index], self.tick[index])
 
 
 def find_plane(rows: HeightRows, rng: np.random.Generator, samples: int = SAMPLES) -> Array | None:

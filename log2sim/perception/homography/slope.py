@@ -8,11 +8,11 @@ and past it: beyond is what lies on the other side of the line than the ego.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.fit import HomographyFit, RoadSlope, by_elements
@@ -41,7 +41,7 @@ MIN_ROWS = 80
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _Rows(Columns):
     """Correspondences of one camera."""
 
     uv: Array  # (N, 2): stabilized, px
@@ -49,9 +49,6 @@ class _Rows:
     xy_map: Array  # (N, 2): the same in the map
     base_map: Array  # (N, 2): where the ego was, m, map
     whiten: Array  # (N, 2, 2): makes pixel errors of unit variance
-
-    def take(self, index: Any) -> _Rows:
-        return _Rows(*(column[index] for column in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,18 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.datatypes import (
-    CATEGORIES,
-    GROUP_OF,
-    MIN_TRUSTED_CONFIDENCE,
-    STANDSTILL_MPS,
-    Agent,
-    Finding,
-    MapFeatures,
-    Scenario,
-    Waypoints,
-    explain_doubt,
-)
+from log2sim import datatypes
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.road.ground_map import GroundMap
@@ -49,9 +38,9 @@ def second_differences(values: ArrayLike, scale: float) -> list[int]:
 TOLERANCE_M = 0.02
 
 
-def feature_columns(scenario: Scenario) -> dict[str, Any]:
+def feature_columns(scenario: datatypes.Scenario) -> dict[str, Any]:
     """Return faces and arrows of lanes, lines and areas of markings, borders, and traffic lights; empty where there are none."""
-    features = scenario.map_features or MapFeatures()
+    features = scenario.map_features or datatypes.MapFeatures()
     return {
         "lanes": [
             {"outline": _columns(lane_outline(lane)), "arrows": [_columns(a) for a in lane_arrows(lane)]}
@@ -61,7 +50,7 @@ def feature_columns(scenario: Scenario) -> dict[str, Any]:
         "markings": [
             {
                 **_columns(m.points_m), "kind": m.kind, "yellow": m.color == "yellow", "width_m": round(m.width_m, 3),
-                "doubtful": m.confidence < MIN_TRUSTED_CONFIDENCE,
+                "doubtful": m.confidence < datatypes.MIN_TRUSTED_CONFIDENCE,
             }
             for m in features.markings
         ],
@@ -94,7 +83,7 @@ EVERY_TICKS = 2
 MAX_PREDICTIONS = 1_000_000  # of all agents together: 30 MB of a page for 3 s each
 
 
-def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[str, Any]]:
+def predicted_columns(scenario: datatypes.Scenario, horizon_s: float) -> dict[str, dict[str, Any]]:
     """Predict agents while they move: by agent, paths relative to where it was, and the ellipse at their ends.
 
     Raises `ConfigError` for a horizon that predictions do not have, or more predictions than a browser can be expected
@@ -102,7 +91,7 @@ def predicted_columns(scenario: Scenario, horizon_s: float) -> dict[str, dict[st
     """
     found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
     table, forecast = found.table, found.forecasts[DEFAULT_METHOD]
-    moves = np.abs(table.velocity_mps[found.row, found.tick]) >= STANDSTILL_MPS
+    moves = np.abs(table.velocity_mps[found.row, found.tick]) >= datatypes.STANDSTILL_MPS
     shown = moves & (found.tick % EVERY_TICKS == 0)
     if shown.sum() > MAX_PREDICTIONS:
         raise ConfigError(
@@ -170,7 +159,7 @@ def _shrunk(image: NDArray[np.uint8], edge_px: int) -> NDArray[np.uint8]:
 
 
 WAYPOINT_COLUMNS = ("t_s", "x_m", "y_m", "speed_mps")
-SIGMAS = ("sigma_xy_m", *Waypoints.OPTIONAL_FLOATS)
+SIGMAS = ("sigma_xy_m", *datatypes.Waypoints.OPTIONAL_FLOATS)
 # sRGB of usual paints by the names of `COLOR_NAMES`.
 PAINTS = {
     "black": (25, 25, 27), "white": (238, 238, 236), "gray": (105, 106, 108), "silver": (180, 182, 184), "red": (165, 25, 30),
@@ -180,9 +169,9 @@ MAX_ROWS = 3_000_000  # waypoints of all layers together; a page with this many 
 
 
 def page_document(
-    scenario: Scenario,
+    scenario: datatypes.Scenario,
     *,
-    truth: Scenario | None = None,
+    truth: datatypes.Scenario | None = None,
     replay: Any = None,
     predict_s: float | None = None,
     background: GroundMap | None = None,
@@ -250,13 +239,13 @@ def page_document(
         "metrics": [[title, text] for title, text in shown],
         "recording": None,
         "studio": {
-            "t0_ns": scenario.t0_ns, "map_offset_m": list(m.offset_m), "log": scenario.name, "categories": list(CATEGORIES),
+            "t0_ns": scenario.t0_ns, "map_offset_m": list(m.offset_m), "log": scenario.name, "categories": list(datatypes.CATEGORIES),
             "paints": {name: list(rgb) for name, rgb in PAINTS.items()}, "corrections": [],
         },
     }  # fmt: skip
 
 
-def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
+def _scenario(scenario: datatypes.Scenario) -> Iterator[dict[str, Any]]:
     """Yield the scenario's agents in the order of the pictures' legend: movers with their colors, then stationary ones."""
     roles, tell_ends = assign_view_roles(scenario), len(ends_of(scenario)) > 1
     marks: list[dict[str, Any]] = [
@@ -272,7 +261,11 @@ def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
         # How far it can be trusted; what nobody knows is left out.
         points = agent.quality.get("points_median")
         sigmas = {key: getattr(agent.waypoints, key) for key in SIGMAS}
-        low = () if agent.doubts or not agent.is_doubtful else (Finding("confidence", text=explain_doubt(agent)),)
+        low = (
+            ()
+            if agent.doubts or not agent.is_doubtful
+            else (datatypes.Finding("confidence", text=datatypes.explain_doubt(agent)),)
+        )
         entry |= mark | {
             "confidence": round(agent.confidence, 4),
             "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in (*agent.doubts, *low)],
@@ -286,7 +279,7 @@ def _scenario(scenario: Scenario) -> Iterator[dict[str, Any]]:
         yield entry | ({"observed_by": spans} if spans and tell_ends else {})
 
 
-def _source(agent: Agent) -> str:
+def _source(agent: datatypes.Agent) -> str:
     """Say from what an agent was reconstructed, as far as its `quality` tells."""
     quality = agent.quality
     if isinstance(stated := quality.get("source"), str):
@@ -307,14 +300,14 @@ def _entry(agent: Any, columns: Any, *, stationary: bool, static: bool) -> dict[
     entry = {
         "id": agent.id,
         "category": agent.category,
-        "group": GROUP_OF[agent.category],
+        "group": datatypes.GROUP_OF[agent.category],
         "size_m": [round(float(v), 3) for v in agent.size_m],
         "stationary": stationary,
         "permanent": static and len(columns.t_s) == 1,  # one pose during the whole scenario
         **{k: second_differences(getattr(columns, k), scale) for k, scale in SCALES.items() if k in WAYPOINT_COLUMNS},
         "yaw_rad": second_differences(np.unwrap(columns.yaw_rad), SCALES["yaw_rad"]),
     }
-    if not isinstance(agent, Agent):
+    if not isinstance(agent, datatypes.Agent):
         return entry
     way, gap = agent.trajectory, ~(columns.observed[:-1] & columns.observed[1:])
     return {

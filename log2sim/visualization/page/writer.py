@@ -48,25 +48,11 @@ def write_page(
     cannot be written, or there are more waypoints than a page can hold, for a horizon that predictions do not have, or
     when the size is too small for what is to be shown. Raises `LogError` when no record of the log can be read.
 
-    Parameters
-    ----------
-    truth : Scenario or None
-        Shown as a layer, aligned to the scenario's time and map.
-    replay : Replay or None
-        Shown as a layer, and beside the scenario in the plots of an agent.
-    predict_s : float, s, or None
-        For how long it is shown where agents were expected to go.
-    background : GroundMap or None
-        Map of the ground to show below everything; the page holds a copy of at most some megabytes.
-    recorded : Log, Recorded or None
-        Log whose pictures and LiDAR points are shown, and the size of the page that they have to fit into.
-    metrics : sequence of (str, str)
-        Titles and texts, such as tables of `evaluate`; those of the replay are shown too.
-
-    Returns
-    -------
-    tuple of str
-        What was taken of the log, in sentences; empty without one.
+    `truth`: shown as a layer, aligned to the scenario's time and map. `replay`: shown as a layer, and beside the scenario in the
+    plots of an agent. `predict_s`, s: for how long it is shown where agents were expected to go. `background`: map of the ground to
+    show below everything; the page holds a copy of at most some megabytes. `recorded`: log whose pictures and LiDAR points are shown,
+    and the size of the page that they have to fit into. `metrics`: titles and texts, such as tables of `evaluate`; those of the
+    replay are shown too. Returns what was taken of the log, in sentences; empty without one.
     """
     out_path = Path(out_path)
     if out_path.suffix.lower() not in SUFFIXES:

@@ -14,17 +14,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Wedge
 
-from log2sim.datatypes import (
-    ENDS,
-    MIN_TRUSTED_CONFIDENCE,
-    STANDSTILL_MPS,
-    Agent,
-    MapLane,
-    Marking,
-    Scenario,
-    Signal,
-    explain_doubt,
-)
+from log2sim import datatypes
 from log2sim.geometry import Array
 from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.metrics.collisions import REPLAY
@@ -65,7 +55,7 @@ def add_lines(ax: Axes, lines: Iterable[Array], **style: Any) -> None:
     ax.add_collection(LineCollection(list(lines), **style), autolim=False)
 
 
-def draw_stationary(ax: Axes, agents: Sequence[Agent], view: Viewport) -> None:
+def draw_stationary(ax: Axes, agents: Sequence[datatypes.Agent], view: Viewport) -> None:
     """Draw stationary agents as gray boxes; as a dot where the box would be too small to see."""
     if not agents:
         return
@@ -131,7 +121,7 @@ def draw_ends(ax: Axes, roles: AgentRoles, view: Viewport, *, ghosts_step_s: flo
             ax.plot(*xy[-1], role.marker, ms=4.2, mfc=face, mec=PAPER, mew=0.7, zorder=z + 0.01)
 
 
-def draw_truth(ax: Axes, truth: Scenario) -> None:
+def draw_truth(ax: Axes, truth: datatypes.Scenario) -> None:
     """Draw the truth as thin dark dashed lines and hollow dashed boxes."""
     tracks, corners = [], []
     for agent in truth.agents:
@@ -190,14 +180,14 @@ STEP_S = 0.1  # between the points of a line: ends observe at the rate of their 
 WIDTH_PT, BESIDE_PT = 1.3, 3.4  # width of a line, and how far to the right of the track it is
 
 
-def lines_of(agent: Agent, end: str, aside_m: float = 0.0) -> list[Array]:
+def lines_of(agent: datatypes.Agent, end: str, aside_m: float = 0.0) -> list[Array]:
     """Return lines (K, 2), m, map frame, along which an end alone observed an agent; `aside_m` to its right."""
     w = agent.waypoints
     if not agent.observed_by.get(end) or len(w) < 2:
         return []
     t_s = np.arange(w.t_s[0], w.t_s[-1] + STEP_S / 2, STEP_S)
     alone = np.ones(len(t_s), dtype=bool)
-    for other in ENDS:
+    for other in datatypes.ENDS:
         spans = agent.observed_by.get(other, ())
         seen = np.any([t_s < -np.inf, *((t_s >= a - 1e-6) & (t_s <= b + 1e-6) for a, b in spans)], axis=0)
         alone &= seen if other == end else ~seen
@@ -252,7 +242,7 @@ _CIRCLE = np.exp(2j * np.pi * np.arange(36) / 36)
 class PredictedPaths:
     """Predictions of the agents of a scenario, to be drawn at times."""
 
-    def __init__(self, scenario: Scenario, horizon_s: float) -> None:
+    def __init__(self, scenario: datatypes.Scenario, horizon_s: float) -> None:
         self.horizon_s = horizon_s
         self._found = predict_scenario(scenario, horizon_s, methods=(DEFAULT_METHOD,))
         self._rows = {a.id: self._found.rows_of(a.id) for a in scenario.agents}
@@ -268,7 +258,7 @@ class PredictedPaths:
         if k < 0 or t_s - table.t_s[ticks[k]] > table.tick_s:
             return None
         forecast, row = found.forecasts[DEFAULT_METHOD], rows[k]
-        if abs(table.velocity_mps[found.row[row], found.tick[row]]) < STANDSTILL_MPS:
+        if abs(table.velocity_mps[found.row[row], found.tick[row]]) < datatypes.STANDSTILL_MPS:
             return None
         path = np.append(table.position_m[found.row[row], ticks[k]], forecast.position_m[row])
         along, across = forecast.sigma_m[row, -1]
@@ -323,14 +313,13 @@ class Overlays:
     """What a picture shows besides the scenario, and the options that concern how."""
 
     replay: Any = None  # drawn over the scenario, with charts below the map
-    truth: Scenario | None = None  # in the time and map of the scenario
+    truth: datatypes.Scenario | None = None  # in the time and map of the scenario
     background: GroundMap | None = None  # A picture of the ground, drawn below everything
     predicted: PredictedPaths | None = None
-    title: str | None = None  # none for the name of the scenario
     span: TimeRange | None = None  # range of time that is shown; None for the whole scenario
     options: PlotOptions = NO_OPTIONS
 
-    def span_of(self, scenario: Scenario) -> TimeRange:
+    def span_of(self, scenario: datatypes.Scenario) -> TimeRange:
         """Return the range of time that is shown."""
         return self.span or TimeRange(0.0, scenario.duration_s)
 
@@ -343,9 +332,9 @@ MIN_SHOWN_S = 0.5  # a doubt about less time is shown for as much, so that it ca
 STRIPES_PT, STRIPE_PT = 3.0, 0.9  # spacing and width of the stripes in boxes
 
 
-def shown_spans(agent: Agent) -> list[tuple[float, float]]:
+def shown_spans(agent: datatypes.Agent) -> list[tuple[float, float]]:
     """List the spans of time in which an agent is shown as doubtful, s; infinite for its whole life."""
-    if agent.confidence < MIN_TRUSTED_CONFIDENCE:
+    if agent.confidence < datatypes.MIN_TRUSTED_CONFIDENCE:
         return [(-np.inf, np.inf)]
     spans = []
     for doubt in agent.doubts:
@@ -356,7 +345,7 @@ def shown_spans(agent: Agent) -> list[tuple[float, float]]:
     return spans
 
 
-def is_doubted_at(agent: Agent, t_s: float) -> bool:
+def is_doubted_at(agent: datatypes.Agent, t_s: float) -> bool:
     """Tell whether an agent is shown as doubtful at a time."""
     return any(start <= t_s <= end for start, end in shown_spans(agent))
 
@@ -372,12 +361,12 @@ def hatch_movers(ax: Axes, roles: AgentRoles, view: Viewport, z_track: float, z_
     add_lines(ax, tracks, **dashes)
 
 
-def box_stripes(agent: Agent, xy_m: Array, yaw_rad: float, view: Viewport) -> list[Array]:
+def box_stripes(agent: datatypes.Agent, xy_m: Array, yaw_rad: float, view: Viewport) -> list[Array]:
     """Compute the stripes, each (2, 2), that hatch the box of an agent at a pose."""
     return list(viewport.stripes(viewport.footprints(agent, xy_m, yaw_rad)[0], STRIPES_PT * view.m_per_pt))
 
 
-def doubtful_parts(agent: Agent) -> Iterator[Array]:
+def doubtful_parts(agent: datatypes.Agent) -> Iterator[Array]:
     """Yield the parts of a track (K, 2) that are shown as doubtful."""
     w = agent.waypoints
     for start, end in shown_spans(agent):
@@ -394,7 +383,7 @@ def doubt_rows(roles: AgentRoles, told: Set[str] = frozenset()) -> list[tuple[An
     doubtful.sort(key=lambda entry: not entry[0].doubts)  # low confidence alone says less
     rows: list[tuple[Any, str]] = []
     for agent, color in doubtful[:MAX_NAMED]:
-        text = printable_label(f"{agent.id} is doubtful: {explain_doubt(agent)}", LINE_LETTERS * MAX_LINES)
+        text = printable_label(f"{agent.id} is doubtful: {datatypes.explain_doubt(agent)}", LINE_LETTERS * MAX_LINES)
         lines = textwrap.wrap(text, LINE_LETTERS, max_lines=MAX_LINES, placeholder=" …")
         rows.append((_hatched_patch(color), "\n".join(lines)))
     if len(doubtful) > MAX_NAMED:
@@ -408,7 +397,7 @@ def _hatched_patch(color: str) -> Patch:
     return Patch(fc=color, ec=MUTED if color == PARKED_FACE else PAPER, hatch="//////", lw=0.6)
 
 
-def hatch(ax: Axes, agent: Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
+def hatch(ax: Axes, agent: datatypes.Agent, k: int, view: Viewport, *, stripe: str, edge: str, z: float) -> None:
     """Draw stripes and outline of the box at waypoint `k`."""
     xy_m, yaw_rad = centers_xy(agent)[k], float(agent.waypoints.yaw_rad[k])
     add_lines(ax, box_stripes(agent, xy_m, yaw_rad, view), colors=stripe, linewidths=STRIPE_PT, zorder=z)
@@ -423,7 +412,7 @@ ARROW_EVERY_M, ARROW_M = 15.0, (1.6, 0.7)  # arrows along lanes: distance from o
 SENSOR: dict[str, Any] = {"marker": "^", "ms": SENSOR_PT, "mfc": SENSOR_COLOR, "mec": PAPER, "mew": 0.8, "ls": "none"}
 
 
-def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: bool) -> None:
+def draw_road(ax: Axes, scenario: datatypes.Scenario, view: Viewport, *, over_picture: bool) -> None:
     """Draw the map features of a scenario; the faces of lanes not over a picture of the ground, which they would hide."""
     # Draw sensors that are fixed in the map with their fields of view; of those that look all around only the range.
     for sensor in scenario.sensors:
@@ -461,7 +450,7 @@ def draw_road(ax: Axes, scenario: Scenario, view: Viewport, *, over_picture: boo
 class SignalLights:
     """Traffic lights of an animation, each in the color of its state at the time that is shown."""
 
-    def __init__(self, ax: Axes, signals: Sequence[Signal]) -> None:
+    def __init__(self, ax: Axes, signals: Sequence[datatypes.Signal]) -> None:
         self._ax, self._signals = ax, signals
         style: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 5.0, "mec": PAPER, "mew": 0.9, "animated": True}
         self._marks = [ax.plot(*signal.position_m[:2], zorder=LABEL - 0.3, **style)[0] for signal in signals]
@@ -473,7 +462,7 @@ class SignalLights:
             self._ax.draw_artist(mark)
 
 
-def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
+def road_rows(scenario: datatypes.Scenario) -> list[tuple[Any, str]]:
     """Return the lines of the legend for what there is."""
     features = scenario.map_features
     rows: list[tuple[Any, str]] = []
@@ -496,7 +485,7 @@ def road_rows(scenario: Scenario) -> list[tuple[Any, str]]:
     return rows
 
 
-def lane_outline(lane: MapLane) -> Array:
+def lane_outline(lane: datatypes.MapLane) -> Array:
     """Return the outline (2 N, 2) of a lane, m, map frame."""
     xy = lane.points_m[:, :2]
     along = np.gradient(xy, axis=0)
@@ -505,7 +494,7 @@ def lane_outline(lane: MapLane) -> Array:
     return np.concatenate([xy + aside, (xy - aside)[::-1]])
 
 
-def lane_arrows(lane: MapLane) -> list[Array]:
+def lane_arrows(lane: datatypes.MapLane) -> list[Array]:
     """Return triangles (3, 2), m, along the middle of a lane that show its direction."""
     xy = lane.points_m[:, :2]
     traveled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
@@ -523,6 +512,6 @@ def lane_arrows(lane: MapLane) -> list[Array]:
     return arrows
 
 
-def _shade(marking: Marking, alpha: float) -> tuple[float, float, float, float]:
-    doubtful = marking.confidence < MIN_TRUSTED_CONFIDENCE
+def _shade(marking: datatypes.Marking, alpha: float) -> tuple[float, float, float, float]:
+    doubtful = marking.confidence < datatypes.MIN_TRUSTED_CONFIDENCE
     return to_rgba(MARKING_COLOR[marking.color or "white"], alpha * (0.4 if doubtful else 1.0))

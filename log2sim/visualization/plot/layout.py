@@ -16,22 +16,7 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from log2sim.datatypes import STANDSTILL_MPS, Agent, explain_doubt
 from log2sim.geometry import Array
-from log2sim.visualization.plot import viewport
-from log2sim.visualization.plot.style import (
-    COLLISION_MARK,
-    CROWD_COLOR,
-    FONT,
-    INK,
-    MUTED,
-    PAPER,
-    PARKED_EDGE,
-    PARKED_FACE,
-    SENSOR_PT,
-    halo,
-    new_figure,
-    printable_label,
-    style_axes,
-)
+from log2sim.visualization.plot import style, viewport
 from log2sim.visualization.plot.viewport import AgentRole, AgentRoles, Viewport, centers_xy, nice_step
 
 LABEL_Z = 8.0
@@ -62,7 +47,7 @@ class MapLabel:
 
 def short_label(role: AgentRole) -> str:
     """Return what marks a mover on the map where there is little room."""
-    return printable_label(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
+    return style.printable_label(role.agent.id, MAX_ID_LETTERS) + "?" * role.agent.is_doubtful
 
 
 def speed_text(agent: Agent) -> str:
@@ -94,7 +79,7 @@ def place_labels(
         if role.leading:
             taken.append(_bounds(role.agent, 0))
             taken.extend((x - r, y - r, x + r, y + r) for x, y in _points_of(role.agent))
-    mark = SENSOR_PT / 2 * view.m_per_pt
+    mark = style.SENSOR_PT / 2 * view.m_per_pt
     taken += [(s["x_m"] - mark, s["y_m"] - mark, s["x_m"] + mark, s["y_m"] + mark) for s in sensors]
     room = LabelRoom(view, taken)
     tracks = {role.agent.id: _points_of(role.agent) for role in roles.movers}
@@ -102,7 +87,7 @@ def place_labels(
 
     def place_detail(text: str, anchor: Anchor) -> bool:
         place = room.place(text, DETAIL_PT, [anchor])
-        labels.extend([] if place is None else [MapLabel(text, MUTED, place, DETAIL_PT, bold=False)])
+        labels.extend([] if place is None else [MapLabel(text, style.MUTED, place, DETAIL_PT, bold=False)])
         return place is not None
 
     def gap_m(
@@ -141,9 +126,9 @@ def place_labels(
             labels.append(MapLabel(short, role.color, short_place, MOVER_PT, bold=True))
     for agent in roles.stationary:
         anchor = centers_xy(agent)[len(agent.waypoints) // 2], np.full(2, agent.size_m[1] / 2)
-        name = printable_label(agent.id, MAX_ID_LETTERS)
+        name = style.printable_label(agent.id, MAX_ID_LETTERS)
         if agent.is_doubtful:
-            reason = printable_label(explain_doubt(agent))
+            reason = style.printable_label(explain_doubt(agent))
             if len(reason) <= MAX_REASON_LETTERS and place_detail(f"{name}? {reason}", anchor):
                 told.add(agent.id)
             else:
@@ -164,8 +149,8 @@ def draw_labels(ax: Axes, labels: Sequence[MapLabel]) -> None:
     for label in labels:
         ax.text(
             label.place_m[0], label.place_m[1], label.text, color=label.color, fontsize=label.size_pt,
-            fontweight="bold" if label.bold else "normal", family=FONT, ha="center", va="center_baseline",
-            path_effects=halo(), zorder=LABEL_Z, parse_math=False, clip_on=True,
+            fontweight="bold" if label.bold else "normal", family=style.FONT, ha="center", va="center_baseline",
+            path_effects=style.halo(), zorder=LABEL_Z, parse_math=False, clip_on=True,
         )  # fmt: skip
 
 
@@ -248,12 +233,12 @@ class MovingLabels:
 
     def __init__(self, ax: Axes, view: Viewport, roles: AgentRoles) -> None:
         self._ax, self._view, self._named = ax, view, names_fit(roles)
-        style: dict[str, Any] = {
-            "fontsize": MOVER_PT, "family": FONT, "fontweight": "bold", "parse_math": False, "animated": True, "clip_on": True,
+        look: dict[str, Any] = {
+            "fontsize": MOVER_PT, "family": style.FONT, "fontweight": "bold", "parse_math": False, "animated": True, "clip_on": True,
             "ha": "center", "va": "center_baseline", "zorder": 9,
         }  # fmt: skip
         leading = [role for role in roles.movers if role.leading]
-        self._texts = {r.agent.id: ax.text(0, 0, "", color=r.color, path_effects=halo(), **style) for r in leading}
+        self._texts = {r.agent.id: ax.text(0, 0, "", color=r.color, path_effects=style.halo(), **look) for r in leading}
         self._side: dict[str, tuple[int, int]] = {}
 
     def show(self, present: list[tuple[AgentRole, Array, float]]) -> None:
@@ -324,14 +309,14 @@ def make_layout(
         width = max(WIDTH_IN, (max(needed, MIN_MAP_IN) + around) / aspect)
         map_width, map_height = width - LEFT_IN - SIDE_IN - GAP_IN, width * aspect - around
     height = map_height + around
-    figure = new_figure(width, height)
+    figure = style.new_figure(width, height)
     bottom = foot_in + BOTTOM_IN
     ax = figure.add_axes((LEFT_IN / width, bottom / height, map_width / width, map_height / height))
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")
     names = ("east", "north") if projected else ("map x", "map y")
-    style_axes(ax)
+    style.style_axes(ax)
     step_m = nice_step(max(fitted.width_m, fitted.height_m) / 5)
     for axis, name, low in zip((ax.xaxis, ax.yaxis), names, (fitted.x0, fitted.y0)):
         # Seven-digit tick labels are unreadable; their common part goes into the axis label.
@@ -339,24 +324,28 @@ def make_layout(
         axis.set_major_locator(MultipleLocator(step_m))
         axis.set_major_formatter(FuncFormatter(lambda v, _, base_m=base_m: f"{v - base_m:.6g}".replace("-", "−")))
         since = f" − {base_m:.0f}" if base_m > 0 else f" + {-base_m:.0f}" if base_m < 0 else ""
-        axis.set_label_text(f"{name}{since} (m)", fontsize=7.5, color=MUTED, family=FONT)
+        axis.set_label_text(f"{name}{since} (m)", fontsize=7.5, color=style.MUTED, family=style.FONT)
     return FigureLayout(figure, ax, fitted, foot_in)
 
 
 def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
     """Write the title and a smaller line below it, flush with the map's left edge."""
     height = layout.figure.get_figheight()
-    style: dict[str, Any] = {"family": FONT, "ha": "left", "va": "baseline", "parse_math": False}
-    x, title, subtitle = LEFT_IN / layout.width_in, printable_label(title, 70), printable_label(subtitle, 130)
-    layout.figure.text(x, 1 - 0.36 / height, title, fontsize=13, fontweight="bold", color=INK, **style)
-    layout.figure.text(x, 1 - 0.59 / height, subtitle, fontsize=8, color=MUTED, **style)
+    look: dict[str, Any] = {"family": style.FONT, "ha": "left", "va": "baseline", "parse_math": False}
+    x, title, subtitle = (
+        LEFT_IN / layout.width_in,
+        style.printable_label(title, 70),
+        style.printable_label(subtitle, 130),
+    )
+    layout.figure.text(x, 1 - 0.36 / height, title, fontsize=13, fontweight="bold", color=style.INK, **look)
+    layout.figure.text(x, 1 - 0.59 / height, subtitle, fontsize=8, color=style.MUTED, **look)
 
 
-def fill_legend(owner: Axes | Figure, rows: list[tuple[Any, str]], place: tuple[float, float], **style: Any) -> None:
+def fill_legend(owner: Axes | Figure, rows: list[tuple[Any, str]], place: tuple[float, float], **look: Any) -> None:
     """Draw a legend whose upper left corner is at a place in fractions of axes or a figure."""
     legend = owner.legend(
         [handle for handle, _ in rows], [text for _, text in rows], loc="upper left", bbox_to_anchor=place, borderaxespad=0,
-        frameon=False, prop={"family": FONT, "size": 7.0}, labelcolor=INK, **style,
+        frameon=False, prop={"family": style.FONT, "size": 7.0}, labelcolor=style.INK, **look,
     )  # fmt: skip
     for text in legend.get_texts():
         text.set_parse_math(False)
@@ -385,29 +374,31 @@ def legend_rows(
     for *_, id, role in sorted(numbered, key=lambda entry: entry[:4]):
         if role.leading and id not in told:
             marker, category = "s" if role.is_ego else role.marker, role.agent.category
-            name = "ego" if role.is_ego else printable_label(id, 20)
+            name = "ego" if role.is_ego else style.printable_label(id, 20)
             name += "" if role.is_ego or id.startswith(category) else f" · {category}"
             line = _line(role.color, lw=2.4 if role.is_ego else 1.7, marker=marker, ms=4.6)
             rows.append((line, f"{name} · {speed_text(role.agent)}"))
     rest = sum(not r.leading for r in roles.movers)
     if rest:
-        rows.append((_line(CROWD_COLOR, lw=1.0), f"{rest} more moving, farther away"))
+        rows.append((_line(style.CROWD_COLOR, lw=1.0), f"{rest} more moving, farther away"))
     if roles.stationary:
-        rows.append((Patch(fc=PARKED_FACE, ec=PARKED_EDGE, lw=0.6), f"{len(roles.stationary)} static"))
+        rows.append((Patch(fc=style.PARKED_FACE, ec=style.PARKED_EDGE, lw=0.6), f"{len(roles.stationary)} static"))
     if roles.movers and mark_step_s is not None:
-        rows.append((Patch(fc=PAPER, ec=MUTED, lw=0.9), "start (hollow), end (filled)"))
-        rows.append((_line("none", marker="o", ms=3.2, mfc=PAPER, mec=MUTED, mew=0.9), f"every {mark_step_s:g} s"))
+        rows.append((Patch(fc=style.PAPER, ec=style.MUTED, lw=0.9), "start (hollow), end (filled)"))
+        rows.append(
+            (_line("none", marker="o", ms=3.2, mfc=style.PAPER, mec=style.MUTED, mew=0.9), f"every {mark_step_s:g} s")
+        )
     if mark_step_s is not None and any(not r.agent.waypoints.observed.all() for r in roles.movers):
-        rows.append((_line(MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, interpolated"))
+        rows.append((_line(style.MUTED, lw=1.3, ls=(0, (2.2, 1.8))), "not observed, interpolated"))
     if any(a.color is not None for a in (*(r.agent for r in roles.movers), *roles.stationary)):
-        nose = _line("none", marker="^", ms=4.6, mfc="#C0392B", mec=MUTED, mew=0.4)
+        nose = _line("none", marker="^", ms=4.6, mfc="#C0392B", mec=style.MUTED, mew=0.4)
         rows.append((nose, "heading, in the vehicle's color"))
     if truth:
-        rows.append((_line(INK, lw=0.8, ls=(0, (3, 2))), "truth"))
+        rows.append((_line(style.INK, lw=0.8, ls=(0, (3, 2))), "truth"))
     if replay:
-        rows.append((_line(MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
+        rows.append((_line(style.MUTED, lw=1.9, ls=(0, (0.1, 1.6)), dash_capstyle="round"), "replay"))
     if collisions:
-        rows.append((Line2D([], [], ls="none", **{**COLLISION_MARK, "ms": 6.0}), "collision of the replay"))
+        rows.append((Line2D([], [], ls="none", **{**style.COLLISION_MARK, "ms": 6.0}), "collision of the replay"))
     if outside:
         rows.append((_line("none"), f"{outside} outside this view"))
     return rows
@@ -422,20 +413,22 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
     column = layout.figure.add_axes((0, 0, 1, 1), frameon=False)
     column.set(xlim=(0, layout.width_in), ylim=(0, height), xticks=[], yticks=[])
     column.set_zorder(-1)
-    for k, face in enumerate((INK, PAPER)):
+    for k, face in enumerate((style.INK, style.PAPER)):
         left, right, top = x + k * w / 2, x + k * w / 2 + w / 2, y + 0.06
         corners = [(left, y), (right, y), (right, top), (left, top)]
-        column.add_patch(Polygon(corners, fc=face, ec=INK, lw=0.8, closed=True))
-    style: dict[str, Any] = {"family": FONT, "fontsize": 7, "color": INK, "va": "bottom"}
-    column.text(x, y + 0.1, "0", ha="center", **style)
-    column.text(x + w, y + 0.1, f"{length_m:g} m", ha="center", **style)
+        column.add_patch(Polygon(corners, fc=face, ec=style.INK, lw=0.8, closed=True))
+    look: dict[str, Any] = {"family": style.FONT, "fontsize": 7, "color": style.INK, "va": "bottom"}
+    column.text(x, y + 0.1, "0", ha="center", **look)
+    column.text(x + w, y + 0.1, f"{length_m:g} m", ha="center", **look)
     if projected:
         nx, ny = layout.width_in - 0.42, y
-        column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=INK, ec=INK, lw=0.8))
-        column.add_patch(Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=PAPER, ec=INK, lw=0.8))
-        column.text(nx, ny + 0.44, "N", ha="center", **{**style, "fontsize": 8.5, "fontweight": "bold"})
+        column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=style.INK, ec=style.INK, lw=0.8))
+        column.add_patch(
+            Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=style.PAPER, ec=style.INK, lw=0.8)
+        )
+        column.text(nx, ny + 0.44, "N", ha="center", **{**look, "fontsize": 8.5, "fontweight": "bold"})
 
 
-def _line(color: str, **style: Any) -> Line2D:
-    edge = {"mec": PAPER, "mew": 0.5} if "mec" not in style else {}
-    return Line2D([0, 1], [0, 1], color=color, **{"lw": 0, "mfc": color, **edge, **style})
+def _line(color: str, **look: Any) -> Line2D:
+    edge = {"mec": style.PAPER, "mew": 0.5} if "mec" not in look else {}
+    return Line2D([0, 1], [0, 1], color=color, **{"lw": 0, "mfc": color, **edge, **look})

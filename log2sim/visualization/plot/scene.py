@@ -11,41 +11,18 @@ from matplotlib.lines import Line2D
 from log2sim.datatypes import ENDS, Scenario
 from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.expected_motion import ends_of
-from log2sim.visualization.plot import layers
-from log2sim.visualization.plot.layout import (
-    SIDE_IN,
-    TOP_IN,
-    FigureLayout,
-    MapLabel,
-    draw_labels,
-    draw_scale_and_north,
-    fill_legend,
-    legend_rows,
-    make_layout,
-    names_fit,
-    place_labels,
-    write_title,
-)
-from log2sim.visualization.plot.selection import PlotOptions, TimeRange
+from log2sim.visualization.plot import layers, viewport
+from log2sim.visualization.plot import layout as layouts
+from log2sim.visualization.plot.selection import PlotOptions
 from log2sim.visualization.plot.style import END_COLOR, FONT, MUTED, PAPER, SIGNAL_COLOR, style_axes
 from log2sim.visualization.plot.time_series import TimelineCharts, charts_height_in, draw_charts, timeline_of
-from log2sim.visualization.plot.viewport import (
-    MAX_UNCROWDED_MOVERS,
-    AgentRoles,
-    Viewport,
-    assign_view_roles,
-    centers_xy,
-    choose_viewport,
-    is_moving,
-    time_step_s,
-)
 
 Rows = list[tuple[Any, str]]  # handles and texts of a legend
 
 
 def draw_base(
-    scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays, *, moving: bool = False
-) -> tuple[FigureLayout, float, TimelineCharts | None, list[MapLabel]]:
+    scenario: Scenario, roles: viewport.AgentRoles, overlays: layers.Overlays, *, moving: bool = False
+) -> tuple[layouts.FigureLayout, float, TimelineCharts | None, list[layouts.MapLabel]]:
     """Draw what stills and animations share.
 
     Returns the layout, the seconds between time marks, charts of a replay with a driven agent, and the labels of a still picture,
@@ -53,46 +30,62 @@ def draw_base(
     """
     span = overlays.span_of(scenario)
     view = _view_of(roles, overlays.options)
-    step_s = time_step_s(span.duration_s, len(roles.movers), _typical_speed(roles), view.width_m / 500)
+    step_s = viewport.time_step_s(span.duration_s, len(roles.movers), _typical_speed(roles), view.width_m / 500)
     projected = scenario.map.projection is not None
     timeline = timeline_of(overlays.replay, roles)
     size = overlays.options.size_px
 
-    def lay_out(rows: Rows) -> FigureLayout:
-        return make_layout(
+    def lay_out(rows: Rows) -> layouts.FigureLayout:
+        return layouts.make_layout(
             view, sum(1 + text.count("\n") for _, text in rows), projected=projected,
             foot_in=charts_height_in(timeline), aspect=None if size is None else size[1] / size[0],
         )  # fmt: skip
 
     # What finds no room on the map is in the legend, for which the figure grows.
     leading = {role.agent.id for role in roles.movers if role.leading}
-    labels: list[MapLabel] = []
+    labels: list[layouts.MapLabel] = []
     if moving:
-        rows = _legend(scenario, roles, overlays, None, leading if names_fit(roles) else set())
+        rows = _legend(scenario, roles, overlays, None, leading if layouts.names_fit(roles) else set())
         layout = lay_out(rows)
     else:
         static, sensors = overlays.options.label_static, scenario.sensors
         told = leading | {agent.id for agent in roles.stationary}
         layout = lay_out(_legend(scenario, roles, overlays, step_s, told))
-        labels, said = place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
+        labels, said = layouts.place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
         if not told <= said | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
             layout = lay_out(_legend(scenario, roles, overlays, step_s, said))
-            labels, said = place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
+            labels, said = layouts.place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
         rows = _legend(scenario, roles, overlays, step_s, said)
     signals_s = None if moving else span.stop_s
     draw_standing(layout.ax, scenario, roles, layout.view, overlays.background, signals_s=signals_s)
     layout.ax.set(xlim=(layout.view.x0, layout.view.x1), ylim=(layout.view.y0, layout.view.y1))
     # In the column beside the map, where the legend covers nothing.
-    place = 1 - SIDE_IN / layout.width_in, 1 - TOP_IN / layout.figure.get_figheight()
-    fill_legend(layout.figure, rows, place, handlelength=2.0, labelspacing=0.56, handletextpad=0.7)
-    draw_scale_and_north(layout, projected=projected)
-    write_title(layout, overlays.title or scenario.name or "scenario", _subtitle(scenario, roles, span))
+    place = 1 - layouts.SIDE_IN / layout.width_in, 1 - layouts.TOP_IN / layout.figure.get_figheight()
+    layouts.fill_legend(layout.figure, rows, place, handlelength=2.0, labelspacing=0.56, handletextpad=0.7)
+    layouts.draw_scale_and_north(layout, projected=projected)
+    movers = sum(viewport.is_moving(r.agent) for r in roles.movers if not r.is_ego)
+    agents = len(scenario.others)
+    parts = [f"{span.duration_s:.1f} s" if span.start_s == 0 else f"{span.start_s:.1f} to {span.stop_s:.1f} s"]
+    parts.append(f"{agents} agent{'' if agents == 1 else 's'}, {movers} moving")
+    if scenario.doubtful:
+        parts.append(f"{len(scenario.doubtful)} doubtful")
+    if scenario.ego is None:
+        parts.append("no ego")
+    if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
+        parts.append(f"origin {scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°")
+    layouts.write_title(layout, scenario.name or "scenario", " · ".join(parts))
     charts = None if timeline is None else draw_charts(layout, timeline, (span.start_s, span.stop_s), moving=moving)
     return layout, step_s, charts, labels
 
 
 def draw_standing(
-    ax: Axes, scenario: Scenario, roles: AgentRoles, view: Viewport, background: Any, *, signals_s: float | None
+    ax: Axes,
+    scenario: Scenario,
+    roles: viewport.AgentRoles,
+    view: viewport.Viewport,
+    background: Any,
+    *,
+    signals_s: float | None,
 ) -> None:
     """Draw what stands: the ground, the road with its traffic lights at a time, if any, and the agents that never move."""
     if background is not None:  # lightened so that tracks stand out
@@ -113,8 +106,8 @@ def draw_standing(
 
 def draw_moving(
     ax: Axes,
-    roles: AgentRoles,
-    view: Viewport,
+    roles: viewport.AgentRoles,
+    view: viewport.Viewport,
     step_s: float,
     *,
     truth: Scenario | None,
@@ -124,7 +117,7 @@ def draw_moving(
     """Draw the tracks of agents, pale where truth or replay lie over them; with `ghosts` also boxes along those."""
     overlaid = truth is not None or replay is not None
     layers.draw_tracks(ax, roles, view, step_s, alpha=0.45 if overlaid else 1.0)
-    crowded = overlaid or not ghosts or len(roles.movers) > MAX_UNCROWDED_MOVERS
+    crowded = overlaid or not ghosts or len(roles.movers) > viewport.MAX_UNCROWDED_MOVERS
     layers.draw_ends(ax, roles, view, ghosts_step_s=None if crowded else step_s)
     layers.hatch_movers(ax, roles, view, layers.TRACK + 0.5, layers.BOX + 0.6)
     if truth is not None:
@@ -134,23 +127,23 @@ def draw_moving(
         layers.draw_collisions(ax, layers.new_collisions(replay)[1])
 
 
-def _view_of(roles: AgentRoles, options: PlotOptions) -> Viewport:
+def _view_of(roles: viewport.AgentRoles, options: PlotOptions) -> viewport.Viewport:
     if options.extent_m is None:
-        return choose_viewport(roles)
+        return viewport.choose_viewport(roles)
     x0, y0, x1, y1 = options.extent_m
-    return Viewport(min(x0, x1), max(x0, x1), min(y0, y1), max(y0, y1))
+    return viewport.Viewport(min(x0, x1), max(x0, x1), min(y0, y1), max(y0, y1))
 
 
 def _legend(
-    scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays, mark_step_s: float | None, told: set[str]
+    scenario: Scenario, roles: viewport.AgentRoles, overlays: layers.Overlays, mark_step_s: float | None, told: set[str]
 ) -> Rows:
     """List the rows of the legend; `told` agents are labeled on the map, and `mark_step_s` is None in animations."""
     view = _view_of(roles, overlays.options)
     agents = [r.agent for r in roles.movers] + list(roles.stationary)
-    outside = sum(not view.contains(centers_xy(a)).any() for a in agents)
+    outside = sum(not view.contains(viewport.centers_xy(a)).any() for a in agents)
     shown = {"truth": overlays.truth is not None, "replay": overlays.replay is not None}
     collisions = len(layers.new_collisions(overlays.replay)[0])
-    rows = legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
+    rows = layouts.legend_rows(roles, mark_step_s, told, collisions=collisions, outside=outside, **shown)
     rows += layers.doubt_rows(roles, told)
     if overlays.predicted is not None and roles.movers:
         dots = Line2D([0, 1], [0, 1], color=MUTED, lw=1.3, ls=(0, (1.0, 1.3)))
@@ -163,22 +156,8 @@ def _legend(
     return rows + layers.road_rows(scenario)
 
 
-def _subtitle(scenario: Scenario, roles: AgentRoles, span: TimeRange) -> str:
-    moving = sum(is_moving(r.agent) for r in roles.movers if not r.is_ego)
-    agents = len(scenario.others)
-    parts = [f"{span.duration_s:.1f} s" if span.start_s == 0 else f"{span.start_s:.1f} to {span.stop_s:.1f} s"]
-    parts.append(f"{agents} agent{'' if agents == 1 else 's'}, {moving} moving")
-    if scenario.doubtful:
-        parts.append(f"{len(scenario.doubtful)} doubtful")
-    if scenario.ego is None:
-        parts.append("no ego")
-    if scenario.map.latitude_deg is not None and scenario.map.longitude_deg is not None:
-        parts.append(f"origin {scenario.map.latitude_deg:.5f}°, {scenario.map.longitude_deg:.5f}°")
-    return " · ".join(parts)
-
-
-def _typical_speed(roles: AgentRoles) -> float:
-    speeds = [float(np.abs(r.agent.waypoints.speed_mps).mean()) for r in roles.movers if is_moving(r.agent)]
+def _typical_speed(roles: viewport.AgentRoles) -> float:
+    speeds = [float(np.abs(r.agent.waypoints.speed_mps).mean()) for r in roles.movers if viewport.is_moving(r.agent)]
     return float(np.median(speeds)) if speeds else 0.0
 
 
@@ -198,22 +177,9 @@ def plot(
 
     Raises `ScenarioError` when the truth's map has another projection.
 
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes, optional
-        Drawn into; limits of axes that show something already are kept. Without, a new figure of pyplot.
-    replay : Replay, optional
-        Drawn over the scenario.
-    truth : Scenario, optional
-        Brought to the scenario's start and map.
-    background : GroundMap, optional
-        A picture of the ground in the map frame.
-    legend : bool, optional
-        By default only in a new figure.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
+    `ax`: drawn into; limits of axes that show something already are kept. Without, a new figure of pyplot. `replay`: drawn over the
+    scenario. `truth`: brought to the scenario's start and map. `background`: a picture of the ground in the map frame. `legend`: by
+    default only in a new figure.
     """
     aligned = None if truth is None else truth.aligned_to(scenario)
     new = ax is None
@@ -221,28 +187,28 @@ def plot(
         import matplotlib.pyplot as plt
 
         ax = plt.subplots(figsize=SIZE_IN, layout="constrained")[1]
-    roles = assign_view_roles(scenario)
+    roles = viewport.assign_view_roles(scenario)
     # The view is that of axes that show something, else the agents'.
     extent, per_pt = ax.get_window_extent(), 72 / ax.figure.dpi
     size_pt = max(extent.width * per_pt, 1.0), max(extent.height * per_pt, 1.0)
     if ax.has_data():
         (x0, x1), (y0, y1) = sorted(ax.get_xlim()), sorted(ax.get_ylim())
-        view = Viewport(x0, x1, y0, y1, max((x1 - x0) / size_pt[0], (y1 - y0) / size_pt[1]))
+        view = viewport.Viewport(x0, x1, y0, y1, max((x1 - x0) / size_pt[0], (y1 - y0) / size_pt[1]))
     else:
-        view = choose_viewport(roles).fitted(*size_pt)
+        view = viewport.choose_viewport(roles).fitted(*size_pt)
         ax.set_aspect("equal", adjustable="box")
         style_axes(ax, grid=False)
         ax.set_xlabel("x of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
         ax.set_ylabel("y of the map (m)", fontsize=7.5, color=MUTED, family=FONT)
-    step_s = time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), view.m_per_pt)
+    step_s = viewport.time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
     draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
-    labels, told = place_labels(roles, view, step_s, sensors=scenario.sensors)
-    draw_labels(ax, labels)
+    labels, told = layouts.place_labels(roles, view, step_s, sensors=scenario.sensors)
+    layouts.draw_labels(ax, labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
     if new if legend is None else legend:
         overlays = {"truth": truth is not None, "replay": replay is not None}
         collisions = len(layers.new_collisions(replay)[0])
-        rows = legend_rows(roles, step_s, told, collisions=collisions, outside=0, **overlays)
-        fill_legend(ax, [*rows, *layers.doubt_rows(roles, told), *layers.road_rows(scenario)], (1.01, 1.0))
+        rows = layouts.legend_rows(roles, step_s, told, collisions=collisions, outside=0, **overlays)
+        layouts.fill_legend(ax, [*rows, *layers.doubt_rows(roles, told), *layers.road_rows(scenario)], (1.01, 1.0))
     return ax

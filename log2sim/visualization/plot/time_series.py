@@ -126,7 +126,43 @@ def draw_charts(
         bottom = top - (k + 1) * (CHART_IN + CHART_GAP_IN) + CHART_GAP_IN
         place = LEFT_IN / layout.width_in, bottom / height, width / layout.width_in, CHART_IN / height
         ax = layout.figure.add_axes(place)
-        _draw_strip(ax, chart, timeline, span_s, last=k == count - 1, moving=moving)
+        last = k == count - 1
+        color = timeline.role.color
+        styles: dict[str, dict[str, Any]] = {
+            "ribbon": {"color": to_rgba(color, 0.28), "lw": 3.4, "solid_capstyle": "round"},
+            "muted": {"color": MUTED, "lw": 1.0, "ls": (0, (3, 1.6))},
+            "thin": {"color": color, "lw": 1.2},
+        }
+        ax.set(xlim=span_s, facecolor="#FBFCFD")
+        everything = np.concatenate([values for _, _, values, _ in chart.lines])
+        low, high = min(float(everything.min()), 0.0), max(float(everything.max()), 0.0)
+        missing = max(chart.min_span - (high - low), 0.0)
+        # A value that is never negative keeps zero at the bottom.
+        below = 0.0 if low == 0.0 and high >= chart.min_span else missing / 2
+        pad = 0.08 * max(high - low, chart.min_span)
+        ax.set_ylim(low - below - pad, high + missing - below + pad)
+        ax.axhline(0.0, color=FRAME, lw=0.8, zorder=1)
+        for t in timeline.collisions_s:
+            ax.axvline(t, color=ALARM, lw=1.0, zorder=2)
+        handles = [ax.plot(t_s, values, zorder=3, **styles[style])[0] for _, t_s, values, style in chart.lines]
+        style_axes(ax, size_pt=6.5, length_pt=2.0)
+        ax.yaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 5, 10]))
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:.6g}".replace("-", "−")))
+        ax.tick_params(labelbottom=last)
+        if last:
+            ax.set_xlabel("time (s)", fontsize=7.5, color=MUTED, family=FONT)
+        labels = [label for label, *_ in chart.lines]
+        if not moving:
+            largest = [float(values[np.argmax(np.abs(values))]) for _, _, values, _ in chart.lines]
+            labels = [f"{label} · max {_number(value, chart)}" for label, value in zip(labels, largest)]
+        legend = ax.legend(
+            handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
+            loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
+            prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
+            handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
+        )  # fmt: skip
+        legend.get_title().set_color(INK)
         axes.append(ax)
     role, spoken = timeline.role, {"pid": "PID", "policy": "a policy", "reactive": "what is ahead"}
     driver = spoken.get(timeline.driver, timeline.driver)
@@ -142,47 +178,6 @@ def charts_height_in(timeline: AgentTimeline | None) -> float:
     if timeline is None:
         return 0.0
     return TIME_IN + len(timeline.charts) * (CHART_IN + CHART_GAP_IN) + HEAD_IN
-
-
-def _draw_strip(
-    ax: Axes, chart: Chart, timeline: AgentTimeline, span_s: tuple[float, float], *, last: bool, moving: bool
-) -> None:
-    color = timeline.role.color
-    styles: dict[str, dict[str, Any]] = {
-        "ribbon": {"color": to_rgba(color, 0.28), "lw": 3.4, "solid_capstyle": "round"},
-        "muted": {"color": MUTED, "lw": 1.0, "ls": (0, (3, 1.6))},
-        "thin": {"color": color, "lw": 1.2},
-    }
-    ax.set(xlim=span_s, facecolor="#FBFCFD")
-    everything = np.concatenate([values for _, _, values, _ in chart.lines])
-    low, high = min(float(everything.min()), 0.0), max(float(everything.max()), 0.0)
-    missing = max(chart.min_span - (high - low), 0.0)
-    # A value that is never negative keeps zero at the bottom.
-    below = 0.0 if low == 0.0 and high >= chart.min_span else missing / 2
-    pad = 0.08 * max(high - low, chart.min_span)
-    ax.set_ylim(low - below - pad, high + missing - below + pad)
-    ax.axhline(0.0, color=FRAME, lw=0.8, zorder=1)
-    for t in timeline.collisions_s:
-        ax.axvline(t, color=ALARM, lw=1.0, zorder=2)
-    handles = [ax.plot(t_s, values, zorder=3, **styles[style])[0] for _, t_s, values, style in chart.lines]
-    style_axes(ax, size_pt=6.5, length_pt=2.0)
-    ax.yaxis.set_major_locator(MaxNLocator(nbins=3, steps=[1, 2, 5, 10]))
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:.6g}".replace("-", "−")))
-    ax.tick_params(labelbottom=last)
-    if last:
-        ax.set_xlabel("time (s)", fontsize=7.5, color=MUTED, family=FONT)
-    labels = [label for label, *_ in chart.lines]
-    if not moving:
-        largest = [float(values[np.argmax(np.abs(values))]) for _, _, values, _ in chart.lines]
-        labels = [f"{label} · max {_number(value, chart)}" for label, value in zip(labels, largest)]
-    legend = ax.legend(
-        handles[::-1], labels[::-1], title=f"{chart.name} ({chart.unit})", alignment="left",
-        loc="upper left", bbox_to_anchor=(_beside(ax, GAP_IN), 1.06), borderaxespad=0, borderpad=0, frameon=False,
-        prop={"family": FONT, "size": 6.5}, title_fontproperties={"family": FONT, "size": 7, "weight": "bold"},
-        handlelength=2.0, labelspacing=0.35, handletextpad=0.7, labelcolor=INK,
-    )  # fmt: skip
-    legend.get_title().set_color(INK)
 
 
 def _beside(ax: Axes, inches: float) -> float:

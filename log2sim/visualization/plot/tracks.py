@@ -182,7 +182,6 @@ def plot_tracks(
     truth: Scenario | None = None,
     background: GroundMap | None = None,
     predict_s: float | None = None,
-    title: str | None = None,
     options: selection.PlotOptions = selection.NO_OPTIONS,
     overwrite: bool = False,
     dpi: int = 200,
@@ -210,7 +209,7 @@ def plot_tracks(
     shown_truth = None if truth is None else selection.cut_scenario(truth.aligned_to(scenario), span)
     predicted = None if predict_s is None else layers.PredictedPaths(scenario, predict_s)
     shown_replay = selection.cut_replay(replay, span, scenario)
-    overlays = layers.Overlays(shown_replay, shown_truth, background, predicted, title, span, options)
+    overlays = layers.Overlays(shown_replay, shown_truth, background, predicted, span, options)
     scenario = selection.cut_scenario(scenario, span)
     roles = assign_view_roles(scenario, whole)
     if suffix in selection.MOVING:
