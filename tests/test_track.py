@@ -229,6 +229,28 @@ def test_an_occlusion_is_stitched_and_not_beyond_what_is_allowed() -> None:
     assert len(track(found, t_ns, **{**OPTIONS, "max_gap_s": 2.15})) == 2
 
 
+def test_one_who_left_is_not_what_else_begins_near_in_a_crowd() -> None:
+    """A single box 1.5 m beside the way of a pedestrian last seen 1.5 s ago is the same one where nothing else begins, not among many."""
+    ways: dict[str, Way] = {"a": line(0, 0, 1.4, 0), "stray": lambda t: (1.4 * t, 1.5)}
+    found, t_ns = record(ways, 80, hidden={"a": (30, 80)}, category="pedestrian")
+    for k in [*range(45), *range(46, 80)]:
+        found[k] = found[k].take(found[k].camera == "a")
+    assert names_of(track(found, t_ns, **OPTIONS)) == [["a", "stray"]]
+    rng = np.random.default_rng(0)
+    for k in range(30, 80):
+        xy = np.array([6.0, 0.0]) + rng.uniform(-10, 10, (3, 2))
+        others = seen(xy[np.abs(xy[:, 1]) > 3.0], t_ns[k], "other", category="pedestrian")
+        found[k] = Measurements.join([found[k], others])
+    assert ["a"] in names_of(track(found, t_ns, **OPTIONS))
+
+
+def test_one_who_comes_the_other_way_is_not_the_one_who_left_there() -> None:
+    """The first box after a gap is where who left may be; the way that it takes from there tells that it is another."""
+    ways: dict[str, Way] = {"a": line(0, 0, 3.5, 0), "b": line(25.2, 0.1, -3.5, 0)}
+    found, t_ns = record(ways, 70, hidden={"a": (29, 70), "b": (0, 36)}, category="cyclist")
+    assert names_of(track(found, t_ns, **OPTIONS, whole_boxes=True)) == [["a"], ["b"]]
+
+
 @pytest.mark.parametrize(("later", "count"), [("cyclist", 1), ("pedestrian", 1), ("car", 2)])
 def test_a_rider_who_comes_out_of_an_occlusion_may_be_taken_for_a_pedestrian(later: str, count: int) -> None:
     found, t_ns = record({"a": line(0, 0, 2, 0)}, 60, hidden={"a": (15, 28)}, category="cyclist")
@@ -296,7 +318,7 @@ def test_without_measurements_there_are_no_tracks() -> None:
     t_ns = stamps(5)
     assert track([Measurements.empty()] * 5, t_ns, **OPTIONS) == []
     assert track([], stamps(0), **OPTIONS) == []
-    assert stitch([], t_ns, max_gap_s=3.0) == []
+    assert stitch(Measurements.empty(), [], max_gap_s=3.0) == []
 
 
 def test_a_track_takes_what_is_likely_and_nothing_else() -> None:

@@ -15,12 +15,13 @@ from log2sim.datatypes.categories import CATEGORIES, GROUP_OF
 from log2sim.datatypes.findings import Finding
 from log2sim.datatypes.log import Span
 from log2sim.errors import ScenarioError
+from log2sim.files.arrays import Columns
 from log2sim.files.documents import short_repr
 from log2sim.geometry import Array, wrap_angle
 
 
 @dataclass(frozen=True, eq=False)
-class Waypoints:
+class Waypoints(Columns):
     """A trajectory of the box center as columns, map frame.
 
     Half a turn is no part of `sigma_yaw_rad`: whether front and back may be swapped is a doubt of the agent.
@@ -50,18 +51,10 @@ class Waypoints:
             if len(column) != len(self.t_s):
                 raise ValueError(f"waypoints: {key} has {len(column)} values, t_s has {len(self.t_s)}")
 
-    def __len__(self) -> int:
-        """Return the number of waypoints."""
-        return len(self.t_s)
-
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the columns that there are, by name."""
         names = (*self.FLOATS, "observed", *self.OPTIONAL_FLOATS, "visible", "lidar_points")
         return {key: getattr(self, key) for key in names if getattr(self, key) is not None}
-
-    def take(self, index: Any) -> Self:
-        """Take the waypoints at `index`, integers in rising order, a slice or a mask."""
-        return type(self)(**{key: column[index] for key, column in self.columns().items()})
 
     def problem(self) -> str | None:
         """Describe the first defect: no waypoint, a value that is not finite, times that do not increase; None without."""

@@ -16,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 
 from log2sim.datatypes import COLOR_NAMES, GROUP_OF, Agent, MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.errors import ScenarioError
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, weighted_quantile, wrap_angle
 
 WITHIN_M, CLOSE_M = 40.0, 20.0  # of the ego's path
@@ -112,7 +113,7 @@ Counts = Callable[[Array], NDArray[np.bool_]]  # which of places (N, 2) count
 
 
 @dataclass(frozen=True, eq=False)
-class RoadSamples:
+class RoadSamples(Columns):
     """Points of lines, S in all."""
 
     xy_m: Array  # (S, 2)
@@ -128,11 +129,7 @@ class RoadSamples:
         xy = np.concatenate([np.zeros((0, 2)), *(xy for xy, _, _ in parts)])
         length, line = np.repeat([length for _, _, length in parts], each), np.repeat(np.arange(len(lines)), each)
         heading = np.concatenate([np.zeros(0), *(heading for _, heading, _ in parts)])
-        return cls(xy, length, line, heading).where(counts(xy))
-
-    def where(self, chosen: NDArray[np.bool_]) -> RoadSamples:
-        """Select samples (S,)."""
-        return RoadSamples(*(column[chosen] for column in vars(self).values()))
+        return cls(xy, length, line, heading).take(counts(xy))
 
 
 def nearest_road(samples: RoadSamples, lines: Sequence[Line]) -> tuple[NDArray[np.int64], Array]:
@@ -164,7 +161,7 @@ def line_figures(found: Sequence[Line], true: Sequence[Line], area: Area) -> dic
     false_m = float(ours.length_m[~right].sum())
     close = _within(area.close, theirs.xy_m)
     # Shares of the matched length whose kind, and whose color where both sides state one, is right.
-    matched, agreement = ours.where(right), {}
+    matched, agreement = ours.take(right), {}
     for name in ("kind", "color"):
         lines = [(found[i], true[k]) for i, k in zip(matched.line, nearest_true[right])]
         pairs = [(getattr(a, name, None), getattr(b, name, None)) for a, b in lines]
@@ -258,7 +255,7 @@ def lane_figures(found: Sequence[MapLane], true: Sequence[MapLane], area: Area) 
     half_m = [float(np.mean(lane.width_m)) / 2 for lane in junctions]
     crossed = shapely.union_all([line.buffer(half, cap_style="flat") for line, half in zip(middles, half_m)])
     found_at, true_at = RoadSamples.of(ours, area.counts), RoadSamples.of(theirs, area.expects)
-    found_at = found_at.where(~np.asarray(shapely.contains_xy(crossed, *found_at.xy_m.T), dtype=bool))
+    found_at = found_at.take(~np.asarray(shapely.contains_xy(crossed, *found_at.xy_m.T), dtype=bool))
     away, _ = _to_lanes(found_at.xy_m, found_at.heading_rad, true)
     missed, _ = _to_lanes(true_at.xy_m, true_at.heading_rad, found)
     weight, true_weight, near = found_at.length_m, true_at.length_m, away <= CENTER_REACH_M

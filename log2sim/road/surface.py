@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log, Sweep
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array
 from log2sim.perception.lidar.cloud import MAX_OBSTACLE_HEIGHT_M, cloud_origin, estimate_ground, sweep_to_map
 from log2sim.road.ground_map import Raster
@@ -37,7 +38,7 @@ ELEVATION_BINS = 900
 
 
 @dataclass(frozen=True, eq=False)
-class GroundPoints:
+class GroundPoints(Columns):
     """Points near the ground, N of all sweeps."""
 
     xy: NDArray[np.float32]  # (N, 2), m: from the north-west corner of the raster: east, south
@@ -49,12 +50,12 @@ class GroundPoints:
     lidar: NDArray[np.int8]  # (N,) int8: number of the LiDAR
 
     @classmethod
-    def join(cls, parts: Sequence[GroundPoints]) -> GroundPoints:
+    def join(cls, parts: Sequence[Self]) -> Self:
         """Concatenate those of several sweeps; none give none."""
         if not parts:
             xy, none = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
             return cls(xy, none, none, none, np.zeros(0, np.int16), np.zeros(0, np.int8))
-        return cls(*(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts), strict=True)))
+        return super().join(parts)
 
 
 def take_sweep(

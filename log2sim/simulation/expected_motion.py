@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import ENDS, Agent, Scenario, Span, Trajectory
 from log2sim.errors import ConfigError
+from log2sim.files.arrays import Columns
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, wrap_angle
 from log2sim.simulation.corridors import ON_PATH_COS, ON_PATH_M, PathTable
@@ -173,7 +174,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class ExpectedPaths:
+class ExpectedPaths(Columns):
     """Expected motion of C boxes at the leads (H,)."""
 
     position_m: Complex  # (C, H) box centers x + iy, map frame
@@ -181,10 +182,6 @@ class ExpectedPaths:
     course: Complex  # (C, H) unit vectors along which and across which `sigma_m` holds
     sigma_m: Array  # (C, H, 2) standard deviations along and across
     size_m: Array  # (C, 2) length and width
-
-    def take(self, index: NDArray[np.generic]) -> ExpectedPaths:
-        """Return some of the boxes."""
-        return ExpectedPaths(*(column[index] for column in vars(self).values()))
 
 
 class ExpectedAgents:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, RELATED_GROUPS, Measurements, Track
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, RELATED_GROUPS, Measurements, Track
 from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_4DOF_999, NS_PER_S, Array, choose_pairs, period_of
 from log2sim.tracking.forward import (
     ACCELERATION_MPS2,
+    MAX_MISSES,
     OTHER_GROUP_COST,
     first_velocity,
     measurement_noise,
@@ -34,35 +36,40 @@ MIN_RIDER_SHARE = 0.25
 CATEGORY_END_MEASUREMENTS = 5
 
 
-def decide_category(m: Measurements, *, whole_boxes: bool = False) -> str:
-    """Decide the category of a track from its measurements, which are sorted by time.
+def decide_category(m: Measurements, rows: Any = slice(None), *, whole_boxes: bool = False) -> str:
+    """Decide the category of a track from its measurements, rows of `m` that are sorted by time.
 
     It is the one with most of the score of the group that has most of it; ties go to the first by name. Without `whole_boxes`, a
     pedestrian faster than people run is a cyclist whose bicycle the detector missed, and a bicycle that moves and sometimes shows
     a rider has one.
     """
-    category, groups = str(m.category[0]), np.array([GROUP_OF[c] for c in m.category.tolist()])
-    if (m.category != category).any():
-        group = _most_scored(groups, m.score)
+    shown = m.category[rows]
+    category = str(shown[0])
+    alike = shown == category
+    if not alike.all():
+        score, groups = m.score[rows], np.array([GROUP_OF[c] for c in shown.tolist()])
+        group = _most_scored(groups, score)
         voters = groups == group
         # A motorcycle, a bicycle and their riders have much the same points but look different.
-        with_image = voters & (m.camera != "")
+        with_image = voters & (m.camera[rows] != "")
         voters = with_image if group == "two_wheeler" and with_image.any() else voters
-        category = _most_scored(m.category[voters], m.score[voters])
+        category = _most_scored(shown[voters], score[voters])
     if whole_boxes:
         return category
     if category == "pedestrian":
         # The robust maximum of the speeds over a while.
-        t = (m.t_ns - m.t_ns[0]) / NS_PER_S
+        t_ns, xy = m.t_ns[rows], m.center_m[rows, :2]
+        t = (t_ns - t_ns[0]) / NS_PER_S
         later = np.searchsorted(t, t + SPEED_BASELINE_S)
         start = np.flatnonzero(later < len(t))
         later = later[start]
-        speed_mps = np.hypot(*(m.center_m[later, :2] - m.center_m[start, :2]).T) / (t[later] - t[start])
+        speed_mps = np.hypot(*(xy[later] - xy[start]).T) / (t[later] - t[start])
         if len(start) and float(np.quantile(speed_mps, SPEED_QUANTILE)) > MAX_PEDESTRIAN_SPEED_MPS:
             return "cyclist"
-    count = min(CATEGORY_END_MEASUREMENTS, len(m) // 2)
-    if category == "bicycle" and count and (m.category != category).mean() >= MIN_RIDER_SHARE:
-        first, last = np.median(m.center_m[:count, :2], axis=0), np.median(m.center_m[-count:, :2], axis=0)
+    count = min(CATEGORY_END_MEASUREMENTS, len(shown) // 2)
+    if category == "bicycle" and count and (shown != category).mean() >= MIN_RIDER_SHARE:
+        xy = m.center_m[rows, :2]
+        first, last = np.median(xy[:count], axis=0), np.median(xy[-count:], axis=0)
         if np.hypot(*(last - first)) > MIN_RIDDEN_M:
             return "cyclist"
     return category
@@ -79,6 +86,8 @@ MAX_POSITION_SIGMA_M = 2.0
 # A stationary object is joined across a gap of any length if its position stays within the offset.
 MAX_STATIONARY_MPS = 0.5
 MAX_STATIONARY_OFFSET_M = 1.0
+# Half the side of the square in which tracks that begin tell how many do.
+NEARBY_M = 10.0
 # Number of measurements from the end of a track that the filter uses; earlier ones no longer influence the state.
 END_MEASUREMENTS = 20
 
@@ -97,15 +106,15 @@ class _Ends(Columns):
 
 
 def stitch(
-    tracks: Sequence[Track], t_ns: NDArray[np.int64], *, max_gap_s: float, whole_boxes: bool = False
-) -> list[Track]:
-    """Join tracks whose ends agree, by optimal assignment, until no pair is left.
+    m: Measurements, parts: Sequence[NDArray[np.intp]], *, max_gap_s: float, whole_boxes: bool = False
+) -> list[tuple[str, NDArray[np.intp]]]:
+    """Join tracks whose ends agree, by optimal assignment, until no pair is left; return the category and the rows of each.
 
-    Both ends are predicted to the middle of the gap and must agree there in position and velocity, within their
-    uncertainty.
+    `parts`: rows of `m` of each track, in the order of time. Both ends are predicted to the middle of the gap and must agree there in
+    position and velocity, within their uncertainty.
     """
-    current = list(tracks)
-    ends = _ends(current, whole_boxes=whole_boxes) if len(current) > 1 else None
+    current = [(decide_category(m, rows, whole_boxes=whole_boxes), rows) for rows in parts]
+    ends = _ends(m, current, whole_boxes=whole_boxes) if len(current) > 1 else None
     while ends is not None:
         i, j, cost = _joining_costs(ends, max_gap_s)
         chosen = choose_pairs(i, j, cost)
@@ -116,18 +125,13 @@ def stitch(
         for chain in chains:
             while chain[-1] in following:
                 chain.append(following[chain[-1]])
-        joined = []
-        for chain in chains:
-            if len(chain) > 1:
-                m = Measurements.join([current[k].measurements for k in chain])
-                ticks = np.concatenate([current[k].tick for k in chain])
-                joined.append(Track(decide_category(m, whole_boxes=whole_boxes), ticks, m))
+        joined = [np.concatenate([current[k][1] for k in chain]) for chain in chains if len(chain) > 1]
+        everyone = [*current, *((decide_category(m, rows, whole_boxes=whole_boxes), rows) for rows in joined)]
         # Only what was joined is filtered again.
-        number = iter(range(len(current), len(current) + len(joined)))
-        rows = [next(number) if len(c) > 1 else c[0] for c in chains]
-        everyone = [*current, *joined]
-        ends = _Ends.join([ends, _ends(joined, whole_boxes=whole_boxes)]).take(rows)
-        current = [everyone[k] for k in rows]
+        number = iter(range(len(current), len(everyone)))
+        kept = [next(number) if len(c) > 1 else c[0] for c in chains]
+        ends = _Ends.join([ends, _ends(m, everyone[len(current) :], whole_boxes=whole_boxes)]).take(kept)
+        current = [everyone[k] for k in kept]
     return current
 
 
@@ -172,50 +176,58 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     near = np.flatnonzero(
         ~same_place & (gap_s <= max_gap_s) & (midpoint_offset_m <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
     )
+    groups = ends.group.tolist()
+    noise, speed_mps = (np.array([table[g] for g in groups]) for table in (ACCELERATION_MPS2, FIRST_SPEED_MPS))
     one, other, half_gap_s = a[near], b[near], gap_s[near] / 2
-    noise = np.array([ACCELERATION_MPS2[g] for g in ends.group[one].tolist()])
-    forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise)
-    backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise)
+    forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise[one])
+    backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise[one])
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
     squared = (
         np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
         + other_group[near]
     )
+    agrees = np.flatnonzero(squared <= CHI2_4DOF_999)
+    near, other, squared, covariance = near[agrees], other[agrees], squared[agrees], covariance[agrees]
+    # Minus twice the logarithm of how much likelier it is that this one goes on there than that another starts, of which as many start
+    # within `max_gap_s` as tracks do in a square and time around, in any direction.
+    begin_s = (ends.first_ns - ends.first_ns.min()) / NS_PER_S
+    around = np.column_stack([max_gap_s * ends.first[:, :2], NEARBY_M * begin_s])
+    begun = cKDTree(around).query_ball_point(around[other], max_gap_s * NEARBY_M, p=np.inf, return_length=True)
+    log_another = np.log(begun / (2 * (2 * NEARBY_M) ** 2) / (2 * np.pi * speed_mps[other] ** 2))
+    log_odds = squared + np.log(np.linalg.det(2 * np.pi * covariance)) + 2 * log_another
     position_covariance = covariance[:, :2, :2]
     certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
-    good = certain & (squared <= CHI2_4DOF_999)
+    good = certain & (log_odds <= 0)
     # The determinant keeps an uncertain agreement from costing less than a certain one.
     cost[near[good]] = squared[good] + np.log(np.linalg.det(position_covariance[good])) + 10.0
     possible = np.isfinite(cost)
     return a[possible], b[possible], cost[possible]
 
 
-def _ends(tracks: Sequence[Track], *, whole_boxes: bool) -> _Ends:
-    group = np.array([GROUP_OF[t.category] for t in tracks])
-    parts = [t.measurements for t in tracks]
+def _ends(m: Measurements, tracks: Sequence[tuple[str, NDArray[np.intp]]], *, whole_boxes: bool) -> _Ends:
+    group = np.array([GROUP_OF[category] for category, _ in tracks])
+    parts = [rows for _, rows in tracks]
     return _Ends(
-        np.array([m.t_ns[0] for m in parts]),
-        np.array([m.t_ns[-1] for m in parts]),
-        *_filtered([np.arange(len(m))[:END_MEASUREMENTS][::-1] for m in parts], parts, group, whole_boxes=whole_boxes),
-        *_filtered([np.arange(len(m))[-END_MEASUREMENTS:] for m in parts], parts, group, whole_boxes=whole_boxes),
+        m.t_ns[[rows[0] for rows in parts]],
+        m.t_ns[[rows[-1] for rows in parts]],
+        *_filtered(m, [rows[:END_MEASUREMENTS][::-1] for rows in parts], group, whole_boxes=whole_boxes),
+        *_filtered(m, [rows[-END_MEASUREMENTS:] for rows in parts], group, whole_boxes=whole_boxes),
         group,
     )
 
 
 def _filtered(
-    orders: Sequence[NDArray[np.intp]], parts: Sequence[Measurements], group: NDArray[np.str_], *, whole_boxes: bool
+    m: Measurements, orders: Sequence[NDArray[np.intp]], group: NDArray[np.str_], *, whole_boxes: bool
 ) -> tuple[Array, Array]:
     """Filter the rows of every track in the given orders; return the final states (A, 4) and covariances (A, 4, 4)."""
     count = np.array([len(o) for o in orders])
-    start = np.cumsum(count) - count
-    xy = np.concatenate([m.center_m[o, :2] for m, o in zip(parts, orders)])
-    t_ns = np.concatenate([m.t_ns[o] for m, o in zip(parts, orders)])
-    r = np.concatenate([m.covariance[o] for m, o in zip(parts, orders)])
-    r = measurement_noise(r, np.repeat(group, count), whole_boxes=whole_boxes)
-    axis = np.array([(m.yaw_rad if whole_boxes else m.box_yaw_rad)[o[0]] for m, o in zip(parts, orders)])
-    mean, covariance = np.zeros((len(parts), 4)), np.zeros((len(parts), 4, 4))
+    start, rows = np.cumsum(count) - count, np.concatenate(orders)
+    xy, t_ns = m.center_m[rows, :2], m.t_ns[rows]
+    r = measurement_noise(m.covariance[rows], np.repeat(group, count), whole_boxes=whole_boxes)
+    axis = (m.yaw_rad if whole_boxes else m.box_yaw_rad)[rows[start]]
+    mean, covariance = np.zeros((len(count), 4)), np.zeros((len(count), 4, 4))
     mean[:, :2], covariance[:, :2, :2] = xy[start], r[start]
-    bicycle = np.array([m.category[o[0]] == "bicycle" for m, o in zip(parts, orders)])
+    bicycle = m.category[rows[start]] == "bicycle"
     covariance[:, 2:, 2:] = first_velocity(axis, np.where(bicycle, "bicycle", group))
     noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
     for k in range(1, int(count.max())):
@@ -265,16 +277,22 @@ def track(
     after stitching, are dropped as false alarms, unless the log itself is as short.
     """
     everything = Measurements.join(measurements)
-    first_row = np.cumsum([0, *(len(m) for m in measurements)])
-    tracks = []
-    for ticks, rows in track_forward(
-        measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps
-    ):
-        found = everything.take(first_row[ticks] + rows)
-        tracks.append(Track(decide_category(found, whole_boxes=whole_boxes), ticks, found))
-    tracks = stitch(tracks, t_ns, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-    kept = [t for t in tracks if len(t) >= min_hits(t_ns, min_life_s)]
-    return sorted(kept, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+    count = [len(m) for m in measurements]
+    tick, first_row = np.repeat(np.arange(len(count)), count), np.cumsum([0, *count])
+    found = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps)
+    parts = [first_row[ticks] + rows for ticks, rows in found]
+    if whole_boxes:
+        # What the forward pass resumed after several misses is decided again by the motion on both sides of the gap. Centers of partial
+        # views wander where an occlusion begins and ends, so that motions of one object disagree.
+        gaps = [np.flatnonzero(np.diff(ticks) > MAX_MISSES) + 1 for ticks, _ in found]
+        parts = [part for rows, cuts in zip(parts, gaps, strict=True) for part in np.split(rows, cuts)]
+    least = min_hits(t_ns, min_life_s)
+    tracks = [
+        Track(category, tick[rows], everything.take(rows))
+        for category, rows in stitch(everything, parts, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
+        if len(rows) >= least
+    ]
+    return sorted(tracks, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
 
 
 def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Agent, AgentTable, IgnoreRegions, Scenario
 from log2sim.evaluation.metrics.truth import MIN_POINTS, image_samples
+from log2sim.files.arrays import Columns
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, choose_pairs, inverse, nearest_index
 
 Index = NDArray[np.int64]
@@ -28,7 +29,7 @@ def gate_m(length_m: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class AgentPairs:
+class AgentPairs(Columns):
     """Pairs within the gate, sorted by tick."""
 
     tick: Index  # (P,)
@@ -38,10 +39,6 @@ class AgentPairs:
     distance_m: Array  # (P,)
     similarity: Array  # (P,) 1 - distance / gate; 0 across groups of categories
     same_group: Mask  # (P,)
-
-    def take(self, index: Mask | Index) -> AgentPairs:
-        """Return the rows at `index`."""
-        return AgentPairs(*(column[index] for column in vars(self).values()))
 
     def bounds(self, ticks: int) -> Index:
         """Return row numbers (T + 1,): the pairs of tick t are rows bounds[t] to bounds[t + 1]."""

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from log2sim.datatypes import GROUPS, Scenario
 from log2sim.evaluation.metrics import comparison
 from log2sim.evaluation.metrics.comparison import Comparison, Index, Mask, StateTable
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, rectangles_overlap, wrap_angle
 
 MIN_WALKING_MPS = 0.5  # the heading of a slower pedestrian does not count
 
 
 @dataclass(frozen=True, eq=False)
-class StateErrors:
+class StateErrors(Columns):
     """Errors of K matched agent-ticks."""
 
     # truth, tick, other: (K,) indices of the truth agent, the tick and the reconstructed agent.
@@ -29,10 +30,6 @@ class StateErrors:
     yaw_rad: Array  # (K,) absolute, in [0, pi]; NaN where yaw does not count
     speed_mps: Array  # (K,) signed
     size_m: Array  # (K, 3) signed errors of length, width, height
-
-    def take(self, index: Mask) -> StateErrors:
-        """Return the rows at `index`."""
-        return StateErrors(*(column[index] for column in vars(self).values()))
 
 
 def state_errors(truth: StateTable, other: StateTable, match: NDArray[np.int64], counted: Mask) -> StateErrors:

@@ -371,9 +371,7 @@ def _labels(
             labeled.append(number)
     if not parts:
         return kitti_labels.DriveLabels()
-    rows = kitti_labels.LabelRows(
-        *(np.concatenate(columns) for columns in zip(*(vars(part).values() for part in parts)))
-    )
+    rows = kitti_labels.LabelRows.join(parts)
     note_damaged_rows(damaged, len(rows.frame) + len(damaged), notes)
     poses_at = kitti_labels.poses_of_rect(ego, first.ego_T_rect)
     found = kitti_labels.labels_of_rows(rows, poses_at, lambda frame: frame * OBJECT_PERIOD_NS, "\n".join(texts))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, ImageRegions, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError
+from log2sim.files.arrays import Columns
 from log2sim.files.documents import parse_float, parse_int
 from log2sim.files.inputs import is_present, read_file
 from log2sim.geometry import (
@@ -222,17 +223,13 @@ class DriveLabels:
 
 
 @dataclass(frozen=True, eq=False)
-class LabelRows:
+class LabelRows(Columns):
     """Lines of a label file."""
 
     frame: NDArray[np.int64]  # (L,)
     track_id: NDArray[np.str_]  # (L,)
     type: NDArray[np.str_]  # (L,)
     values: Array  # (L, 14): the numbers from truncation on
-
-    def take(self, index: NDArray[np.bool_]) -> LabelRows:
-        """Select the rows of a mask."""
-        return LabelRows(*(column[index] for column in vars(self).values()))
 
 
 def read_labels(

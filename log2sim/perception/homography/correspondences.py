@@ -10,12 +10,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
+from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array, Camera, undistort
 from log2sim.perception.boxes import quantile_of_sorted
 from log2sim.perception.homography.fit import HomographyFit, RobustFit, refused_fit, validated_fit
@@ -114,7 +114,7 @@ NEAREST_SIDE_QUANTILE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Correspondences:
+class Correspondences(Columns):
     """Pixels of one camera and the ground positions that they show.
 
     Raises `ValueError` for arrays of other shapes.
@@ -131,15 +131,6 @@ class Correspondences:
         uv, xy, tick = self.uv.shape, self.xy_ego.shape, self.tick.shape
         if uv != xy or len(uv) != 2 or uv[1] != 2 or tick != uv[:1]:
             raise ValueError(f"uv and xy_ego must be (N, 2) and tick (N,), got {uv}, {xy}, {tick}")
-
-    def __len__(self) -> int:
-        """Return the number of correspondences."""
-        return len(self.uv)
-
-    def take(self, index: Any) -> Correspondences:
-        """Select the rows at `index` (integers or a mask)."""
-        by_size = None if self.xy_by_size is None else self.xy_by_size[index]
-        return Correspondences(self.uv[index], self.xy_ego[index], self.tick[index], by_size)
 
     @classmethod
     def join(cls, parts: Sequence[Correspondences]) -> Correspondences:
