@@ -65,7 +65,8 @@ class TrafficScene:
         solids = []
         for o in self.objects:
             velocity = o.speed_mps * np.array([np.cos(o.yaw_rad), np.sin(o.yaw_rad)])
-            passes = float(rng.uniform(0.3, 0.9))
+            # Tinted panes return nearly all.
+            passes = float(rng.uniform(0.3, 0.9) if rng.random() < 0.75 else rng.uniform(0.0, 0.3))
             solids.append(Solid(o.parts, o.position_m, o.yaw_rad, velocity, glass_passes=passes))
         one = cast_polytopes(self.lidar, self.sensor, solids, self.surface, rng, self.returns)
         if self.second is None:
@@ -209,7 +210,7 @@ def draw_layout(
     out = _Layout(surface, roads, rng, without)
     # The place of the sensor's pole, or of its own car.
     out.take(np.array([[0.0, 0.0, 0.5]]) if mount == "roadside" else _covering(np.zeros(2), forward, OWN_CAR_M))
-    if mount == "vehicle" and rng.random() < 0.4:
+    if mount == "vehicle" and rng.random() < 0.5:
         _close(out, roads[0])
     for road in roads:
         _traffic(out, road)
@@ -226,15 +227,15 @@ def draw_layout(
 
 
 def _close(out: _Layout, road: Road) -> None:
-    """Put long vehicles beside the sensor's car, where one side is seen, and end-on before it, and people and riders who pass it."""
+    """Put vehicles beside the sensor's car, where one side is seen, and end-on before and behind it, and people and riders who pass it."""
     rng, own = out.rng, float(road.offset(np.zeros(1, np.float32), np.zeros(1, np.float32))[0])
     for beside in (True, False):
-        for _ in range(rng.choice(3, p=[0.4, 0.4, 0.2])):
-            category = str(rng.choice(["truck", "bus", "car"], p=[0.5, 0.35, 0.15]))
-            away = rng.choice([-1, 1]) * rng.uniform(2.5, 4.5)
-            s, d = (
-                (rng.uniform(-9, 9), away) if beside else (rng.choice([-1, 1]) * rng.uniform(10, 40), rng.normal(0, 2))
-            )
+        for _ in range(rng.choice(3, p=[0.4, 0.4, 0.2] if beside else [0.1, 0.5, 0.4])):
+            category = str(rng.choice(["truck", "bus", "car"], p=[0.5, 0.35, 0.15] if beside else [0.38, 0.32, 0.3]))
+            if beside:
+                s, d = rng.uniform(-9, 9), rng.choice([-1, 1]) * rng.uniform(2.5, 4.5)
+            else:
+                s, d = rng.choice([-1, 1], p=[0.3, 0.7]) * rng.uniform(8, 45), rng.normal(0, 1)
             xy, direction = road.at(float(s), own + float(d))
             yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.03)
             out.add_user(category, xy, yaw, speed=float(rng.uniform(0, 12) * (rng.random() < 0.6)), margin=0.1)
@@ -397,10 +398,15 @@ def _fronts(out: _Layout, road: Road) -> None:
     for side in (-1, 1):
         edge = road.half_width_m + rng.uniform(2.5, 12)
         style, s = rng.random(), -55.0
+        # In some rows every piece has its own distance from the road, its own direction, and may be as short as a car.
+        uneven = rng.random() < 0.5
         while s < 55:
-            length = rng.uniform(4, 14)
-            xy, direction = road.at(s + length / 2, side * edge)
+            length = rng.uniform(1.8, 9) if uneven and rng.random() < 0.6 else rng.uniform(4, 14)
+            away = edge + (abs(rng.normal(0, 1.5)) if uneven else 0.0)
+            xy, direction = road.at(s + length / 2, side * away)
             yaw = direction + (0.0 if side > 0 else np.pi)
+            if uneven:
+                yaw += rng.normal(0, 0.4) if rng.random() < 0.15 else rng.normal(0, 0.03)
             clear = out.is_free(_covering(xy, direction, (length, 2.0, 1.0)), 0.3)
             if clear and not out.on_road(xy):
                 if style < 0.5 and rng.random() < 0.85:
@@ -408,7 +414,7 @@ def _fronts(out: _Layout, road: Road) -> None:
                 elif style < 0.85 and rng.random() < 0.75:
                     out.add_thing("fence", xy, yaw, clutter.fence(length, rng))
                 for _ in range(rng.poisson(1.0) if at_walls else 0):
-                    place, _ = road.at(s + rng.uniform(0, length), side * (edge - rng.uniform(0.25, 1.2)))
+                    place, _ = road.at(s + rng.uniform(0, length), side * (away - rng.uniform(0.25, 1.2)))
                     kind = out.one_of(AT_WALLS)
                     if kind == "person":
                         out.add_user("pedestrian", place, rng.uniform(-np.pi, np.pi), margin=0.0)

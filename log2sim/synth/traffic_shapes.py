@@ -48,9 +48,9 @@ _CAR_SHARES = {
 
 
 def car(rng: Rng) -> Shape:
-    """Draw a car: a body, a cabin of glass under a solid roof, seats, wheels; nearly one in ten is a delivery van."""
+    """Draw a car: a body, a cabin of glass under a solid roof, seats, wheels; one in eight is a delivery van."""
     kinds = [*_CAR_SHARES, "delivery"]
-    shares = np.array([*_CAR_SHARES.values(), 0.08])
+    shares = np.array([*_CAR_SHARES.values(), 0.14])
     kind = kinds[rng.choice(len(kinds), p=shares / shares.sum())]
     return _delivery_van(rng) if kind == "delivery" else _car(kind, rng)
 
@@ -117,7 +117,7 @@ def _wheels(x: float, width: float, radius: float) -> list[Polytope]:
 
 
 def _delivery_van(rng: Rng) -> Shape:
-    length, width, height = rng.uniform(5.0, 6.5), rng.uniform(1.95, 2.1), rng.uniform(2.2, 2.8)
+    length, width, height = rng.uniform(5.0, 7.4), rng.uniform(1.9, 2.2), rng.uniform(2.1, 3.0)
     half, hood = length / 2, rng.uniform(1.1, 1.3)
     foot = half - rng.uniform(0.6, 1.0)
     top = foot - (height - hood) * rng.uniform(0.4, 0.6)
@@ -254,7 +254,8 @@ def _load(back: float, front: float, width: float, floor: float, height: float, 
     """Make what a truck or trailer carries between two x."""
     w, kind = width / 2, rng.random()
     if kind < 0.6:
-        return [box((back, -w, floor), (front, w, height), PAINT)]
+        skirt = [box((back + 0.1, -w, rng.uniform(0.2, 0.6)), (front, w, floor), PAINT)] if rng.random() < 0.35 else []
+        return [box((back, -w, floor), (front, w, height), PAINT), *skirt]
     bed = [box((back, -w, floor), (front, w, floor + 0.2), METAL)]
     if kind < 0.75:
         wall = rng.uniform(0.4, 1.4)
@@ -286,13 +287,14 @@ def semitrailer(rng: Rng) -> Shape:
 
 
 def bus(rng: Rng) -> Shape:
-    """Draw a bus or coach."""
+    """Draw a bus or coach; the windows of some are covered."""
     length = rng.choice([rng.uniform(6.5, 9), rng.uniform(10.5, 13), 18.0], p=[0.2, 0.65, 0.15])
     width, height = rng.uniform(2.3, 2.6), rng.uniform(2.8, 3.5)
     half, w, belt = length / 2, width / 2, rng.uniform(1.0, 1.4)
+    pane = PAINT if rng.random() < 0.3 else GLASS
     parts = [
         box((-half, -w, 0.3), (half, w, belt), PAINT),
-        prism([(-half, belt), (half, belt), (half - 0.15, height - 0.3), (-half + 0.05, height - 0.3)], width * 0.99, GLASS, taper=0.01),
+        prism([(-half, belt), (half, belt), (half - 0.15, height - 0.3), (-half + 0.05, height - 0.3)], width * 0.99, pane, taper=0.01),
         box((-half + 0.05, -w * 0.98, height - 0.32), (half - 0.15, w * 0.98, height), PAINT),
         box((-half + 0.05, -w * 0.97, belt), (-half + 0.4, w * 0.97, height - 0.3), PAINT),
         box((-half + 0.6, -w * 0.8, belt - 0.2), (half - 1.5, w * 0.8, belt + 0.35), CLOTH),
@@ -439,6 +441,10 @@ def building(length: float, rng: Rng) -> Parts:
     if rng.random() < 0.5:
         x = rng.uniform(-half * 0.6, half * 0.6)
         parts.append(box((x - 0.8, -rng.uniform(0.2, 1.2), 0), (x + 0.8, 0.1, rng.uniform(1.0, 3.2)), WALL))
+    # Wings, bays and porches, as wide and as far out as a side or a rear of a vehicle.
+    for x in rng.uniform(-half, half, rng.choice(4, p=[0.5, 0.25, 0.15, 0.1])):
+        wide, tall = min(rng.uniform(0.8, 6.0), length) / 2, rng.uniform(1.8, 4.0) if rng.random() < 0.5 else height
+        parts.append(box((x - wide, -rng.uniform(0.3, 2.5), 0), (x + wide, 0.1, tall), WALL))
     parts += [box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)][:2]
     if rng.random() < 0.3:
         parts.append(box((-half, -1.5, 2.8), (half, 0.1, 3.0), WALL))

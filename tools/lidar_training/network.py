@@ -132,6 +132,10 @@ MIN_TOWED_M = 1.5
 STRIDE = 2
 # Width of the peak as a share of length and width, and at least of a cell.
 PEAK_LENGTH, PEAK_WIDTH, MIN_PEAK_CELLS = 0.16, 0.18, 0.55
+# Of a long vehicle that is seen end-on nothing shows where its middle is, and a peak that may be anywhere is nowhere: its peak is as far behind the
+# end that shows as the middle of a car is, m. Where the sensor is so far beside its flank, m, its length shows, and the peak is in the middle. Cells
+# regress the middle in either case.
+HALF_CAR_M, FLANK_SHOWS_M = 2.2, 2.0
 # Cells whose peak is higher than this regress the box.
 MIN_REGRESSED_PEAK = 0.45
 
@@ -140,7 +144,7 @@ MIN_REGRESSED_PEAK = 0.45
 class Targets:
     """Maps (B, ...) at the network's stride."""
 
-    heat: Tensor  # (B, 3, h, w): one at an object's middle, falling around it
+    heat: Tensor  # (B, 3, h, w): one at an object's peak, falling around it
     box: Tensor  # (B, 10, h, w): dx, dy, z, log sizes, sin and cos of twice the yaw, sin and cos of the yaw
     regressed: Tensor  # (B, 1, h, w): where the box is regressed
     considered: Tensor  # (B, 3, h, w): where the heat is judged
@@ -175,18 +179,23 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
             dy = ((v - np.arange(j0, j1) - 0.5) * cell)[None, :].astype(np.float32)
             c, s = np.cos(yaw), np.sin(yaw)
             along, across = dx * c + dy * s, dy * c - dx * s
+            # From the middle to the peak along the axis; the sensor is at the origin.
+            beside_m = abs(x * s - y * c) - width / 2
+            play_m = max(length / 2 - HALF_CAR_M, 0.0) * float(np.clip(1 - beside_m / FLANK_SHOWS_M, 0, 1))
+            shift_m = float(np.clip(-(x * c + y * s), -play_m, play_m))
+            pu, pv = u + shift_m * c / cell, v + shift_m * s / cell
             inside = (np.abs(along) < length / 2 + 0.1) & (np.abs(across) < width / 2 + 0.1)
             # A bicycle without rider may pass for a two-wheeler, but not for a person.
             group = GROUPS.index("vehicle" if name == "other" else GROUP_OF[name])
-            if points < MIN_POINTS or name in ("bicycle", "other") or not (0 <= u < n and 0 <= v < n):
+            if points < MIN_POINTS or name in ("bicycle", "other") or not (0 <= pu < n and 0 <= pv < n):
                 considered[(k, group, *area)][inside] = 0
                 continue
             spread_m = [
-                max(length * PEAK_LENGTH, cell * MIN_PEAK_CELLS),
+                max(min(length, 2 * HALF_CAR_M) * PEAK_LENGTH, cell * MIN_PEAK_CELLS),
                 max(width * PEAK_WIDTH, cell * MIN_PEAK_CELLS),
             ]
-            peak = np.exp(-0.5 * ((along / spread_m[0]) ** 2 + (across / spread_m[1]) ** 2))
-            peak[int(u) - i0, int(v) - j0] = 1
+            peak = np.exp(-0.5 * (((along + shift_m) / spread_m[0]) ** 2 + (across / spread_m[1]) ** 2))
+            peak[int(pu) - i0, int(pv) - j0] = 1
             stronger = peak > heat[(k, group, *area)]
             heat[(k, group, *area)][stronger] = peak[stronger]
             near = (peak > MIN_REGRESSED_PEAK) & stronger
