@@ -39,7 +39,7 @@ MUTANTS = (
     ("Kalman gain", "tracking/forward.py", "gain @ (xy[:, :, None]", "0.5 * gain @ (xy[:, :, None]", "track"),
     ("process noise", "tracking/forward.py", "(span**3 / 3)", "(span**3 / 30)", "track"),
     ("weak detections start tracks", "tracking/forward.py", "fresh = strong.copy()", "fresh = np.ones_like(strong)", "track"),
-    ("gaps of tracks", "tracking/tracker.py", "-half_gap_s, noise)", "half_gap_s, noise)", "track"),
+    ("gaps of tracks", "tracking/tracker.py", "-half_gap_s, noise[one])", "half_gap_s, noise[one])", "track"),
     ("outliers count", "agents/smooth/fixed_interval.py", "problem = replace(problem, weight=weight)", "problem = replace(problem, weight=1 + 0 * weight)", "smooth"),
     ("standing vehicles roll", "agents/smooth/fixed_interval.py", "still = np.isfinite(sigma)", "still = np.isfinite(sigma) & False", "smooth"),
     ("sizes of whole sides", "agents/size.py", "error_of_all / (error_of_all + prior)", "prior / (error_of_all + prior)", "size"),
