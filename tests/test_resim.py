@@ -359,12 +359,13 @@ def test_what_was_not_recorded_is_told(recorded: tuple[Log, Scenario], tmp_path:
     far = replace(truth.others[0], id="far", waypoints=replace(w, x_m=w.x_m + 500))
     aside = replace(ego, waypoints=replace(ego.waypoints, y_m=ego.waypoints.y_m + 8))
     source, now = (replace(truth, agents=agents) for agents in ((*truth.agents, far), (aside, *truth.others)))
-    source = replace(source, provenance={"log": {"name": "elsewhere", "digest": "0" * 64}})
+    source = replace(source, provenance={"log": {"name": "elsewhere", "digest": "0" * 64}, "edits": [{}]})
     notes = resimulate(short, source, now, tmp_path / "out")
     assert notes[0].startswith("no point of")
     assert "far" in notes[0]
     assert "reconstructed from log 'elsewhere', whose data are not those" in notes[1]
-    assert "ego is 8.0 m from where anything was recorded" in notes[2]
+    assert "was edited" in notes[2]
+    assert "ego is 8.0 m from where anything was recorded" in notes[3]
 
 
 def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], world: World) -> None:

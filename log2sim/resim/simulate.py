@@ -349,6 +349,11 @@ def resimulate(
             f"scenario '{source.name}' was reconstructed from log '{of.get('name')}', whose data are not those of '{log.name}': "
             "where poses or agents differ, surfaces are wrong"
         )
+    if source.provenance.get("edits"):
+        notes.append(
+            f"scenario '{source.name}' was edited, and where it removed or moved somebody the world shows who was recorded there; "
+            "take the scenario before, and the edited one as what happens now (--replay)"
+        )
     if off_m > MAX_OFF_PATH_M:
         notes.append(
             f"at {when_s:.1f} s the ego is {off_m:.1f} m from where anything was recorded; sweeps lack what was hidden"
