@@ -16,7 +16,7 @@ from worlds import rows_at
 
 from log2sim.datatypes import Measurements, Track
 from log2sim.geometry import NS_PER_S
-from log2sim.geometry.transforms import NEVER, choose_pairs
+from log2sim.geometry.statistics import NEVER, choose_pairs
 from log2sim.tracking.forward import (
     CENTER_SIGMA_M,
     ForwardTracker,

@@ -138,7 +138,7 @@ def _serve(work: Callable[[Any], Any], connection: Connection, not_mine: list[Co
             except Exception as error:
                 error.add_note("".join(traceback.format_exception(error)))
                 answer = (False, error)
-            # A pickle that can be read; of an error that cannot, its text
+            # An error that cannot be pickled, or read again, is sent as its text.
             try:
                 content = pickle.dumps(answer, protocol=5)
                 if not answer[0]:

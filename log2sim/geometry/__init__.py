@@ -42,19 +42,22 @@ from log2sim.geometry.camera import (
     undistort,
 )
 from log2sim.geometry.polyline import SPACING_M, Polyline, Projection, crossings
-from log2sim.geometry.transforms import (
+from log2sim.geometry.statistics import (
     CHI2_2DOF_99,
     CHI2_2DOF_999,
     CHI2_4DOF_999,
+    choose_pairs,
+    fit_windows,
+    median,
+    weighted_quantile,
+)
+from log2sim.geometry.transforms import (
     NS_PER_S,
     Array,
     PoseTrack,
     apply,
-    choose_pairs,
     cos_sin,
-    fit_windows,
     inverse,
-    median,
     nearest_index,
     nearest_rotation,
     period_of,
@@ -64,7 +67,6 @@ from log2sim.geometry.transforms import (
     shift_poses,
     slerp,
     transform,
-    weighted_quantile,
     whole_kilometers,
     wrap_angle,
     yaw_of,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.files.arrays import Columns
 from log2sim.resim.rays import Floats, Rays, bin_of
 from log2sim.resim.surfels import Surfels
 
@@ -70,7 +71,7 @@ def grid_of(rays: Rays) -> RayGrid:
 
 
 @dataclass(frozen=True, eq=False)
-class Meetings:
+class Meetings(Columns):
     """Rays that meet discs, M of them."""
 
     ray: NDArray[np.intp]
@@ -78,15 +79,6 @@ class Meetings:
     range_m: Floats
     facing: Floats  # cosine between ray and normal
     weight: Floats  # 1 in the middle of the disc, 0 at its edge
-
-    def take(self, index: Any) -> Meetings:
-        """Return some of them."""
-        return Meetings(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-
-def met_of(parts: list[Meetings]) -> Meetings:
-    """Concatenate meetings."""
-    return Meetings(*(np.concatenate([getattr(p, name) for p in parts]) for name in Meetings.__dataclass_fields__))
 
 
 def meetings(rays: Rays, grid: RayGrid, surfels: Surfels, center: Floats, normal: Floats) -> Meetings:
@@ -97,7 +89,7 @@ def meetings(rays: Rays, grid: RayGrid, surfels: Surfels, center: Floats, normal
         found.append(_met(rays, grid, center[part], normal[part], surfels.radius_m[part], first))
     if not found:
         found.append(_met(rays, grid, center, normal, surfels.radius_m, 0))
-    return met_of(found)
+    return Meetings.join(found)
 
 
 def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floats, first: int) -> Meetings:

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log, Sweep
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, inverse, rotation_from_rpy, wrap_angle
 from log2sim.perception.records import RecordSource
 
@@ -29,7 +30,7 @@ MIN_DOWN_RAD = np.deg2rad(5.0)  # below the horizon: a street is not steeper
 
 
 @dataclass(frozen=True, eq=False)
-class Shots:
+class Shots(Columns):
     """Rays of one sweep in the frame of the sensor, each at its own time.
 
     Attributes
@@ -48,10 +49,6 @@ class Shots:
     t_ns: NDArray[np.int64]
     range_m: Floats
     intensity: Floats
-
-    def take(self, index: Any) -> Shots:
-        """Return some of the rays."""
-        return Shots(self.direction[index], self.t_ns[index], self.range_m[index], self.intensity[index])
 
 
 @dataclass(frozen=True, eq=False)

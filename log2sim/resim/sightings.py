@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.resim.caster import Meetings, met_of
+from log2sim.resim.caster import Meetings
 from log2sim.resim.rays import Floats, Rays, bin_of
 from log2sim.resim.surfels import Surfels, joined
 
@@ -221,4 +221,4 @@ def with_sightings(
         discs.append(
             Surfels(chosen.point_m[near], np.zeros((len(ray), 3), np.float32), one, chosen.intensity[near], one, back)
         )
-    return met_of(parts), joined([surfels, *discs])
+    return Meetings.join(parts), joined([surfels, *discs])

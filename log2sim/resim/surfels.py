@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array
 from log2sim.resim.rays import Floats, Pattern, Shots, angles_of
 
@@ -29,7 +29,7 @@ RADIUS_PER_CELL = 0.8  # discs of neighboring cells overlap, so that no ray pass
 
 
 @dataclass(frozen=True, eq=False)
-class Surfels:
+class Surfels(Columns):
     """Discs, S of them.
 
     Attributes
@@ -54,19 +54,10 @@ class Surfels:
     share: Floats
     returned: Floats
 
-    def __len__(self) -> int:
-        """Return the number of discs."""
-        return len(self.radius_m)
-
-    def take(self, index: Any) -> Surfels:
-        """Return some of the discs."""
-        return Surfels(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
 
 def joined(parts: Iterable[Surfels]) -> Surfels:
     """Concatenate surfels of one frame."""
-    some = list(parts) or [no_surfels()]
-    return Surfels(*(np.concatenate([getattr(p, name) for p in some]) for name in Surfels.__dataclass_fields__))
+    return Surfels.join(list(parts) or [no_surfels()])
 
 
 def no_surfels() -> Surfels:
