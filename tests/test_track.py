@@ -297,6 +297,19 @@ def test_two_that_pass_behind_the_same_truck_come_out_as_themselves() -> None:
     assert [len(t) for t in tracks] == [58, 58]
 
 
+def test_a_single_box_in_a_gap_stays_with_the_rider_on_both_sides_of_it() -> None:
+    # Taken for a pedestrian it shows no motion, and none who walks would be so far on; what rides on after it does tell.
+    found, t_ns = record({"rider": line(0, 0, 5, 0)}, 60, hidden={"rider": (20, 40)}, category="cyclist")
+    found[29] = seen(np.array([[14.5, 0.0]]), t_ns[29], ["rider"], category="pedestrian")
+    (one,) = track(found, t_ns, **OPTIONS | {"whole_boxes": True, "min_life_s": 0.0})
+    assert one.category == "cyclist"
+    assert one.tick.tolist() == [*range(20), 29, *range(40, 60)]
+    # Beside the way it is somebody else.
+    found[29] = seen(np.array([[14.5, 4.0]]), t_ns[29], ["other"], category="pedestrian")
+    (one,) = track(found, t_ns, **OPTIONS | {"whole_boxes": True, "min_life_s": 0.0})
+    assert one.tick.tolist() == [*range(20), *range(40, 60)]
+
+
 def test_what_stands_is_the_same_however_long_it_was_hidden() -> None:
     ways = {"parked": line(20, 5, 0, 0), "passing": line(0, 0, 10, 0)}
     tracks = track(*record(ways, 120, hidden={"parked": (30, 90)}), **OPTIONS)

@@ -281,15 +281,18 @@ def track(
     )
     if not found:
         return []
-    ticks, rows = (np.concatenate(column) for column in zip(*found))
-    cuts = np.cumsum([len(part) for part, _ in found])[:-1]
+    whole = [first_row[ticks] + rows for ticks, rows in found]
+    parts = whole
     if whole_boxes:
         # What the forward pass resumed after several misses is decided again by the motion on both sides of the gap. Centers of partial
         # views wander where an occlusion begins and ends, so that motions of one object disagree.
-        cuts = np.union1d(cuts, np.flatnonzero(np.diff(ticks) > MAX_MISSES) + 1)
-    parts = np.split(first_row[ticks] + rows, cuts)
-    least = min_hits(t_ns, min_life_s)
+        rows = np.concatenate(whole)
+        begun = np.cumsum([len(part) for part in whole])[:-1]
+        parts = np.split(rows, np.union1d(begun, np.flatnonzero(np.diff(tick[rows]) > MAX_MISSES) + 1))
     stitched = stitch(everything, parts, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
+    if whole_boxes:
+        stitched = _with_single_boxes(stitched, whole, tick)
+    least = min_hits(t_ns, min_life_s)
     kept = [(category, rows) for category, rows in stitched if len(rows) >= least]
     # One copy in the order of the tracks, of which each is a part.
     end = np.cumsum([len(rows) for _, rows in kept])
@@ -299,6 +302,28 @@ def track(
         for (category, rows), stop in zip(kept, end.tolist(), strict=True)
     ]
     return sorted(tracks, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+
+
+def _with_single_boxes(
+    stitched: list[tuple[str, NDArray[np.intp]]], whole: Sequence[NDArray[np.intp]], tick: NDArray[np.intp]
+) -> list[tuple[str, NDArray[np.intp]]]:
+    """Let single boxes that were cut off stay where the forward pass, with tracks `whole`, had them, if what is around them is one track.
+
+    A box that is alone shows no motion by which both sides could decide; `tick`: of all rows.
+    """
+    track, rows = np.repeat(np.arange(len(whole)), [len(part) for part in whole]), np.concatenate(whole)
+    owner = np.zeros(len(tick), dtype=np.intp)
+    for k, (_, part) in enumerate(stitched):
+        owner[part] = k
+    of, size = owner[rows], np.array([len(part) for _, part in stitched])
+    between = (of[:-2] == of[2:]) & (of[:-2] != of[1:-1]) & (track[:-2] == track[2:]) & (size[of[1:-1]] == 1)
+    out = dict(enumerate(stitched))
+    for k in (np.flatnonzero(between) + 1).tolist():
+        category, part = out[int(of[k - 1])]
+        if tick[rows[k]] not in tick[part]:
+            out[int(of[k - 1])] = category, np.sort(np.append(part, rows[k]))
+            del out[int(of[k])]
+    return list(out.values())
 
 
 def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:

@@ -55,6 +55,7 @@ def main(folder: Path, online: bool = False, fit: bool = False, results: Path | 
     else:
         names = sorted({path.stem for path in (folder / "detections").glob("*/*.txt")})
         sequences = {name: read_sequence(folder, name) for name in names}
+        describe_sequence(*next(iter(sequences.values())), online=online)  # imports what is imported when it is needed
         begin = time.process_time()
         described = {name: describe_sequence(*sequence, online=online) for name, sequence in sequences.items()}
         told = {name: choose(d, online=online) for name, d in described.items()}
