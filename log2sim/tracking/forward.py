@@ -230,7 +230,8 @@ class ForwardTracker:
         self._now_ns = now_ns
         if len(m) == 0:
             return m["row"], np.zeros(0, dtype=np.intp)
-        fresh = strong = m["score"] >= self.birth_score
+        strong = m["score"] >= self.birth_score
+        fresh = strong.copy()
         numbers = tracks = taken = np.zeros(0, dtype=np.intp)
         if len(known):
             costs, inside, flows = self._costs(m, flow_mps, now_ns)
@@ -239,7 +240,6 @@ class ForwardTracker:
             joined = -2 * np.logaddexp(prior[0] - costs[:, 0] / 2, prior[1] - costs[:, 1] / 2)
             tracks, taken = self._choose(m, strong, joined, inside)
         if len(tracks):
-            fresh = strong.copy()
             fresh[taken] = False
             standing = known["standing"][tracks] * np.exp((joined[tracks, taken] - costs[tracks, 1, taken]) / 2)
             known["standing"][tracks] = np.where(standing < MIN_STANDING_PROBABILITY, 0.0, standing)
@@ -329,7 +329,7 @@ def _both_motions(dt_s: float) -> tuple[Array, Array, Array]:
     step, unit = _motion(dt_s)
     noise = _ACCELERATION[:, None, None, None] ** 2 * unit * np.array([1.0, 0.0])[:, None, None]
     noise[:, 1, _PLACE, _PLACE] = STANDING_DRIFT_M**2 * abs(dt_s)
-    return step, np.kron(step, step).T, noise
+    return step, np.asarray(np.kron(step, step).T, dtype=np.float64), noise
 
 
 def _measured(found: Measurements, now_ns: NDArray[np.int64], *, whole_boxes: bool) -> Rows:

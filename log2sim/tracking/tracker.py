@@ -209,8 +209,9 @@ def _ends(m: Measurements, tracks: Sequence[tuple[str, NDArray[np.intp]]], *, wh
     group = np.array([GROUP_OF[category] for category, _ in tracks])
     parts = [rows for _, rows in tracks]
     orders = [*(rows[:END_MEASUREMENTS][::-1] for rows in parts), *(rows[-END_MEASUREMENTS:] for rows in parts)]
-    first, last = zip(*(np.split(v, 2) for v in _filtered(m, orders, np.tile(group, 2), whole_boxes=whole_boxes)))
-    return _Ends(m.t_ns[[rows[0] for rows in parts]], m.t_ns[[rows[-1] for rows in parts]], *first, *last, group)
+    mean, covariance = _filtered(m, orders, np.tile(group, 2), whole_boxes=whole_boxes)
+    begin_ns, end_ns, n = m.t_ns[[rows[0] for rows in parts]], m.t_ns[[rows[-1] for rows in parts]], len(parts)
+    return _Ends(begin_ns, end_ns, mean[:n], covariance[:n], mean[n:], covariance[n:], group)
 
 
 def _filtered(
