@@ -47,7 +47,7 @@ def choose(described: Described, *, online: bool) -> Boxes:
     keep, score = _people(described, online=online)
     keep_car, score_car = _cars(described, online=online)
     keep = np.where(car, keep_car, keep)
-    told = Boxes(**{**vars(described.boxes), "score": np.where(car, score_car, score)}).take(keep)
+    told = replace(described.boxes, score=np.where(car, score_car, score)).take(keep)
     return told.take(np.lexsort([told.track_id, told.frame]))
 
 
@@ -136,11 +136,11 @@ class Described:
 
 def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
     """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
-    columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
     in_camera = from_map(*smooth_shapes(rows, boxes, measurements, online=online), rows.frame, view)
     # In the image the detector knows better than a box around a box.
     in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
-    out = Boxes(**(columns | in_camera))
+    told = {"frame": rows.frame, "track_id": rows.track, "category": rows.category}
+    out = replace(boxes.take(rows.model), **told, **in_camera)
     inside = np.isfinite(out.box_px).all(axis=1)
     out, rows = out.take(inside), rows.take(inside)
     if not online:
