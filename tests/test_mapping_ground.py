@@ -124,7 +124,7 @@ def test_pictures_and_points_of_moving_agents_are_left_out() -> None:
     streams = {"c0": Stream("c0", log.streams["c0"].t_ns, painted), "l0": Stream("l0", log.streams["l0"].t_ns, bright)}
     spoiled = log.changed(streams=streams)
     coarse, both = MapConfig(cell_m=0.1), (scenario, empty_scenario(log))
-    with_car, without = maps = [map_ground(spoiled, s, coarse, refine=False) for s in both]
+    with_car, _ = maps = [map_ground(spoiled, s, coarse, refine=False) for s in both]
     red = [int(((g.color_bgr[..., 2] > 120) & (g.color_bgr[..., 0] < 60) & (g.alpha > 0)).sum()) for g in maps]
     assert red[1] > 500
     assert red[0] < 0.01 * red[1]
