@@ -103,7 +103,7 @@ def estimate_homography(
         return refused_fit(f"{len(rows)} correspondences, at least 4 are needed", len(uv), ticks)
     rows = rows[np.argsort(number[rows], kind="stable")]
     of_rows = number[rows]
-    dense = np.cumsum(np.diff(of_rows, prepend=of_rows[0]) > 0)
+    dense = np.cumsum(np.diff(of_rows, prepend=of_rows[0]) > 0, dtype=np.int64)
     data = NormalizedCorrespondences.of(uv[rows], xy[rows], dense, options.sigma_px, sigma_m)
     if of_stream:
         image_K = None

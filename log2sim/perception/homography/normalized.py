@@ -278,11 +278,15 @@ def _homography_steps(linear: Linearization, h: Array, gate: float) -> Array:
         step = -np.linalg.solve(normal, right)
     except np.linalg.LinAlgError:
         return h
-    moved = h.reshape(count, 9, 1) + np.where(enough[:, None, None] & np.isfinite(step).all(axis=1, keepdims=True), step, 0.0)
+    moved = h.reshape(count, 9, 1) + np.where(
+        enough[:, None, None] & np.isfinite(step).all(axis=1, keepdims=True), step, 0.0
+    )
     return np.asarray(moved / np.sqrt((moved * moved).sum(axis=1, keepdims=True))).reshape(count, 3, 3)
 
 
-def refine(data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Array | None = None) -> tuple[Array, Linearization]:
+def refine(
+    data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Array | None = None
+) -> tuple[Array, Linearization]:
     """Minimize the bounded loss from `h` (3, 3); with intrinsics `image_K` (3, 3) over the poses of that camera."""
     linear = linearize(data, h[None])
     loss = float(np.minimum(linear.squared, CHI2_2DOF_99).sum())
@@ -303,7 +307,7 @@ def newton_step(
 ) -> Array:
     """Take a Gauss-Newton step from `h` (3, 3), the `k`-th linearized; returns `h` if the step is undetermined."""
     if image_K is None:
-        return _homography_steps(linear, h[None], gate)[0]
+        return np.asarray(_homography_steps(linear, h[None], gate)[0])
     use, basis = linear.squared[k] < gate, pose_tangent(image_K, h)
     slope = (linear.slope[k] * use).reshape(9, -1)
     normal, right = basis.T @ (slope @ slope.T) @ basis, basis.T @ (slope @ linear.error[k].ravel())
