@@ -33,10 +33,9 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
+from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.given_poses import (
     MAX_SIGMA_M,
-    USUAL_SIGMA_M,
-    USUAL_SIGMA_RAD,
     CheckedPoses,
     Stretch,
     join_tracks,

@@ -33,15 +33,12 @@ from log2sim.road.strokes import Curve, fit_curve, thin, trace
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).
 BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
-MAX_BAR_TURN_RAD = np.deg2rad(10)
 MIN_BARS = 3
-SURE_BARS, FEW_BARS = 6, -3.0  # fewer are often side by side by chance in LiDAR intensities of grass
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
 STOP_WIDTH_M, STOP_LENGTH_M = (0.22, 0.85), (1.5, 20.0)
 LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
-ALONE = -1.0  # log-odds of a stop line beside which no lane line is seen
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
 MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
 # A plain stroke fills its rectangle, also where it is blurred; an arrow of as many widths length half of it.
@@ -88,9 +85,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
-        odds = log_odds_of_line(own, sum(lengths), dashes=len(chosen), alone=False)
-        if not np.isfinite(own.color).any() and len(chosen) < SURE_BARS:
-            odds += FEW_BARS
+        odds = log_odds_of_line(own, sum(lengths), alone=False)
         corners = []
         for _, bar in chosen:
             d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
@@ -124,7 +119,6 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     """Mask (B, B) of bars that are parallel and side by side."""
     middle, direction = np.array([b.middle for b in bars]), np.array([b.direction for b in bars])
     length, width = np.array([b.length_m for b in bars]), np.array([b.width_m for b in bars])
-    turn = np.abs((direction[:, None] - direction + np.pi / 2) % np.pi - np.pi / 2)
     offset = middle[None] - middle[:, None]
     c, s = np.cos(direction)[:, None], np.sin(direction)[:, None]
     along, across = np.abs(offset[..., 0] * c + offset[..., 1] * s), np.abs(offset[..., 1] * c - offset[..., 0] * s)
@@ -132,7 +126,7 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     near = (across >= BAR_STEP_M[0]) & (across <= BAR_STEP_M[1]) & (along <= BARS_IN_LINE * shorter)
     alike = np.maximum(width[:, None], width) <= 1.6 * np.minimum(width[:, None], width)
     alike &= np.maximum(length[:, None], length) <= 2.0 * shorter
-    beside = near & alike & (turn <= MAX_BAR_TURN_RAD)
+    beside = near & alike
     return np.asarray(beside | beside.T)
 
 
@@ -154,7 +148,7 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
                 cross = chord[0] * tangent[1] - chord[1] * tangent[0]
                 angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
-            stops.append(replace(line, log_odds=line.log_odds + (ALONE if angle is None else 0.0)))
+            stops.append(line)
         else:
             others.append(line)
     return stops, others
@@ -234,7 +228,7 @@ MIN_SEEN = 0.5
 ROAD_TOLERANCE = 1.5  # sigmas that a road may differ from where lane lines are
 # Log-odds: a meter of seam, patch or wear is much more frequent than that of a border, long ones are not.
 PRIOR, PER_METER, MAX_BY_LENGTH, PER_SIGMA = -3.0, 0.15, 4.5, 0.7
-MIN_BORDER_M, MIN_BORDER_CONFIDENCE = 5.0, 0.5
+MIN_BORDER_M = 5.0
 NEAR_LINE_M = 12.0  # borders farther from all lane lines are those of something else
 
 
@@ -387,7 +381,7 @@ def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[A
     sigmas = float(_surface_step(np.array(by_color), np.array(by_lidar), np.array(len(steps[1]) > 3)))
     curb = CURB_M[0] <= by_height * HEIGHT_SIGMA_M <= CURB_M[1]
     odds = PRIOR + min(PER_METER * length, MAX_BY_LENGTH) + PER_SIGMA * min(sigmas - MIN_STEP, CLEAR_STEP) + 2.0 * curb
-    if probability(odds) < MIN_BORDER_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
+    if probability(odds) < MIN_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
         return None
     shown = (("camera", by_color > 1), ("lidar", by_lidar > 1 or curb))
     sources = tuple(name for name, shows in shown if shows)
