@@ -42,8 +42,8 @@ MAX_MISSES = 2
 # A match is rejected when a larger share of the box's length or width is unobserved: its position along that axis is
 # undetermined.
 MAX_HIDDEN_SHARE = 0.7
-# A ray that goes on behind a side by this passed it. Where more than this share of those toward a box go on, nothing is there.
-SIDE_DEPTH_M, MAX_THROUGH_SHARE = 0.3, 0.5
+# A ray that goes on behind a side by this passed it.
+SIDE_DEPTH_M = 0.3
 # An end is where a ray passes within this distance of the last point.
 MAX_GAP_M = 1.5
 # Quantiles of the heights of points between which a side is: below a truck and above a hood rays pass.
@@ -273,7 +273,7 @@ def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
     first = start - np.append(center, size[2] / 2)
     ending = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
     passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
-    return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
+    return bool(met >= MIN_POINTS and 2 * passed > met)
 
 
 # Standard deviations of a yaw known up to half a turn: of the box of one tick, and the least of any.

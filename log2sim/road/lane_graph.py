@@ -43,6 +43,7 @@ from log2sim.road.sections import (
     join_conflicts,
     lay_out,
 )
+from log2sim.road.strokes import CHORD_ERROR_M
 
 # Stations at which the distance to the next line is taken.
 STRIP_STEP_M = 1.0
@@ -207,8 +208,6 @@ def _joined(one: LaneStrip, two: LaneStrip) -> LaneStrip:
     return LaneStrip(line, width, s, longer.left, longer.right, confidence)
 
 
-# How far interpolation may be from a point that is left out: below the centimeter to which lanes are exact.
-TOLERANCE_M = 0.004
 # Longest chord, so that heights and widths are sampled too.
 MAX_STEP_M = 20.0
 
@@ -225,7 +224,7 @@ def thin(lane: MapLane) -> MapLane:
         share = (way / way[-1])[:, None]
         off = np.abs(columns[a : b + 1] - (columns[a] + share * (columns[b] - columns[a]))).max(axis=1)
         k = a + int(off.argmax())
-        if off.max() <= TOLERANCE_M:
+        if off.max() <= CHORD_ERROR_M:
             if way[-1] <= MAX_STEP_M:
                 continue
             k = a + int(np.searchsorted(way, way[-1] / 2))

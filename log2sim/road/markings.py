@@ -36,7 +36,7 @@ BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
 MIN_BARS = 3
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
-STOP_WIDTH_M, STOP_LENGTH_M = (0.22, 0.85), (1.5, 20.0)
+STOP_LENGTH_M = (1.5, 20.0)
 LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
@@ -135,7 +135,7 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
     lanes = [one for one in lines if one.width_m <= MAX_LANE_LINE_WIDTH_M and one.length_m >= 3.0]
     stops, others = [], []
     for line in lines:
-        wide = STOP_WIDTH_M[0] <= line.width_m <= STOP_WIDTH_M[1]
+        wide = BAR_WIDTH_M[0] <= line.width_m <= BAR_WIDTH_M[1]
         fits = wide and STOP_LENGTH_M[0] <= line.length_m <= STOP_LENGTH_M[1] and line.dashes < 3
         middle, chord = line.xy.mean(axis=0), line.xy[-1] - line.xy[0]
         nearest, angle = LANE_LINE_WITHIN_M, None  # of the lane lines; the angle to it in [0, pi / 2]

@@ -290,8 +290,6 @@ BLEND_M = 20.0
 GAP_M = 8.0
 # Center lines stay this close to every path on them, so that all lie within half of a lane of `LANE_M`.
 KEEP_M = 1.6
-# Stations at which offsets of paths are compared.
-GRID_M = 2.0
 # Standard deviation of the smoothing along the lane of the mean offset, which jumps by up to a meter where a vehicle appears.
 SMOOTH_M = 8.0
 # A path that comes back to a place after this distance, which is less than the smallest roundabout, is there a second time.
@@ -454,7 +452,7 @@ def _ease(u: Array) -> Array:
 
 def _center(route: Route, k: int, paths: Sequence[DrivenPath], matches: Sequence[Match]) -> Route:
     """Move a route to the median of the paths on it."""
-    grid = np.linspace(0.0, route.line.length_m, max(int(np.ceil(route.line.length_m / GRID_M)), 1) + 1)
+    grid = np.linspace(0.0, route.line.length_m, max(int(np.ceil(route.line.length_m / STEP_M)), 1) + 1)
     asides = []
     width = float(route.width_m.max())
     for path, found in zip(paths, matches):
@@ -473,7 +471,7 @@ def _center(route: Route, k: int, paths: Sequence[DrivenPath], matches: Sequence
     middle, low, high = np.nanmedian(held, axis=0), np.nanmin(held, axis=0), np.nanmax(held, axis=0)
     near = np.clip(middle, high - KEEP_M, np.maximum(low + KEEP_M, high - KEEP_M))
     middle = np.where(high - low > 2 * KEEP_M, (high + low) / 2, near)
-    shift = gaussian_filter1d(middle, SMOOTH_M / GRID_M, mode="nearest")
+    shift = gaussian_filter1d(middle, SMOOTH_M / STEP_M, mode="nearest")
     moved = route.line.offset(route.line.s_m, np.interp(route.line.s_m, grid, shift))
     return replace(route, line=Polyline.through(moved)) if np.any(shift) else route
 
