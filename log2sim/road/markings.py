@@ -33,7 +33,9 @@ from log2sim.road.strokes import Curve, fit_curve, thin, trace
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).
 BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
+MAX_BAR_TURN_RAD = np.deg2rad(10)
 MIN_BARS = 3
+SURE_BARS, FEW_BARS = 6, -3.0  # fewer are often side by side by chance in LiDAR intensities of grass
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
 STOP_LENGTH_M = (1.5, 20.0)
@@ -86,6 +88,8 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
         odds = log_odds_of_line(own, sum(lengths), alone=False)
+        if not np.isfinite(own.color).any() and len(chosen) < SURE_BARS:
+            odds += FEW_BARS
         corners = []
         for _, bar in chosen:
             d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
@@ -119,6 +123,7 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     """Mask (B, B) of bars that are parallel and side by side."""
     middle, direction = np.array([b.middle for b in bars]), np.array([b.direction for b in bars])
     length, width = np.array([b.length_m for b in bars]), np.array([b.width_m for b in bars])
+    turn = np.abs((direction[:, None] - direction + np.pi / 2) % np.pi - np.pi / 2)
     offset = middle[None] - middle[:, None]
     c, s = np.cos(direction)[:, None], np.sin(direction)[:, None]
     along, across = np.abs(offset[..., 0] * c + offset[..., 1] * s), np.abs(offset[..., 1] * c - offset[..., 0] * s)
@@ -126,7 +131,7 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     near = (across >= BAR_STEP_M[0]) & (across <= BAR_STEP_M[1]) & (along <= BARS_IN_LINE * shorter)
     alike = np.maximum(width[:, None], width) <= 1.6 * np.minimum(width[:, None], width)
     alike &= np.maximum(length[:, None], length) <= 2.0 * shorter
-    beside = near & alike
+    beside = near & alike & (turn <= MAX_BAR_TURN_RAD)
     return np.asarray(beside | beside.T)
 
 
