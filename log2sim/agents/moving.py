@@ -186,8 +186,6 @@ CERTAIN_COURSE_M = 1.0
 # Standard deviation of the yaw of a single measurement.
 BOX_YAW_SIGMA_RAD = 0.2
 SAME_MOMENT_S = 1e-3
-# A yaw of points that is farther from the course is that of their width.
-MAX_YAW_OFF_RAD = np.pi / 4
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
 HEIGHT_MEDIAN_HALF = 4
 # So many places tell enough.
@@ -224,14 +222,10 @@ def moving_candidate(
     tick = track.tick.tolist()
     spans = [(0, range(tick[0] - 1, -1, -1)), (len(tick) - 1, range(tick[-1] + 1, len(timeline.t_ns)))]
     spans += [(k, range(a + 1, b)) for k, (a, b) in enumerate(pairwise(tick))]
-    bottom_m, axis = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2, headings.copy()
-    if group == "vehicle":
-        # At the end of a track the sides of a box tell its direction better than its course does.
-        off = np.nan_to_num(wrap_angle(2 * (m.yaw_rad - headings)) / 2)
-        axis += np.where(np.abs(off) < MAX_YAW_OFF_RAD, off, 0.0)
+    bottom_m = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2
     matches = []
     for k, wanted in spans:
-        place = rough.xy_m[k], rough.velocity_mps[k], float(axis[k])
+        place = rough.xy_m[k], rough.velocity_mps[k], float(headings[k])
         start = BoxState(int(m.t_ns[k]), *place, geometry.size_m, bottom_m)
         matches += track_with_lidar(obstacles, wanted, timeline.t_ns, start)
     # Measurements and matches together, one at a moment.

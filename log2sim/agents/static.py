@@ -52,8 +52,6 @@ LEVELS = 0.25, 0.75
 MIN_SIZE_SHARE = 0.5
 # Gains of the constant-velocity filter.
 POSITION_GAIN, VELOCITY_GAIN = 0.6, 0.15
-# What is longer than so many widths moves along its length.
-LONG_WIDTHS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +112,6 @@ def track_with_lidar(
         innovation, velocity = match.xy_m - expected, state.velocity_mps
         if abs(dt_s) > 1e-3:
             velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-            if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
-                axis = np.array([np.cos(match.yaw_rad), np.sin(match.yaw_rad)])
-                velocity = (velocity @ axis) * axis
         position = expected + POSITION_GAIN * innovation
         state = replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=match.yaw_rad)
     return matches
