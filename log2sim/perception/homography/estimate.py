@@ -286,8 +286,6 @@ def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: 
 
 # Beyond this range one pixel of a camera at car height is several meters.
 MAX_RANGE_M = 60.0
-# Standard deviation, m, of the ground itself and of where the nearest side of an obstacle is, along each axis.
-GROUND_POSITION_SIGMA_M = 0.2
 
 
 def place_obstacle(
@@ -315,7 +313,7 @@ def place_obstacle(
     # width to half the length.
     depth, depth_sigma = (length + width) / 4, (length - width) / 4
     slope = homography_jacobian(ground_H_image, uv)[0]
-    covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * GROUND_POSITION_SIGMA_M**2
+    covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * FOOT_SIGMA_M**2
     covariance = covariance + depth_sigma**2 * np.outer(direction, direction)
     if homography_covariance is not None:
         covariance = covariance + ground_covariances(ground_H_image, homography_covariance, uv)[0]
