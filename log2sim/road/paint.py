@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import Layer, RidgePoints, Samples, sample
+from log2sim.road.ridges import COARSE_M, Layer, RidgePoints, Samples, sample
 
 AROUND_M = 0.25
 
@@ -275,7 +275,6 @@ MAX_TURN_RAD = np.deg2rad(20)  # the directions of ridge points are 15 deg apart
 MIN_POINTS = 5
 MIN_PIECE_M = 0.4
 MIN_COVERED = 0.6  # share of a piece's length that has ridge points
-CELL_M = 0.1  # distance of ridge points along a line
 PROFILES_AT_ONCE = 4000  # bound of memory
 
 
@@ -289,12 +288,12 @@ def find_pieces(ground: GroundMap, points: RidgePoints) -> Pieces:
     return pieces.take(np.isfinite(pieces.width_m) & (pieces.width_m > 0))
 
 
-def fit_lines(points: RidgePoints, cell_m: float = CELL_M) -> Array:
+def fit_lines(points: RidgePoints, cell_m: float = COARSE_M) -> Array:
     """Fit lines to ridge points, the strongest first, each point to one: x, y, direction, length (N, 4).
 
     Points are `cell_m` apart along a line; all lengths are in proportion to that.
     """
-    scale = cell_m / CELL_M
+    scale = cell_m / COARSE_M
     if not len(points.xy_map):
         return np.zeros((0, 4))
     tree = cKDTree(points.xy_map)
@@ -321,7 +320,7 @@ def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any], scale: float) 
     turn = np.abs((points.direction[near] - points.direction[seed] + np.pi / 2) % np.pi - np.pi / 2)
     angle, center = float(points.direction[seed]), np.zeros(2)
     chosen = turn < MAX_TURN_RAD
-    across_m, cell_m = ACROSS_M * scale, CELL_M * scale
+    across_m, cell_m = ACROSS_M * scale, COARSE_M * scale
     for width in (2 * across_m, across_m):
         along, across = _turned(xy - center, angle)
         member = chosen & (np.abs(across) < width)

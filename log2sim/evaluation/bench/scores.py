@@ -14,6 +14,7 @@ from log2sim.errors import ConfigError
 from log2sim.evaluation.bench.settings import ErrorSums, Point, error_of
 from log2sim.evaluation.metrics.comparison import truth_states
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.metrics.truth import MIN_POINTS
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, box_iou, inverse, line_stamps_ns, project_boxes
 from log2sim.perception.first_pass import Observations, base_poses
 from log2sim.perception.homography.correspondences import (
@@ -128,7 +129,6 @@ def jitter(scenario: Scenario, tick_s: float) -> float | None:
 MIN_IOU = 0.5
 NEAR_M = 25.0
 HOLDOUT_FRACTION = 0.25  # fraction of the measured obstacles that homographies are not fitted to and are scored by
-MIN_POINTS = 20
 MAX_SAME_FOOT_PX = 0.01
 BLOCK_S = 0.5
 

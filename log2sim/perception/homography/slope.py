@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
+from log2sim.perception.homography.estimate import MIN_FEET
 from log2sim.perception.homography.fit import HomographyFit, RoadSlope, by_elements
 from log2sim.perception.homography.normalized import TRUNCATED_VARIANCE_SHARE, scale_free_basis, scaled
 from log2sim.perception.homography.pitch_roll import (
@@ -36,8 +37,6 @@ STEP_SIGMAS = np.array([0.1, 0.1, 3.0])
 # Correspondences within a square of the map of this size, m, are held out together: an object that stands is off by the same at
 # all ticks.
 CELL_M = 4.0
-# As many foot points as give a homography of their own, over both halves.
-MIN_ROWS = 80
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,7 @@ def fit_slope(
     `sigma_px`, `sigma_m`: standard deviations of the correspondences up to a common factor.
     """
     known = np.isin(data.tick, list(map_T_base)) & np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1)
-    if not fit.ok or np.count_nonzero(known) < MIN_ROWS:
+    if not fit.ok or np.count_nonzero(known) < MIN_FEET:
         return fit
     data = data.take(known)
     rows, start = (
@@ -83,7 +82,7 @@ def fit_slope(
     )
     cell = np.floor(rows.xy_map / CELL_M).astype(np.int64)
     place, parity = np.unique(cell, axis=0, return_inverse=True)[1].ravel(), cell.sum(axis=1) % 2
-    if np.bincount(parity, minlength=2).min() < MIN_ROWS // 4:
+    if np.bincount(parity, minlength=2).min() < MIN_FEET // 4:
         return fit
     # A bend that the ego comes near looks like an ego that pitches: two planes may also take the place of its angles, and do if
     # that is as good.

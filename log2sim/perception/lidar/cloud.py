@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import ENDS, VEHICLE, Log, Obstacles, Rays, Sweep, end_of
 from log2sim.geometry import NS_PER_S, Array
+from log2sim.perception.boxes import TRIM
 
 CELL_M = 1.0
 REACH_M = 100.0
@@ -125,8 +126,8 @@ MIN_WINDOW_RAD, MAX_WINDOW_RAD = np.deg2rad(0.6), np.deg2rad(6.0)
 # A return this much farther than the end belongs to something behind the object.
 MIN_DEPTH_STEP_M = 0.5
 MIN_RAYS_BEYOND = 2
-# Share of a cluster's points skipped at each end, so that a stray one is not taken for the end.
-TRIM, MAX_TRIMMED_POINTS = 0.01, 2
+# Points of a cluster that are skipped at each end at most, so that a stray one is not taken for the end.
+MAX_TRIMMED_POINTS = 2
 # Points this near to an end form the face that ends there; a corner has more than this share of their variance across.
 FACE_M, MAX_FLATNESS, MAX_FACE_POINTS = 1.5, 0.05, 256
 SLOPE_MARGIN = 0.01

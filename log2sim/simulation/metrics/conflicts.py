@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO
 from log2sim.geometry import Array, rectangles_overlap, separating_axes, wrap_angle
-from log2sim.simulation.metrics.collisions import REPLAY, BoxTracks, RowIndex, circles_meet, spacing_s
+from log2sim.simulation.metrics.collisions import CHUNK, REPLAY, BoxTracks, RowIndex, circles_meet, spacing_s
 from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0  # constant velocity is no prediction over a longer time
-CHUNK = 20
 BLOCK = 256  # rows and agents of one broad phase, so that its arrays stay small
 
 
