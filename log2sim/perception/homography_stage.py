@@ -20,10 +20,9 @@ from log2sim.perception.homography.estimate import (
     STREAM_METHODS,
     EstimationOptions,
     fit_camera,
-    place_obstacle,
-    spanned_height_m,
 )
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
+from log2sim.perception.homography.place import place_obstacle, spanned_height_m
 from log2sim.perception.homography.rig import SAMPLES, Rig, RigFit, fit_rig
 from log2sim.perception.homography.slope import fit_slope, slope_homography
 from log2sim.perception.lidar.measure import BORDER_PX
@@ -179,7 +178,7 @@ def place_by_homography(
                 if bent is not None:
                     h, by_slope = bent
                     uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
-            placed = place_obstacle(h, camera, box_px, category, base_T_cam[:2, 3], uncertainty)
+            placed = place_obstacle(h, camera, box_px, category, base_T_cam, uncertainty, edges_seen(m, k, camera))
             if placed is None:
                 continue
             if obstacles is not None:
@@ -196,6 +195,21 @@ def place_by_homography(
             columns["height_px_m"][k] = spanned_height_m(h, camera, box_px, base_T_cam)
         out.append(Measurements(**columns) if len(missing) else m)
     return out
+
+
+def edges_seen(m: Measurements, k: int, camera: Camera) -> tuple[bool, bool, bool, bool]:
+    """Return which edges of a box (left, top, right, bottom) the image and nearer obstacles do not cut off.
+
+    The box of what is nearer reaches further down, and covers an edge whose middle, or lower end, it holds.
+    """
+    box = m.box_px[k]
+    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    others = m.box_px[(m.camera == m.camera[k]) & (m.t_ns == m.t_ns[k]) & (m.box_px[:, 3] > box[3])]
+    size = np.array([camera.width_px, camera.height_px])
+    seen = [*(box[:2] >= BORDER_PX).tolist(), *(box[2:] <= size - 1 - BORDER_PX).tolist()]
+    for edge, place in enumerate(((box[0], y), (x, box[1]), (box[2], y), (x, box[3]))):
+        seen[edge] &= not bool(np.any(np.all((others[:, :2] < place) & (others[:, 2:] > place), axis=1)))
+    return seen[0], seen[1], seen[2], seen[3]
 
 
 def count_rays(
