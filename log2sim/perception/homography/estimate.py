@@ -7,13 +7,12 @@ from functools import partial
 
 import numpy as np
 
-from log2sim.geometry import Array, Camera
+from log2sim.geometry import Array, apply_homography
 from log2sim.perception.homography.correspondences import (
     SIZE_SIGMA_SHARE,
     Correspondences,
     fit_frames,
     ransac_skimage,
-    undistorted_pixels,
 )
 from log2sim.perception.homography.fit import (
     RANSAC_SCHEDULE,
@@ -21,7 +20,6 @@ from log2sim.perception.homography.fit import (
     HomographyFit,
     PitchRoll,
     RansacSchedule,
-    ground_covariances,
     ransac,
     refused_fit,
     validated_fit,

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
-from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian
-from log2sim.perception.boxes import LIMIT_SIGMAS
+from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian, wrap_angle
+from log2sim.perception.boxes import LIMIT_SIGMAS, UNIFORM_SIGMA
 from log2sim.perception.homography.correspondences import undistorted_pixels
 from log2sim.perception.homography.estimate import FOOT_SIGMA_PX
 from log2sim.perception.homography.fit import ground_covariances
 
 # Beyond this range one pixel of a camera at car height is several meters.
 MAX_RANGE_M = 60.0
-# Standard deviation of the ground itself, m.
-GROUND_SIGMA_M = 0.2
+# Standard deviation, m, of the ground itself and of where in its outline an obstacle is, along each axis.
+GROUND_POSITION_SIGMA_M = 0.2
 # Yaws at which an obstacle is tried, up to half turns; they are 10 degrees apart.
 YAWS_RAD = np.arange(18) * np.pi / 18
 # Shares of length and width within which an obstacle touches the ground: between the axles (a car's wheelbase is 2.7 of 4.4 m, that of
@@ -40,48 +40,51 @@ def place_obstacle(
     right, bottom) are edges of the obstacle and not of the image or of something before it.
 
     Returns its center (2,), m, on the ground and the covariance (2, 2); None above the horizon, beyond `MAX_RANGE_M`, and where
-    the edges do not tell how far it is.
+    its foot or both of its sides are not seen.
 
     From above, the left and the right edge of the box are rays, the lower edge is a line, and the height of the box tells the
     distance of the near side. For each yaw the center and the errors of length, width and edges are a linear least-squares
-    problem; the yaws are weighed by their marginal likelihoods.
+    problem; the yaws are weighed by their marginal likelihoods. That a roof close below a camera looks larger is left out.
     """
     corners = undistorted_pixels(camera, box_px[[[0, 3], [2, 3], [0, 1], [2, 1]]])
     uv = (corners[0] + corners[1]) / 2
     (left, right, foot), below = apply_homography(ground_H_image, np.array([corners[0], corners[1], uv]))
     origin = base_T_cam[:2, 3]
-    if not below.all() or np.hypot(*(foot - origin)) > MAX_RANGE_M:
-        return None
     range_m = float(np.hypot(*(foot - origin)))
+    if not seen[BOTTOM] or not (seen[LEFT] or seen[RIGHT]) or not below.all() or range_m > MAX_RANGE_M:
+        return None
     by_px = homography_jacobian(ground_H_image, uv[None])[0]
     typical = np.array(TYPICAL_SIZE_M[category])
     size_sigma = typical * np.log(np.divide(MAX_SIZE_M[category], MIN_SIZE_M[category])) / LIMIT_SIGMAS
     contact, whole = np.array(CONTACT[GROUP_OF[category]]), np.ones(2)
     # Each edge: outward normal, how far out it is from the camera, the variance of that, and the part of the obstacle that it touches.
     rows: list[tuple[Array, float, float, Array]] = []
-    for is_seen, ground, turn in ((seen[LEFT], left, 1.0), (seen[RIGHT], right, -1.0)):
-        along = (ground - origin) / np.hypot(*(ground - origin))
-        normal = turn * np.array([-along[1], along[0]])
-        if is_seen:
-            rows.append((normal, 0.0, (FOOT_SIGMA_PX * float(normal @ by_px[:, 0])) ** 2, whole))
+    rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(camera.K).T @ base_T_cam[:3, :3].T
+    bearing = np.arctan2(rays[:, 1], rays[:, 0])
+    for is_seen, ground, turn, edge in ((seen[LEFT], left, 1.0, 0), (seen[RIGHT], right, -1.0, 1)):
+        if not is_seen:
+            continue
+        # A camera that looks down sees uprights lean: any height may be that of the side.
+        lean = float(wrap_angle(bearing[edge + 2] - bearing[edge]))
+        along = np.arctan2(*(ground - origin)[::-1]) + lean / 2
+        normal = turn * np.array([-np.sin(along), np.cos(along)])
+        variance = (FOOT_SIGMA_PX * float(normal @ by_px[:, 0])) ** 2 + (UNIFORM_SIGMA * range_m * lean) ** 2
+        rows.append((normal, 0.0, variance, whole))
     ahead = (foot - origin) / range_m
-    if seen[BOTTOM]:
-        normal = np.array([left[1] - right[1], right[0] - left[0]])
-        normal = normal / np.hypot(*normal)
-        normal = -normal if normal @ ahead > 0 else normal
-        variance = (FOOT_SIGMA_PX * float(normal @ by_px[:, 1])) ** 2 + GROUND_SIGMA_M**2
-        if homography_covariance is not None:
-            variance += float(normal @ ground_covariances(ground_H_image, homography_covariance, uv[None])[0] @ normal)
-        rows.append((normal, float(normal @ (foot - origin)), variance, contact))
-        if seen[TOP]:
-            height_px = float(box_px[3] - box_px[1])
-            spanned = spanned_height_m(ground_H_image, camera, box_px, base_T_cam)
-            share = np.hypot(size_sigma[2] / typical[2], np.sqrt(2) * FOOT_SIGMA_PX / max(height_px, 1.0))
-            if np.isfinite(spanned) and spanned > 0:
-                by_height_m = range_m * typical[2] / spanned
-                rows.append((-ahead, -by_height_m, (share * by_height_m) ** 2, contact))
-    if len(rows) < 2 or not (seen[BOTTOM] or (seen[LEFT] and seen[RIGHT])):
-        return None
+    normal = np.array([left[1] - right[1], right[0] - left[0]])
+    normal = normal / np.hypot(*normal)
+    normal = -normal if normal @ ahead > 0 else normal
+    variance = (FOOT_SIGMA_PX * float(normal @ by_px[:, 1])) ** 2
+    if homography_covariance is not None:
+        variance += float(normal @ ground_covariances(ground_H_image, homography_covariance, uv[None])[0] @ normal)
+    rows.append((normal, float(normal @ (foot - origin)), variance, contact))
+    spanned_m = spanned_height_m(ground_H_image, camera, box_px, base_T_cam)
+    above_m = -range_m * float(rays[:2, 2].sum() / np.hypot(rays[:2, 0], rays[:2, 1]).sum())
+    # Seen from above, the upper edge is that of the far side.
+    if seen[TOP] and spanned_m > 0 and above_m < typical[2] + size_sigma[2]:
+        share = np.hypot(size_sigma[2] / typical[2], np.sqrt(2) * FOOT_SIGMA_PX / float(box_px[3] - box_px[1]))
+        by_height_m = range_m * typical[2] / spanned_m
+        rows.append((-ahead, -by_height_m, (share * by_height_m) ** 2, contact))
     normals, offsets, variances, parts = (np.array(column) for column in zip(*rows, strict=True))
     body = np.array([[np.cos(YAWS_RAD), np.sin(YAWS_RAD)], [-np.sin(YAWS_RAD), np.cos(YAWS_RAD)]])
     reach = np.abs(np.einsum("iky,nk->yni", body, normals)) / 2 * parts  # of an edge by length and width (Y, n, 2)
@@ -102,7 +105,7 @@ def place_obstacle(
     # Errors of edges that do not fit to each other are larger than they say (Birge, 1932).
     if len(rows) > 2:
         total *= max(1.0, float(squared.min()) / (len(rows) - 2))
-    return origin + mean, total
+    return origin + mean, total + GROUND_POSITION_SIGMA_M**2 * np.eye(2)
 
 
 def spanned_height_m(ground_H_image: Array, camera: Camera, box_px: Array, base_T_cam: Array) -> float:
