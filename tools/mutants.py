@@ -36,7 +36,7 @@ MUTANTS = (
     ("ends of boxes", "perception/boxes.py", "low[k], high[k] = [low[k, 1], -high[k, 0]], [high[k, 1], -low[k, 0]]", "low[k], high[k] = low[k], high[k]", "size fusion measure"),
     ("one sweep, one object", "perception/fusion.py", 'possible &= ~((rows.camera[:, None] == "") & (rows.camera == ""))', "possible &= True", "fusion"),
     ("cameras are not fused", "perception/fusion.py", "squared <= CHI2_2DOF_99 * determinant", "squared <= 0 * determinant", "fusion"),
-    ("Kalman gain", "tracking/forward.py", "gain @ (xy[:, :, None]", "0.5 * gain @ (xy[:, :, None]", "track"),
+    ("Kalman gain", "tracking/forward.py", "gain @ off[..., None]", "0.5 * gain @ off[..., None]", "track"),
     ("process noise", "tracking/forward.py", "(span**3 / 3)", "(span**3 / 30)", "track"),
     ("weak detections start tracks", "tracking/forward.py", "fresh = strong.copy()", "fresh = np.ones_like(strong)", "track"),
     ("gaps of tracks", "tracking/tracker.py", "-half_gap_s, noise[one])", "half_gap_s, noise[one])", "track"),

@@ -143,9 +143,11 @@ class BoxEvidence:
         return own if view is None else np.concatenate([own, view.cluster[:, :3]])
 
     def take(self, index: Any) -> Self:
-        """Take the rows at `index`, integers or a mask."""
+        """Take the rows at `index`: integers, a mask, or a slice, which copies nothing."""
+        columns = {k: v[index] for k, v in vars(self).items() if k not in TUPLES}
+        if isinstance(index, slice):
+            return type(self)(**columns, cluster=self.cluster[index], others=self.others[index])
         rows = np.arange(len(self))[index]
-        columns = {k: v[rows] for k, v in vars(self).items() if k not in TUPLES}
         others = tuple(self.others[i] for i in rows) if self.others else ()
         return type(self)(**columns, cluster=take_arrays(self.cluster, rows.tolist()), others=others)
 

@@ -144,7 +144,8 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     starts = ends.first_ns[order]
     # A margin of a microsecond for the comparison in seconds that follows.
     after = np.searchsorted(starts, ends.last_ns, side="right")
-    until = np.searchsorted(starts, ends.last_ns + round(max_gap_s * NS_PER_S) + 1000, side="right")
+    latest_ns = ends.last_ns + round(max_gap_s * NS_PER_S) + 1000
+    until = np.searchsorted(starts, latest_ns, side="right")
     count = np.maximum(until - after, 0)
     a = np.repeat(np.arange(len(starts)), count)
     b = order[np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(after, count)]
@@ -155,29 +156,28 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     if len(slow_end) and len(slow_start):
         places = cKDTree(ends.first[slow_start, :2])
         found = places.query_ball_point(ends.last[slow_end, :2], MAX_STATIONARY_OFFSET_M)
-        a = np.concatenate([a, np.repeat(slow_end, [len(k) for k in found])])
-        b = np.concatenate([b, slow_start[np.concatenate([*found, []]).astype(np.intp)]])
-    pairs = np.unique(a * len(starts) + b)
-    a, b = pairs // len(starts), pairs % len(starts)
-    related = np.isin(ends.group, RELATED_GROUPS)
-    alike = (ends.group[a] == ends.group[b]) | related[a] & related[b]
-    possible = alike & (ends.first_ns[b] > ends.last_ns[a])
-    a, b = a[possible], b[possible]
+        one = np.repeat(slow_end, [len(k) for k in found])
+        other = slow_start[np.concatenate([*found, []]).astype(np.intp)]
+        later = ends.first_ns[other] > latest_ns[one]
+        a, b = np.concatenate([a, one[later]]), np.concatenate([b, other[later]])
+    group, related = np.unique(ends.group, return_inverse=True)[1], np.isin(ends.group, RELATED_GROUPS)
+    alike = (group[a] == group[b]) | related[a] & related[b]
+    a, b = a[alike], b[alike]
     gap_s = (ends.first_ns[b] - ends.last_ns[a]) / NS_PER_S
     stationary = ends_stationary[a] & starts_stationary[b]
-    last, first = ends.last[a], ends.first[b]
-    offset_m = np.hypot(*(last - first)[:, :2].T)
-    other_group = np.where(ends.group[a] == ends.group[b], 0.0, OTHER_GROUP_COST)
+    apart_m = ends.last[a, :2] - ends.first[b, :2]
+    offset_m = np.hypot(*apart_m.T)
+    other_group = np.where(group[a] == group[b], 0.0, OTHER_GROUP_COST)
     same_place = stationary & (offset_m < MAX_STATIONARY_OFFSET_M) & (other_group == 0)
     cost = np.where(same_place, offset_m, np.inf)
-    half = gap_s[:, None] / 2
-    midpoint_offset_m = np.hypot(*(last[:, :2] + half * last[:, 2:] - first[:, :2] + half * first[:, 2:]).T)
+    midpoint_m = apart_m + gap_s[:, None] / 2 * (ends.last[a, 2:] + ends.first[b, 2:])
     # Beyond this distance no allowed uncertainty passes the gate.
     near = np.flatnonzero(
-        ~same_place & (gap_s <= max_gap_s) & (midpoint_offset_m <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
+        ~same_place & (gap_s <= max_gap_s) & (np.hypot(*midpoint_m.T) <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
     )
-    groups = ends.group.tolist()
-    noise, speed_mps = (np.array([table[g] for g in groups]) for table in (ACCELERATION_MPS2, FIRST_SPEED_MPS))
+    noise, speed_mps = (
+        np.array([table[g] for g in ends.group.tolist()]) for table in (ACCELERATION_MPS2, FIRST_SPEED_MPS)
+    )
     one, other, half_gap_s = a[near], b[near], gap_s[near] / 2
     forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise[one])
     backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise[one])
@@ -192,8 +192,9 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     # within `max_gap_s` as tracks do in a square and time around, in any direction.
     begin_s = (ends.first_ns - ends.first_ns.min()) / NS_PER_S
     around = np.column_stack([max_gap_s * ends.first[:, :2], NEARBY_M * begin_s])
-    begun = cKDTree(around).query_ball_point(around[other], max_gap_s * NEARBY_M, p=np.inf, return_length=True)
-    log_another = np.log(begun / (2 * (2 * NEARBY_M) ** 2) / (2 * np.pi * speed_mps[other] ** 2))
+    known, at = np.unique(other, return_inverse=True)
+    begun = cKDTree(around).query_ball_point(around[known], max_gap_s * NEARBY_M, p=np.inf, return_length=True)
+    log_another = np.log(begun[at] / (2 * (2 * NEARBY_M) ** 2) / (2 * np.pi * speed_mps[other] ** 2))
     log_odds = squared + np.log(np.linalg.det(2 * np.pi * covariance)) + 2 * log_another
     position_covariance = covariance[:, :2, :2]
     certain = np.sqrt(np.linalg.eigvalsh(position_covariance)[:, -1]) <= MAX_POSITION_SIGMA_M
@@ -207,13 +208,10 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
 def _ends(m: Measurements, tracks: Sequence[tuple[str, NDArray[np.intp]]], *, whole_boxes: bool) -> _Ends:
     group = np.array([GROUP_OF[category] for category, _ in tracks])
     parts = [rows for _, rows in tracks]
-    return _Ends(
-        m.t_ns[[rows[0] for rows in parts]],
-        m.t_ns[[rows[-1] for rows in parts]],
-        *_filtered(m, [rows[:END_MEASUREMENTS][::-1] for rows in parts], group, whole_boxes=whole_boxes),
-        *_filtered(m, [rows[-END_MEASUREMENTS:] for rows in parts], group, whole_boxes=whole_boxes),
-        group,
-    )
+    orders = [*(rows[:END_MEASUREMENTS][::-1] for rows in parts), *(rows[-END_MEASUREMENTS:] for rows in parts)]
+    mean, covariance = _filtered(m, orders, np.tile(group, 2), whole_boxes=whole_boxes)
+    begin_ns, end_ns, n = m.t_ns[[rows[0] for rows in parts]], m.t_ns[[rows[-1] for rows in parts]], len(parts)
+    return _Ends(begin_ns, end_ns, mean[:n], covariance[:n], mean[n:], covariance[n:], group)
 
 
 def _filtered(
@@ -279,20 +277,54 @@ def track(
     everything = Measurements.join(measurements)
     count = [len(m) for m in measurements]
     tick, first_row = np.repeat(np.arange(len(count)), count), np.cumsum([0, *count])
-    found = track_forward(measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps)
-    parts = [first_row[ticks] + rows for ticks, rows in found]
+    found = track_forward(
+        measurements, t_ns, birth_score=birth_score, whole_boxes=whole_boxes, flow_mps=flow_mps, joined=everything
+    )
+    if not found:
+        return []
+    whole = [first_row[ticks] + rows for ticks, rows in found]
+    parts = whole
     if whole_boxes:
         # What the forward pass resumed after several misses is decided again by the motion on both sides of the gap. Centers of partial
         # views wander where an occlusion begins and ends, so that motions of one object disagree.
-        gaps = [np.flatnonzero(np.diff(ticks) > MAX_MISSES) + 1 for ticks, _ in found]
-        parts = [part for rows, cuts in zip(parts, gaps, strict=True) for part in np.split(rows, cuts)]
+        rows = np.concatenate(whole)
+        begun = np.cumsum([len(part) for part in whole])[:-1]
+        parts = np.split(rows, np.union1d(begun, np.flatnonzero(np.diff(tick[rows]) > MAX_MISSES) + 1))
+    stitched = stitch(everything, parts, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
+    if whole_boxes:
+        stitched = _with_single_boxes(stitched, whole, tick)
     least = min_hits(t_ns, min_life_s)
+    kept = [(category, rows) for category, rows in stitched if len(rows) >= least]
+    # One copy in the order of the tracks, of which each is a part.
+    end = np.cumsum([len(rows) for _, rows in kept])
+    in_order = everything.take(np.concatenate([rows for _, rows in kept])) if kept else everything
     tracks = [
-        Track(category, tick[rows], everything.take(rows))
-        for category, rows in stitch(everything, parts, max_gap_s=max_gap_s, whole_boxes=whole_boxes)
-        if len(rows) >= least
+        Track(category, tick[rows], in_order.take(slice(stop - len(rows), stop)))
+        for (category, rows), stop in zip(kept, end.tolist(), strict=True)
     ]
     return sorted(tracks, key=lambda t: (int(t.tick[0]), float(t.measurements.center_m[0, 0])))
+
+
+def _with_single_boxes(
+    stitched: list[tuple[str, NDArray[np.intp]]], whole: Sequence[NDArray[np.intp]], tick: NDArray[np.intp]
+) -> list[tuple[str, NDArray[np.intp]]]:
+    """Let single boxes that were cut off stay where the forward pass, with tracks `whole`, had them, if what is around them is one track.
+
+    A box that is alone shows no motion by which both sides could decide; `tick`: of all rows.
+    """
+    track, rows = np.repeat(np.arange(len(whole)), [len(part) for part in whole]), np.concatenate(whole)
+    owner = np.zeros(len(tick), dtype=np.intp)
+    for k, (_, part) in enumerate(stitched):
+        owner[part] = k
+    of, size = owner[rows], np.array([len(part) for _, part in stitched])
+    between = (of[:-2] == of[2:]) & (of[:-2] != of[1:-1]) & (track[:-2] == track[2:]) & (size[of[1:-1]] == 1)
+    out = dict(enumerate(stitched))
+    for k in (np.flatnonzero(between) + 1).tolist():
+        category, part = out[int(of[k - 1])]
+        if tick[rows[k]] not in tick[part]:
+            out[int(of[k - 1])] = category, np.sort(np.append(part, rows[k]))
+            del out[int(of[k])]
+    return list(out.values())
 
 
 def min_hits(t_ns: NDArray[np.int64], min_life_s: float) -> int:

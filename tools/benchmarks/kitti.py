@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,6 @@ from kitti.scoring import IOU, evaluate
 from kitti.tracks import rows_offline, rows_online
 
 from benchmarks.table import markdown
-from log2sim.datatypes import Measurements
 from log2sim.geometry import Array
 
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
@@ -55,6 +55,7 @@ def main(folder: Path, online: bool = False, fit: bool = False, results: Path | 
     else:
         names = sorted({path.stem for path in (folder / "detections").glob("*/*.txt")})
         sequences = {name: read_sequence(folder, name) for name in names}
+        describe_sequence(*next(iter(sequences.values())), online=online)  # imports what is imported when it is needed
         begin = time.process_time()
         described = {name: describe_sequence(*sequence, online=online) for name, sequence in sequences.items()}
         told = {name: choose(d, online=online) for name, d in described.items()}
@@ -83,10 +84,10 @@ def read_sequence(folder: Path, name: str) -> tuple[Boxes, View]:
 def describe_sequence(boxes: Boxes, view: View, *, online: bool) -> Described:
     """All boxes of tracks, detected and predicted ones, before it is chosen which are told."""
     pairs = find_pairs(boxes)
-    measurements = to_measurements(pairs.tracked, view)
-    rows = (rows_online if online else rows_offline)(pairs.tracked, measurements)
-    others = to_measurements(pairs.boxes.take(slice(pairs.count, None)), view)
-    everything = Measurements.join([*measurements, *others])
+    everything, tracked = to_measurements(pairs.boxes, view), pairs.tracked
+    cuts = np.searchsorted(tracked.frame, np.arange(len(view.map_T_cam) + 1)).tolist()
+    by_frame = [everything.take(slice(a, b)) for a, b in pairwise(cuts)]
+    rows = (rows_online if online else rows_offline)(tracked, by_frame)
     rows = decide_people(rows, pairs, everything.center_m if view.motion_known else None, online=online)
     return describe(rows, pairs.boxes, everything, view, online=online)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +110,10 @@ def same_frame(a: Boxes, b: Boxes, *, reach_m: bool) -> tuple[Index, Index]:
     row = np.repeat(np.arange(len(a)), count)
     col = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
     if reach_m:
-        gap = a.bottom_m[row] - b.bottom_m[col]
-        reach = np.hypot(*a.size_hwl_m[row, 1:].T) / 2 + np.hypot(*b.size_hwl_m[col, 1:].T) / 2
-        near = np.hypot(gap[:, 0], gap[:, 2]) <= reach
+        (x, z, reach), (b_x, b_z, b_reach) = (
+            (*boxes.bottom_m[:, [0, 2]].T.copy(), np.hypot(*boxes.size_hwl_m[:, 1:].T) / 2) for boxes in (a, b)
+        )
+        near = (x[row] - b_x[col]) ** 2 + (z[row] - b_z[col]) ** 2 <= (reach[row] + b_reach[col]) ** 2
         row, col = row[near], col[near]
     return row, col
 
@@ -174,8 +174,8 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     return View(map_T_imu @ inverse(rect_T_cam @ cam_T_velo @ velo_T_imu), P)
 
 
-def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
-    """Boxes, sorted by frame, as measurements in the map, one set a frame (T,)."""
+def to_measurements(boxes: Boxes, view: View) -> Measurements:
+    """Boxes as measurements in the map; `points`, which the tracker does not read, is the row."""
     n = len(boxes)
     center = boxes.bottom_m.copy()
     center[:, 1] -= boxes.size_hwl_m[:, 0] / 2
@@ -185,7 +185,7 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
     sigma = SIGMA_M + SIGMA_PER_M * np.hypot(center[:, 0], center[:, 2])
     half_m = boxes.size_hwl_m[:, :0:-1] / 2
     map_center = apply(pose, center)
-    everything = Measurements(
+    return Measurements(
         t_ns=boxes.frame * PERIOD_NS,
         category=np.array([CATEGORY_OF[c] for c in boxes.category.tolist()], dtype="<U16"),
         score=1 / (1 + np.exp(-boxes.score)),
@@ -200,7 +200,7 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         center_m=map_center,
         yaw_rad=np.arctan2(heading[:, 1], heading[:, 0]),
         covariance=sigma[:, None, None] ** 2 * np.eye(2),
-        points=np.zeros(n, dtype=np.int64),
+        points=np.arange(n),
         source=np.full(n, "lidar", dtype="<U16"),
         cluster=(np.zeros((0, 3)),) * n,
         sensor_m=map_center,
@@ -211,13 +211,11 @@ def to_measurements(boxes: Boxes, view: View) -> list[Measurements]:
         heading_score=np.full(n, np.nan),
         seen_by=seen_from(VEHICLE, n),
     )
-    cuts = np.searchsorted(boxes.frame, np.arange(len(view.map_T_cam) + 1))
-    return [everything.take(slice(a, b)) for a, b in pairwise(cuts)]
 
 
 def from_map(center_m: Array, size_m: Array, yaw_rad: Array, frame: NDArray[np.int64], view: View) -> dict[str, Array]:
-    """Columns of `Boxes` for boxes (N,) given in the map: length, width, height and yaw about z."""
-    cam_T_map = inverse(view.map_T_cam[frame])
+    """Columns of `Boxes`, but for those in the image, for boxes (N,) given in the map: length, width, height and yaw about z."""
+    cam_T_map = inverse(view.map_T_cam)[frame]
     center = apply(cam_T_map, center_m)
     ahead = np.einsum(
         "nij,nj->ni", cam_T_map[:, :3, :3], np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), 0 * yaw_rad])
@@ -227,18 +225,17 @@ def from_map(center_m: Array, size_m: Array, yaw_rad: Array, frame: NDArray[np.i
     yaw = np.arctan2(-ahead[:, 2], ahead[:, 0])
     return {
         "alpha": np.mod(yaw - np.arctan2(center[:, 0], center[:, 2]) + np.pi, 2 * np.pi) - np.pi,
-        "box_px": project(bottom, size_m[:, ::-1], yaw, view.P),
         "size_hwl_m": size_m[:, ::-1],
         "bottom_m": bottom,
         "yaw_rad": yaw,
     }
 
 
-def project(bottom_m: Array, size_hwl_m: Array, yaw_rad: Array, P: Array) -> Array:
+def project(boxes: Boxes, P: Array) -> Array:
     """Image boxes (N, 4) around 3D boxes, cut at the border; NaN where less than half lies inside or a corner is too near."""
-    center = bottom_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    center[:, 2] += size_hwl_m[:, 0] / 2
-    corners = box_corners(center, size_hwl_m[:, ::-1], -yaw_rad)  # on axes x right, z forward, y up
+    center = boxes.bottom_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    center[:, 2] += boxes.size_hwl_m[:, 0] / 2
+    corners = box_corners(center, boxes.size_hwl_m[:, ::-1], -boxes.yaw_rad)  # on axes x right, z forward, y up
     xyz = np.stack([corners[..., 0], -corners[..., 2], corners[..., 1], np.ones(corners.shape[:2])], axis=-1)
     uvw = xyz @ P.T
     ahead = (uvw[..., 2] > NEAR_M).all(axis=1)
@@ -249,30 +246,21 @@ def project(bottom_m: Array, size_hwl_m: Array, yaw_rad: Array, P: Array) -> Arr
     return np.where(inside[:, None], np.concatenate([cut_low, cut_high], axis=1), np.nan)
 
 
-def hidden_share(boxes: Boxes, frames: int, hides: NDArray[np.bool_] | None = None) -> Array:
-    """Share (N,) of every image box that lies behind boxes of its frame that are nearer to the camera; rows by frame.
-
-    With `hides` (N,) only those rows hide others.
-    """
-    depth = np.linalg.norm(boxes.bottom_m, axis=1)
-    hides = np.ones(len(boxes), dtype=bool) if hides is None else hides
-    steps = (np.arange(GRID) + 0.5) / GRID
-    low, high = boxes.box_px[:, :2], boxes.box_px[:, 2:]
-    grid = low[:, None] + (high - low)[:, None] * steps[:, None]
-    out = np.zeros(len(boxes))
-    cuts = np.searchsorted(boxes.frame, np.arange(frames + 1))
-    for a, b in pairwise(cuts):
-        front = a + np.flatnonzero(hides[a:b])
-        if b - a < 2 or len(front) == 0:
-            continue
-        nearer = depth[None, front] < depth[a:b, None] - NEARER_M
-        touching = np.all((low[None, front] < high[a:b, None]) & (high[None, front] > low[a:b, None]), axis=2) & nearer
-        i, j = np.nonzero(touching)
-        if len(i) == 0:
-            continue
-        covered = (grid[a + i] > low[front[j], None]) & (grid[a + i] < high[front[j], None])
+def hidden_share(boxes: Boxes, hides: Mask) -> Array:
+    """Share (N,) of every image box that lies behind those of the rows `hides` (N,) of its frame that are nearer to the camera."""
+    depth, out = np.linalg.norm(boxes.bottom_m, axis=1), np.zeros(len(boxes))
+    (u0, v0, u1, v1), front = boxes.box_px.T, np.flatnonzero(hides)
+    front = front[np.argsort(boxes.frame[front], kind="stable")]
+    i, j = same_frame(boxes, boxes.take(front), reach_m=False)
+    j = front[j]
+    for nearer, farther in ((depth + NEARER_M, depth), (u0, u1), (-u1, -u0), (v0, v1), (-v1, -v0)):
+        kept = nearer[j] < farther[i]
+        i, j = i[kept], j[kept]
+    if len(i):
+        low, high = boxes.box_px[:, :2], boxes.box_px[:, 2:]
+        grid = low[:, None] + (high - low)[:, None] * ((np.arange(GRID) + 0.5) / GRID)[:, None]
+        covered = (grid[i] > low[j, None]) & (grid[i] < high[j, None])
         cells = covered[:, :, None, 0] & covered[:, None, :, 1]
-        hidden = np.zeros((b - a, GRID, GRID), dtype=bool)
-        np.logical_or.at(hidden, i, cells)
-        out[a:b] = hidden.mean(axis=(1, 2))
+        begin = np.flatnonzero(np.diff(i, prepend=-1))
+        out[i[begin]] = np.logical_or.reduceat(cells, begin, axis=0).mean(axis=(1, 2))
     return out

@@ -7,7 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kitti.boxes import PERIOD_NS, Boxes, Index, Mask, View, from_map, hidden_share, is_small, overlap_3d, same_frame
+from kitti.boxes import (
+    PERIOD_NS,
+    Boxes,
+    Index,
+    Mask,
+    View,
+    from_map,
+    hidden_share,
+    is_small,
+    overlap_3d,
+    project,
+    same_frame,
+)
 from kitti.tracks import (
     SCALE,
     Rows,
@@ -137,10 +149,10 @@ class Described:
 def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
     """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
     columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
-    in_camera = from_map(*smooth_shapes(rows, boxes, measurements, online=online), rows.frame, view)
+    out = Boxes(**(columns | from_map(*smooth_shapes(rows, boxes, measurements, online=online), rows.frame, view)))
     # In the image the detector knows better than a box around a box.
-    in_camera["box_px"] = np.where((rows.source < 0)[:, None], in_camera["box_px"], boxes.box_px[rows.model])
-    out = Boxes(**(columns | in_camera))
+    (predicted,) = (rows.source < 0).nonzero()
+    out.box_px[predicted] = project(out.take(predicted), view.P)
     inside = np.isfinite(out.box_px).all(axis=1)
     out, rows = out.take(inside), rows.take(inside)
     if not online:
@@ -154,7 +166,7 @@ def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *
     evidence = _evidence(rows.track, seen, score, online | (beyond == 0), online=online)
     confidence = np.clip(evidence + moved, *CONFIDENCE_LIMITS)
     share, local = _near(rows, seen, score, online=online)
-    hidden = _hidden(out, seen & (confidence >= HIDING_CONFIDENCE), len(view.map_T_cam))
+    hidden = hidden_share(out, seen & (confidence >= HIDING_CONFIDENCE))
     height = np.clip(out.box_px[:, 3] - out.box_px[:, 1], *HEIGHTS_PX)
     features = {
         "score": score,
@@ -209,14 +221,6 @@ def _near(rows: Rows, seen: Mask, score: Array, *, online: bool) -> tuple[Array,
     b = np.searchsorted(known, key + (0 if online else NEAR_FRAMES), "right")
     window = NEAR_FRAMES if online else 2 * NEAR_FRAMES
     return (b - a - seen) / window, (total[b] - total[a]) / SCALE / np.maximum(b - a, 1)
-
-
-def _hidden(out: Boxes, hides: Mask, frames: int) -> Array:
-    """Share (N,) of every image box that nearer ones of the rows `hides` (N,) hide."""
-    order = np.argsort(out.frame, kind="stable")
-    hidden = np.empty(len(out))
-    hidden[order] = hidden_share(out.take(order), frames, hides[order])
-    return hidden
 
 
 def _doubled(out: Boxes, distance: Index, beyond: Index) -> Mask:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,10 +59,11 @@ def rows_online(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
         taken, number = tracker.step(found, now_ns)
         source = first[frame] + taken
         latest[number] = source
-        coasting = np.flatnonzero((tracker.seen_ns < now_ns) & (tracker.hits >= COAST_HITS))
-        number = np.concatenate([number, tracker.number[coasting]])
+        known = tracker.tracks
+        coasting = np.flatnonzero((known["seen_ns"] < now_ns) & (known["hits"] >= COAST_HITS))
+        number = np.concatenate([number, known["number"][coasting]])
         source = np.concatenate([source, np.full(len(coasting), -1)])
-        parts.append((np.full(len(number), frame), number, source, latest[number], tracker.mean[coasting, :2]))
+        parts.append((np.full(len(number), frame), number, source, latest[number], known["mean"][coasting, 0, :2]))
     frames, number, source, model, predicted = (np.concatenate(c) for c in zip(*parts))
     xy = Measurements.join(measurements).center_m[model, :2]
     xy[source < 0] = predicted
@@ -96,11 +97,8 @@ def exact_sums(values: NDArray[np.generic]) -> Index:
 
 def rows_offline(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     """Stitched tracks on their smoothed paths, with the gaps and some frames before and after them."""
-    first = np.searchsorted(boxes.frame, np.arange(len(measurements)))
     t_ns = np.arange(len(measurements), dtype=np.int64) * PERIOD_NS
-    # The tracker does not read how many points there were, so the row of a detection travels in their place.
-    marked = [replace(m, points=first[k] + np.arange(len(m))) for k, m in enumerate(measurements)]
-    tracks = track(marked, t_ns, birth_score=0.0, max_gap_s=MAX_GAP_S, min_life_s=0.0, whole_boxes=True)
+    tracks = track(measurements, t_ns, birth_score=0.0, max_gap_s=MAX_GAP_S, min_life_s=0.0, whole_boxes=True)
     rows_of = [t.measurements.points for t in tracks]
     extended = np.array([len(r) >= EXTENDED_HITS and boxes.score[r].mean() >= EXTENDED_SCORE for r in rows_of])
     paths = smooth_paths(tracks, t_ns, np.where(extended, EXTENDED_FRAMES, 0))
@@ -222,14 +220,17 @@ def _smoothed(
     tracks: Sequence[Track], group: NDArray[np.str_], noise: Array, start: Index, length: Index, t_ns: Index, seen: Mask
 ) -> tuple[Array, Array]:
     """Smoothed states (N, 4) and covariances (N, 4, 4) of tracks whose rows begin at `start` (A,)."""
-    m, at = Measurements.join([t.measurements for t in tracks]), np.flatnonzero(seen)
+    found, at = [t.measurements for t in tracks], np.flatnonzero(seen)
     xy, r, age_s = np.zeros((len(seen), 2)), np.zeros((len(seen), 2, 2)), np.zeros(len(seen))
-    xy[at], age_s[at] = m.center_m[:, :2], (m.t_ns - t_ns[at]) / NS_PER_S
-    r[at] = measurement_noise(m.covariance, np.repeat(group, [len(t) for t in tracks]), whole_boxes=True)
+    xy[at] = np.concatenate([m.center_m[:, :2] for m in found])
+    age_s[at] = (np.concatenate([m.t_ns for m in found]) - t_ns[at]) / NS_PER_S
+    r[at] = measurement_noise(
+        np.concatenate([m.covariance for m in found]), np.repeat(group, [len(t) for t in tracks]), whole_boxes=True
+    )
     mean, covariance = np.zeros((len(seen), 4)), np.zeros((len(seen), 4, 4))
     ahead_mean, ahead_covariance = mean.copy(), covariance.copy()
     mean[start, :2], covariance[start, :2, :2] = xy[start], r[start]
-    covariance[start, 2:, 2:] = first_velocity(np.array([t.measurements.yaw_rad[0] for t in tracks]), group)
+    covariance[start, 2:, 2:] = first_velocity(np.array([m.yaw_rad[0] for m in found]), group)
     dt_s = np.diff(t_ns, prepend=0) / NS_PER_S
     for k in range(1, int(length.max(initial=0))):
         on = np.flatnonzero(length > k)
@@ -238,11 +239,12 @@ def _smoothed(
         mean[i], covariance[i] = ahead_mean[i], ahead_covariance[i]
         if len(j := i[seen[i]]):
             mean[j], covariance[j] = update(mean[j], covariance[j], xy[j], r[j], age_s[j])
+    later = np.setdiff1d(np.arange(len(seen)), start)
+    step, back = np.tile(np.eye(4), (len(seen), 1, 1)), np.zeros((len(seen), 4, 4))
+    step[:, 0, 2] = step[:, 1, 3] = dt_s
+    back[later] = np.linalg.solve(ahead_covariance[later], step[later] @ covariance[later - 1]).swapaxes(1, 2)
     for k in range(int(length.max(initial=0)) - 1, 0, -1):
         i = start[length > k] + k
-        step = np.tile(np.eye(4), (len(i), 1, 1))
-        step[:, 0, 2] = step[:, 1, 3] = dt_s[i]
-        back = np.swapaxes(np.linalg.solve(ahead_covariance[i], step @ covariance[i - 1]), 1, 2)
-        mean[i - 1] += (back @ (mean[i] - ahead_mean[i])[:, :, None])[..., 0]
-        covariance[i - 1] += back @ (covariance[i] - ahead_covariance[i]) @ np.swapaxes(back, 1, 2)
+        mean[i - 1] += (back[i] @ (mean[i] - ahead_mean[i])[:, :, None])[..., 0]
+        covariance[i - 1] += back[i] @ (covariance[i] - ahead_covariance[i]) @ back[i].swapaxes(1, 2)
     return mean, covariance
