@@ -159,7 +159,7 @@ def place_by_homography(
         if len(missing):
             columns = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in columns.items()}
         poses: dict[tuple[str, int], tuple[Array, Array]] = {}
-        for k in missing:
+        for k in missing.tolist():
             name, box_px, category = str(m.camera[k]), m.box_px[k], str(m.category[k])
             fit = homographies[name].fit if name in homographies and name in log.cameras else None
             h = None if fit is None else fit.at_tick(tick)
