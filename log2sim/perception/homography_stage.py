@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
-from log2sim.geometry import Array, Camera, ground_homography, inverse, line_stamps_ns
+from log2sim.geometry import Array, Camera, ground_homography, inverse, line_stamps_ns, rotation_from_rpy
 from log2sim.perception.first_pass import Observations, base_poses
 from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes, undistorted_pixels
 from log2sim.perception.homography.estimate import (
@@ -30,6 +30,9 @@ from log2sim.plan import HomographyScope, Plan
 
 # A camera lower than this sees the ground under too flat an angle, m.
 MIN_CAMERA_HEIGHT_M = 0.2
+# Standard deviation of the angle between the wheels' plane under a vehicle and the ground that it sees: springs, and roads of
+# changing grade. In two recorded drives that look flat it is 0.5 degrees.
+TILT_SIGMA_RAD = np.deg2rad(0.5)
 # Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
 # is empty.
 MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25
@@ -137,15 +140,26 @@ def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
     """Make the homography of flat ground under the ego from the calibration; None for a camera near the ground."""
     if camera.mount_T_cam[2, 3] - log.ground_z_ego_m < MIN_CAMERA_HEIGHT_M:
         return None
-    try:
-        h = ground_homography(camera, camera.mount_T_cam, log.ground_z_ego_m)
-    except np.linalg.LinAlgError:
-        return None
-    if np.linalg.cond(h) > MAX_CONDITION:
-        return None
-    h /= np.linalg.norm(h[2])
+    # As it is, and tilted by a standard deviation about either axis of the ground.
+    tilts = [np.eye(3), rotation_from_rpy(TILT_SIGMA_RAD, 0.0, 0.0), rotation_from_rpy(0.0, TILT_SIGMA_RAD, 0.0)]
+    up = np.array([0.0, 0.0, camera.mount_T_cam[2, 3]])
+    found = []
+    for tilt in tilts:
+        pose = camera.mount_T_cam.copy()
+        pose[:3, :3] = tilt @ pose[:3, :3]
+        pose[:3, 3] = tilt @ (pose[:3, 3] - up) + up
+        try:
+            h = ground_homography(camera, pose, log.ground_z_ego_m)
+        except np.linalg.LinAlgError:
+            return None
+        if np.linalg.cond(h) > MAX_CONDITION:
+            return None
+        found.append(h / np.linalg.norm(h[2]))
+    h = found[0]
+    by_tilt = np.array([f - h for f in found[1:]]).reshape(2, 9)
     s = np.linalg.svd(h, compute_uv=False)
-    return HomographyFit(True, "", h, refused_fit("", 0).inliers, float("nan"), float(s[0] / s[-1]))
+    fit = HomographyFit(True, "", h, refused_fit("", 0).inliers, float("nan"), float(s[0] / s[-1]))
+    return replace(fit, covariance=by_tilt.T @ by_tilt)
 
 
 def place_by_homography(
