@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.registration import World, WorldSpec, disturbed, draw_world, errors_of, misplaced
+from benchmarks.registration import disturbed, draw_world, errors_of, misplaced
 
 from log2sim.config import Config
 from log2sim.datatypes import Lidar, Log, Stream, Sweep
@@ -46,9 +46,9 @@ POLE = "pole0"
 
 
 @pytest.fixture(scope="module")
-def street() -> World:
+def street() -> Log:
     """A street with buildings, moving traffic, and a LiDAR of 32 lines on a pole."""
-    return draw_world(WorldSpec(kind="street", seed=5, road_lidar="level32", azimuth_step_deg=1.2, duration_s=2.0))
+    return draw_world("street", 5, "level32", duration_s=2.0, step_deg=1.2)
 
 
 def register(log: Log, **asked: object) -> RoadRegistration:
@@ -56,10 +56,10 @@ def register(log: Log, **asked: object) -> RoadRegistration:
     return register_road(log, config, select_sensors(log, config), progress=lambda *_: None)
 
 
-def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: World) -> None:
-    bad = disturbed(street.log, POLE, 0.5, 2.0, 0.2, np.random.default_rng(0))
+def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: Log) -> None:
+    bad = disturbed(street, POLE, 0.5, 2.0, 0.2, np.random.default_rng(0))
     found = register(bad)
-    away_m, turned_deg, late_s = errors_of(found.log, street.log, POLE)
+    away_m, turned_deg, late_s = errors_of(found.log, street, POLE)
     assert away_m < 0.1
     assert turned_deg < 0.3
     assert abs(late_s) < 0.02
@@ -68,8 +68,8 @@ def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: World) -> Non
 
 
 @pytest.mark.slow
-def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: World) -> None:
-    found = register(misplaced(street.log, POLE, 8.0, 90.0))
+def test_a_pose_that_contradicts_what_the_vehicle_sees_is_left_out(street: Log) -> None:
+    found = register(misplaced(street, POLE, 8.0, 90.0))
     assert [(fault.kind, fault.subject, fault.treatment) for fault in found.faults] == [
         ("wrong_road_pose", POLE, "left_out")
     ]

@@ -17,7 +17,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 from cooperation_worlds import blind_area, curve, hidden_traffic, overlap  # noqa: E402
 from cooperation_worlds.blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S  # noqa: E402
-from cooperation_worlds.hidden_traffic import HiddenTraffic, seen, sweeps  # noqa: E402
+from cooperation_worlds.hidden_traffic import HiddenTraffic, sweeps  # noqa: E402
 from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast  # noqa: E402
 
 DRAW = {"range": curve.draw, "blind_area": blind_area.draw, "overlap": overlap.draw}
@@ -56,14 +56,13 @@ def test_the_walker_hides_from_the_vehicle_and_not_from_the_pole(seed: int) -> N
 @pytest.mark.slow
 def test_true_boxes_of_random_traffic_score_1_and_those_of_the_vehicle_alone_less() -> None:
     traffic = hidden_traffic.drawn(3, 0)
-    view = seen(traffic)
-    stamps = view.log.streams[VEHICLE_LIDAR].t_ns
+    stamps = traffic.log.streams[VEHICLE_LIDAR].t_ns
     boxes = [true_boxes(traffic, int(stamp) - 30_000_000) for stamp in stamps]
-    everything = sweeps(view, stamps, boxes)
+    everything = sweeps(traffic, stamps, boxes)
     hidden = np.concatenate([s["vehicle"][2] for s in everything])
     counted = ~np.concatenate([s["vehicle"][1].ignored for s in everything])
     figures = hidden_traffic.figures(
-        {"all": everything, "nothing": sweeps(view, stamps, [Boxes3D.empty()] * len(stamps))}
+        {"all": everything, "nothing": sweeps(traffic, stamps, [Boxes3D.empty()] * len(stamps))}
     )
     assert figures["ap"]["vehicle"] == {"all": 1.0, "nothing": 0.0}
     assert (hidden & counted).sum() < counted.sum()

@@ -89,9 +89,10 @@ def drive(change: float, seed: int, *, step_m: float = 0.8, bend_m: float = 55.0
 
 
 @pytest.mark.parametrize(
-    ("step_m", "bend_m"), [(0.0, 30.0), (0.8, 55.0), (2.0, 55.0)], ids=["standing", "near", "past"]
+    ("change", "step_m", "bend_m"),
+    [(0.04, 0.0, 30.0), (0.04, 0.8, 55.0), (0.04, 2.0, 55.0), (-0.02, 0.8, 55.0)],
+    ids=["standing", "near", "past", "down"],
 )
-@pytest.mark.parametrize("change", [0.04, -0.02], ids=["up", "down"])
 def test_what_is_beyond_a_bend_of_the_road_is_placed_where_it_is(change: float, step_m: float, bend_m: float) -> None:
     one, two = [], []
     for seed in range(2):
@@ -115,7 +116,7 @@ def test_a_road_of_one_plane_keeps_one() -> None:
 
 def test_the_covariance_holds_on_both_sides_of_the_bend() -> None:
     nees = []
-    for seed in range(6):
+    for seed in range(4):
         world = drive(0.04, seed, bias_m=0.0)
         away, covariance = world.errors(world.fit(), 10, (10.0, 20.0, 30.0, 52.0, 58.0))
         nees.append((away * np.linalg.solve(covariance, away[:, :, None])[:, :, 0]).sum(axis=1) / 2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from worlds import Solid, scan, standing
 
-from log2sim.agents.static import BoxState, LidarMatch, left_free, match_box, match_standing, track_with_lidar
+from log2sim.agents.static import BoxState, LidarMatch, left_free, match_boxes, match_standing, track_with_lidar
 from log2sim.datatypes import Obstacles, Rays
 from log2sim.geometry import rotation_from_rpy
 from log2sim.perception.boxes import rotate
@@ -29,7 +29,7 @@ def obstacles(solids, *, far=(0.0, 0.0, 0.0), turn=0.0, stamp_ns=T0_NS, t_s=0.0,
 
 def seen(cloud, xy, yaw=0.0, bottom=0.0, size=SIZE):
     box = BoxState(cloud.stamp_ns, np.asarray(xy, dtype=np.float64), np.zeros(2), yaw, size, bottom)
-    return match_box(cloud, 7, box)
+    return match_boxes(cloud, 7, [box])[0]
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(12, 3, 20), (18, -5, 90), (25, 4, 150), (15, 0, 5)])

@@ -249,15 +249,15 @@ def flank(azimuth_step_deg, *, length_m=16.0, aside_m=2.5, start_m=2.0):
 
 def test_a_flank_goes_on_where_rays_are_far_apart_and_ends_where_none_hits_it():
     points = flank(0.4)
-    near, far = points[points[:, 0] <= 9.0], points[points[:, 0] > 9.0]
+    near, far = points[points[:, 0] <= 9.0].T, points[points[:, 0] > 9.0].T
     assert np.diff(np.sort(points[:, 0])).max() > 0.8
-    np.testing.assert_array_equal(continued_sides(near, far, 22.0), np.arange(len(far)))
+    np.testing.assert_array_equal(continued_sides(near, far, 22.0), np.arange(far.shape[1]))
     # What is beyond a gap that no lost ray explains, beside the flank, or longer than the category, is something else.
-    assert len(continued_sides(near, far + np.array([3.0, 0.0]), 22.0)) == 0
-    assert len(continued_sides(near, far + np.array([0.0, 1.0]), 22.0)) == 0
+    assert len(continued_sides(near, far + np.array([[3.0], [0.0]]), 22.0)) == 0
+    assert len(continued_sides(near, far + np.array([[0.0], [1.0]]), 22.0)) == 0
     kept = continued_sides(near, far, 10.0)
-    assert far[kept, 0].max() <= near[:, 0].min() + 10.0 + 1e-9
-    assert 0 < len(kept) < len(far)
+    assert far[0, kept].max() <= near[0].min() + 10.0 + 1e-9
+    assert 0 < len(kept) < far.shape[1]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from plain_settings import AGENTS_ALONE
 from test_first_pass import STAMPS, TICKS, Truth, driving_log, with_records
-from worlds import tiny_log
+from worlds import tiny_log, tiny_table
 
 from log2sim import Config, reconstruct
 from log2sim.datatypes import Log
@@ -101,7 +101,8 @@ def test_scenarios_of_any_number_of_processes_are_the_same(
 
 
 def test_frames_are_skipped_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    log, _ = tiny_log(duration_s=1.2)
+    small = [{**tiny_table()["camera"][0], "size_px": [240, 150]}]
+    log, _ = tiny_log(duration_s=1.2, camera=small)
 
     def find(image: Any) -> list[Any]:
         return [(10.0, 10.0, 60.0, 50.0, 0.9, "car")] if image[::7].mean() % 1 < 0.3 else []

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import ConfigError, LogError
-from log2sim.geometry import NS_PER_S
+from log2sim.geometry import NS_PER_S, rotation_from_rpy
 from log2sim.logs.opening import open_log
 from log2sim.resim.alignment import Alignment
 from log2sim.resim.caster import first_hits, grid_of, meetings
@@ -63,9 +63,9 @@ def test_a_plane_of_discs_is_met_where_the_plane_is() -> None:
 
 def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do() -> None:
     """Of an ego that turns: LiDARs that spin, and one that looks everywhere all the time."""
-    grid = np.stack(np.meshgrid(np.arange(-20, 20, 0.25), np.arange(-20, 20, 0.25)), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(np.arange(-13, 16, 0.25), np.arange(-13, 13, 0.25)), -1).reshape(-1, 2)
     plane = disc_surfels(np.column_stack([grid, -1.8 + 0 * grid[:, 0]]), np.tile([0.0, 0, 1], (len(grid), 1)), 0.25)
-    wall = np.stack(np.meshgrid(np.arange(-20, 20, 0.1), np.arange(-1.8, 4, 0.1)), -1).reshape(-1, 2)
+    wall = np.stack(np.meshgrid(np.arange(-10, 10, 0.1), np.arange(-1.8, 2, 0.1)), -1).reshape(-1, 2)
     wall = np.column_stack([0 * wall[:, 0] + 8, wall])  # across the way, so that every start counts
     plane = joined([plane, disc_surfels(wall, np.tile([-1.0, 0, 0], (len(wall), 1)), 0.1)])
     rng = np.random.default_rng(2)
@@ -80,13 +80,7 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
         moment = (t_s / 0.0002).astype(int)
         poses = np.tile(np.eye(4), (501, 1, 1))
         yaw, x = 0.3 * np.arange(501) * 0.0002, speed_mps * np.arange(501) * 0.0002
-        poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = (
-            np.cos(yaw),
-            -np.sin(yaw),
-            np.sin(yaw),
-            np.cos(yaw),
-        )
-        poses[:, 0, 3] = x
+        poses[:, :3, :3], poses[:, 0, 3] = rotation_from_rpy(0.0, 0.0, yaw), x
         shots = replace(shots_toward(ray), t_ns=(t_s * NS_PER_S).astype(np.int64))
         rays = rays_in_map(shots, poses, moment)
         met = meetings(rays, grid_of(rays), plane, plane.center_m - rays.shift_m.astype(np.float32), plane.normal)
@@ -126,10 +120,10 @@ def test_smallest_axes_are_those_of_an_eigenvalue_solver() -> None:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A street with houses and cars, 2 s long, its LiDAR of fewer rays."""
+    """A street with houses and cars, 1.5 s long, its LiDAR of fewer rays."""
     bare = load_scene(SCENES / "bare.toml")
     lidar = bare.lidar[0].model_copy(update={"azimuth_step_deg": 0.8})
-    return bare.model_copy(update={"camera": (), "lidar": (lidar,), "duration_s": 2.0})
+    return bare.model_copy(update={"camera": (), "lidar": (lidar,), "duration_s": 1.5})
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +156,7 @@ def count_in_box(points: np.ndarray, scenario: Scenario, id: str, t_s: float) ->
 def test_sweeps_that_were_left_out_come_back_as_recorded(recorded: tuple[Log, Scenario], world: World) -> None:
     log, truth = recorded
     simulation, (name,) = Simulation(log, world, truth), log.lidars
-    for i in (7, 17):
+    for i in (7, 12):
         shots = simulation.shots(name, i)
         sweep, rows = simulation.cast(name, shots, log, 0, np.random.default_rng(0))
         simulated = np.full(len(shots.t_ns), np.nan)
@@ -198,7 +192,7 @@ def test_agents_have_about_as_many_points_as_recorded(recorded: tuple[Log, Scena
     log, truth = recorded
     (name,) = log.lidars
     counts = np.zeros((2, len(truth.others)))
-    for i in (7, 12, 17):
+    for i in (2, 7, 12):
         t_s = (log.streams[name].t_ns[i] - truth.t0_ns) / NS_PER_S - 0.05
         sweep = log.streams[name].read(i)
         poses, moment, _ = poses_of(log, name, sweep.t_ns)
@@ -206,7 +200,7 @@ def test_agents_have_about_as_many_points_as_recorded(recorded: tuple[Log, Scena
         for row, points in enumerate((true, points_of(Simulation(log, world, truth), name, i, log))):
             counts[row] += [count_in_box(points, truth, agent.id, t_s) for agent in truth.others]
     seen = counts[0] >= 20
-    assert seen.sum() >= 4
+    assert seen.sum() >= 3
     assert (np.abs(counts[1] - counts[0])[seen] <= 0.15 * counts[0, seen] + 1).all()  # one point at its outline
 
 
@@ -265,7 +259,7 @@ def test_surfaces_of_an_agent_lie_on_each_other_though_its_trajectory_is_off(rec
         every.append(on_car(np.einsum("nij,nj->ni", poses[moment, :3, :3], sweep.xyz_m) + poses[moment, :3, 3], i))
     tree = cKDTree(np.concatenate(every))
     for scenario, aside_m in ((source, 0.0), (edited, 2.0)):
-        found = [on_car(points_of(Simulation(log, built, scenario), name, i, log), i, aside_m) for i in (2, 7, 12, 17)]
+        found = [on_car(points_of(Simulation(log, built, scenario), name, i, log), i, aside_m) for i in (2, 7, 12)]
         assert np.median(tree.query(np.concatenate(found))[0]) < 0.08  # 0.11 where surfaces are not aligned
 
 
@@ -317,15 +311,15 @@ def test_the_ground_goes_on_below_what_stands(recorded: tuple[Log, Scenario]) ->
 
 def test_a_simulated_log_opens_with_its_truth(recorded: tuple[Log, Scenario], tmp_path: Path) -> None:
     log, truth = recorded
-    short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:6]) for k, s in log.streams.items()})
+    short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:4]) for k, s in log.streams.items()})
     film = choose_film_file(tmp_path / "film.webm")
     gone = replace(truth, agents=tuple(a for a in truth.agents if a.id != truth.others[0].id))
     resimulate(
         short, truth, truth, tmp_path / "out", then=lambda made: write_film(replace(made, scenario=gone), truth, film)
     )
     frames = cv2.VideoCapture(str(tmp_path / "film.webm"))
-    shown = [image for _ in range(6) for found, image in [frames.read()] if found]
-    assert len(shown) == 6
+    shown = [image for _ in range(4) for found, image in [frames.read()] if found]
+    assert len(shown) == 4
     recorded_rows, simulated_rows, now_rows = np.split(shown[3].astype(float), 3)
     # What is simulated looks as what was recorded, more than what happens without an agent.
     apart = [np.abs(rows - recorded_rows)[20:].mean() for rows in (simulated_rows, now_rows)]
@@ -375,7 +369,7 @@ def test_a_policy_sees_from_where_it_drives(recorded: tuple[Log, Scenario], worl
     first: list[np.ndarray] = []
 
     def drive(observation: Observation) -> Controls:
-        if len(ahead) < 2 and observation.t_s >= len(ahead) * 1.5:
+        if len(ahead) < 2 and observation.t_s >= len(ahead):
             # The house beside the street: 10 m to the left of the path, wherever along it the ego is.
             points = observation.sweep(name).xyz_m
             first.append(points)

@@ -12,9 +12,11 @@ import pytest
 from benchmarks import poses, warnings
 from entry import commands_in, run_named
 from fits import late_fusion
+from fits.logistic import logistic_regression
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from mutants import MUTANTS
 from profile_ticks import Measured, figures
+from scipy.optimize import minimize
 from worlds import tiny_toml
 
 from log2sim.logs.native.writer import write_log
@@ -104,6 +106,19 @@ def test_warnings_of_labels_of_kitti_are_counted_a_minute(tmp_path: Path, capsys
         (tmp_path / name / "0003.txt").write_text(text)
     warnings.main([tmp_path])
     assert "3 s driven: 0 warnings, 0.00 a minute" in capsys.readouterr().out
+
+
+def test_a_logistic_regression_has_the_weights_of_a_minimizer() -> None:
+    rng = np.random.default_rng(0)
+    x, prior, precision = np.column_stack([np.ones(200), rng.normal(size=(200, 2))]), [0.0, 1.0, 0.5], [0.1, 4.0, 1.0]
+    right = rng.random(200) < 1 / (1 + np.exp(-x @ [0.3, -2.0, 1.0]))
+
+    def cost(w: np.ndarray) -> float:
+        return float(np.logaddexp(0.0, np.where(right, -1, 1) * (x @ w)).sum() + precision @ (w - prior) ** 2 / 2)
+
+    found = logistic_regression(x, right, precision, prior)
+    np.testing.assert_allclose(found, minimize(cost, prior).x, atol=1e-4)
+    assert logistic_regression(x[:0], right[:0], precision, prior).tolist() == prior
 
 
 def test_pairs_of_labels_that_late_fusion_is_fitted_to_are_right(tmp_path: Path) -> None:

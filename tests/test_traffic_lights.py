@@ -47,9 +47,10 @@ def junction(moving: bool = True) -> tuple[Log, Scenario]:
     return synthesize(scene_from_table(table), observe=False)
 
 
-def boxes_of(log: Log, truth: Scenario, rng: np.random.Generator, noise_px: float = 1.0) -> list[LightBox]:
-    """Boxes around the true housings with errors, and the pictures in them."""
-    out = []
+@lru_cache(maxsize=2)
+def boxes_of(moving: bool = True) -> list[LightBox]:
+    """Boxes around the true housings with errors of a pixel, and the pictures in them."""
+    (log, truth), rng, out = junction(moving), np.random.default_rng(0), []
     for index, t_ns in enumerate(log.streams["front"].t_ns.tolist()):
         image = log.streams["front"].read(index)
         cam_T_map = inverse(log.map_T_sensor("front", t_ns)[0][0])
@@ -58,20 +59,14 @@ def boxes_of(log: Log, truth: Scenario, rng: np.random.Generator, noise_px: floa
             corners = box_corners(signal.position_m, HOUSING_M, signal.heading_rad or 0.0)[0]
             uv, seen = project(log.cameras["front"], corners @ cam_T_map[:3, :3].T + cam_T_map[:3, 3])
             if seen.all():
-                rows.append(
-                    [
-                        *(uv.min(axis=0) + rng.normal(0, noise_px, 2)),
-                        *(uv.max(axis=0) + rng.normal(0, noise_px, 2)),
-                        0.6,
-                    ]
-                )
+                rows.append([*(uv.min(axis=0) + rng.normal(size=2)), *(uv.max(axis=0) + rng.normal(size=2)), 0.6])
         out += crop_lights("front", t_ns, image, np.array(rows).reshape(-1, 5))
     return out
 
 
 def test_signals_of_a_junction_are_placed_and_change_when_they_do() -> None:
     log, truth = junction()
-    signals, seen = find_signals(log, truth, boxes_of(log, truth, np.random.default_rng(0)))
+    signals, seen = find_signals(log, truth, boxes_of())
     assert seen == "2 traffic lights"
     for true in truth.signals:
         found = min(signals, key=lambda s: float(np.linalg.norm(s.position_m - true.position_m)))
@@ -86,7 +81,7 @@ def test_signals_of_a_junction_are_placed_and_change_when_they_do() -> None:
 
 def test_a_range_by_lidar_points_makes_the_distance_sure() -> None:
     log, truth = junction(moving=False)
-    boxes = boxes_of(log, truth, np.random.default_rng(1))
+    boxes = boxes_of(moving=False)
     eye = log.map_T_sensor("front", boxes[0].t_ns)[0][0][:3, 3]
     near = [
         min((s.position_m for s in truth.signals), key=lambda p: abs(np.arctan2(*(p - eye)[[1, 0]]) - _azimuth(log, b)))
@@ -109,7 +104,7 @@ def _azimuth(log: Log, box: LightBox) -> float:
 
 def test_boxes_that_do_not_repeat_or_never_shine_are_no_signals() -> None:
     log, truth = junction()
-    boxes = boxes_of(log, truth, np.random.default_rng(2))
+    boxes = boxes_of()
     assert find_signals(log, truth, boxes[:2])[0] == ()
     dark = [LightBox(b.camera, b.t_ns, b.box_px, b.score, drawn("off")) for b in boxes]
     signals, seen = find_signals(log, truth, dark)
@@ -130,7 +125,7 @@ def test_points_in_the_middle_of_a_box_give_its_range() -> None:
     from log2sim.perception.lidar.projection import view_of
 
     log, truth = junction(moving=False)
-    box = boxes_of(log, truth, np.random.default_rng(3), 0.0)[0]
+    box = boxes_of(moving=False)[0]
     signal = min(
         truth.signals, key=lambda s: abs(_azimuth(log, box) - np.arctan2(s.position_m[1] + 1.8, s.position_m[0] + 12.4))
     )

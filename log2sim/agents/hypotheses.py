@@ -91,7 +91,7 @@ def _observed_ends(t: Array, ends: Ends, origin: Array, axis: int, sigma_m: floa
         off = p.xy_m[1:-1, 0] - p.xy_m[:-2, 0] * (1 - share) - p.xy_m[2:, 0] * share
         weights, rows = np.zeros((len(off), len(p))), np.arange(len(off))
         weights[rows, rows], weights[rows, rows + 1], weights[rows, rows + 2] = share - 1, 1.0, -share
-        expected = np.einsum("ij,jk,ik->i", weights, noise_of(p), weights)
+        expected = np.einsum("ij,jk,ik->i", weights, noise_of(p)[0], weights)
         found.append(Positions(p.t_s, p.xy_m, p.variance * max(1.0, float(np.mean(off**2 / expected)))))
     return found
 
@@ -110,7 +110,7 @@ def _log_odds(ends: list[Positions]) -> tuple[float, float]:
         t = p.t_s[:, None]
         moved = [t - (first + last) / 2, np.maximum(t - starts, 0.0) ** 2 / 2, np.maximum(stops - t, 0.0) ** 2 / 2]
         way = np.concatenate(moved, axis=1)
-        weight = np.linalg.inv(noise_of(p) + PLACE_SIGMA_M**2)
+        weight = np.linalg.inv(noise_of(p)[0] + PLACE_SIGMA_M**2)
         known[k] = ((weight @ way) * way).sum(axis=0)
         pulled[k] = way.T @ weight @ (p.xy_m[:, 0] - np.median(p.xy_m[:, 0]))
     known, pulled = np.vstack([known, known.sum(axis=0)]), np.vstack([pulled, pulled.sum(axis=0)])

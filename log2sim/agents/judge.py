@@ -199,6 +199,7 @@ def extend_static(
         np.array([[f(a.waypoints.x_m), f(a.waypoints.y_m)] for a in out], dtype=np.float64) for f in (np.min, np.max)
     )
     half_m = np.array([np.hypot(*a.size_m[:2]) for a in out]) / 2
+    tables: dict[int, AgentTable] = {}
     # The surest first: what it takes, the others cannot have.
     for n in sorted(range(len(rows)), key=lambda n: -agents[rows[n]].confidence):
         agent, w = agents[rows[n]], agents[rows[n]].waypoints
@@ -207,11 +208,16 @@ def extend_static(
         away_m = np.hypot(*np.maximum(np.maximum(low - place[:2], place[:2] - high), 0.0).T)
         may_meet = away_m <= reach_m + np.hypot(*(high - low).T)
         may_meet[rows[n]] = False
-        for k in np.flatnonzero(may_meet).tolist():  # in its place
-            there = AgentTable.of([out[k]], t_s)
-            near = np.flatnonzero(np.hypot(*(there.xy_m[0] - place[:2]).T) <= reach_m[k])
-            shared = overlap_of_smaller(np.tile(place, (len(near), 1)), there.rectangles(0, near))
-            taken[near] |= shared > TOUCHING
+        ticks, there = [], []
+        for k in np.flatnonzero(may_meet).tolist():
+            if k not in tables:
+                tables[k] = AgentTable.of([out[k]], t_s)
+            ticks.append(np.flatnonzero(np.hypot(*(tables[k].xy_m[0] - place[:2]).T) <= reach_m[k]))
+            there.append(tables[k].rectangles(0, ticks[-1]))
+        if ticks:  # at which another is in its place
+            others = np.concatenate(there)
+            shared = overlap_of_smaller(np.tile(place, (len(others), 1)), others)
+            taken[np.concatenate(ticks)[shared > TOUCHING]] = True
         before, after = np.flatnonzero(t_s < w.t_s[0]), np.flatnonzero(t_s > w.t_s[-1])
         before = before[before > max(before[taken[before]], default=-1)]
         after = after[after < min(after[taken[after]], default=len(t_s))]
@@ -220,6 +226,7 @@ def extend_static(
             seen = np.concatenate([np.zeros(len(before), bool), w.observed, np.zeros(len(after), bool)])
             life_s = np.concatenate([t_s[before], w.t_s, t_s[after]])
             out[rows[n]] = replace(agent, waypoints=replace(w.take(index), t_s=life_s, observed=seen))
+            tables.pop(rows[n], None)
     return out[: len(agents)]
 
 

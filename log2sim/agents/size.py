@@ -124,8 +124,9 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     sensor = boxes.rotate(np.array([v.sensor_m[:2] for v in seen]).reshape(-1, 2) - origin, -yaw)
     visible = np.array([v.ends_visible for v in seen], dtype=bool).reshape(-1, 2)
     views = boxes.real_ends(low, high, sensor, visible, min_sine=_min_sine(track.category))
-    steps = [boxes.azimuth_step_rad(v.cluster[:, :2] - v.sensor_m[:2]) for v in seen]
-    gaps = boxes.end_gaps(np.array(steps), low - sensor, high - sensor, views)
+    shown = [v.cluster[:, :2] - v.sensor_m[:2] for v in seen]
+    steps = boxes.azimuth_steps(np.concatenate(shown), np.array([len(xy) for xy in shown])) if shown else np.zeros(0)
+    gaps = boxes.end_gaps(steps, low - sensor, high - sensor, views)
     # An end that is real from one viewpoint is real, and known as well as from the best one.
     real = views.max(axis=0)
     gap = np.where(views == real, gaps, np.inf).min(axis=0)
@@ -160,8 +161,9 @@ def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: 
         v.cluster[:, :2] - v.sensor_m[:2] - (v.cluster[:, 3:] * velocity if v.cluster.shape[1] > 3 else 0.0)
         for (_, v), velocity in zip(views, velocity_mps[of])
     ]
-    low, high = boxes.extents_of_clusters(np.concatenate(moved), np.array([len(xy) for xy in moved]), yaw_rad[of])
-    step = np.array([boxes.azimuth_step_rad(xy) for xy in moved])
+    xy, size = np.concatenate(moved), np.array([len(xy) for xy in moved])
+    low, high = boxes.extents_of_clusters(xy, size, yaw_rad[of])
+    step = boxes.azimuth_steps(xy, size)
     visible = np.array([view.ends_visible for _, view in views], dtype=bool).reshape(-1, 2)
     real = boxes.real_ends(low, high, np.zeros(2), visible, min_sine=_min_sine(track.category))
     seen = Ends(low, high, real, boxes.end_gaps(step, low, high, real))

@@ -21,8 +21,8 @@ from log2sim.perception.boxes import (
     SIDE_END,
     UNIFORM_SIGMA,
     complete_box,
-    corrected_yaw,
-    extents,
+    correct_yaws,
+    extents_of_clusters,
     facing_ends,
     oriented_covariance,
     rotate,
@@ -98,7 +98,7 @@ def track_with_lidar(
         stamp_ns = int(t_ns[tick]) if cloud is None else cloud.stamp_ns
         predicted = state.xy_m + state.velocity_mps * ((stamp_ns - state.t_ns) / NS_PER_S)
         reached = cloud is not None and float(np.hypot(*(predicted - cloud.origin[:2]))) <= reach_of(state.size_m)
-        match = match_box(cloud, tick, replace(state, xy_m=predicted)) if cloud is not None and reached else None
+        match = match_boxes(cloud, tick, [replace(state, xy_m=predicted)])[0] if cloud is not None and reached else None
         if match is None:
             misses += 1
             if misses >= MAX_MISSES and not is_static:
@@ -138,8 +138,9 @@ def match_standing(
     for tick, cloud in enumerate(obstacles):
         if cloud is None:
             continue
-        for k in np.flatnonzero(np.hypot(*(place - cloud.origin[:2]).T) <= reach).tolist():
-            match = None if tick in measured[k] else match_box(cloud, tick, boxes[k])
+        near = np.flatnonzero(np.hypot(*(place - cloud.origin[:2]).T) <= reach).tolist()
+        near = [k for k in near if tick not in measured[k]]
+        for k, match in zip(near, match_boxes(cloud, tick, [boxes[k] for k in near])):
             if match is not None:
                 matches[k].append(match)
     return matches
@@ -155,58 +156,70 @@ def _reach_around(size_m: Array) -> float:
     return float(np.hypot(*size_m[:2])) / 2 + MARGIN_M + SHELL_M
 
 
-def match_box(cloud: Obstacles, tick: int, box: BoxState) -> LidarMatch | None:
-    """Match a predicted box, at the stamp of a cloud, against its points; None where they do not determine its position.
+def match_boxes(cloud: Obstacles, tick: int, boxes: Sequence[BoxState]) -> list[LidarMatch | None]:
+    """Match predicted boxes, at the stamp of a cloud, against its points; None for those whose position they do not determine.
 
     Of a vehicle beside the sensor only a flank is seen, and of a long one not even all of that. It has the place across
     from the flank, and the place along from an end behind which rays go on. A wall has no such ends.
     """
-    size, yaw_rad = box.size_m, box.yaw_rad
-    near = cloud.near(box.xy_m, _reach_around(size))
-    z = cloud.xyz[near, 2] + np.float32(cloud.origin[2] - box.bottom_m)
-    near = near[(z > 0.15) & (z < size[2] + 0.4)]
-    if len(near) < MIN_POINTS:
-        return None
-    late_s = cloud.t_s[near, None].astype(np.float64)
-    local = rotate(cloud.xyz[near, :2] + (cloud.origin[:2] - box.xy_m) - late_s * box.velocity_mps, -yaw_rad)
-    outside_m = (np.abs(local) - size[:2] / 2).max(axis=1)
-    inside = outside_m <= MARGIN_M
-    in_shell = ~inside & (outside_m <= MARGIN_M + SHELL_M)
-    if inside.sum() < MIN_POINTS or in_shell.sum() > MAX_SHELL_RATIO * inside.sum():
-        return None
-    # The pose of what stands is known from all ticks.
-    turn_rad = corrected_yaw(local[inside], 0.0) if box.velocity_mps.any() else 0.0
-    box = replace(box, yaw_rad=yaw_rad + turn_rad)
-    low, high = extents(local[inside], turn_rad)
-    if np.any(high - low > size[:2] + np.maximum(0.6, MAX_SHIFT_SHARE * size[:2])):
-        return None
-    sensor = rotate(cloud.sensor_of(near[inside])[:2].astype(np.float64) + cloud.origin[:2] - box.xy_m, -box.yaw_rad)
-    real, gap_m, rays = facing_ends(low, high, sensor), np.zeros((2, 2)), None
-    hidden = size[:2] - (high - low) > MAX_HIDDEN_SHARE * np.maximum(size[:2], 1.0)
-    if cloud.free is None and hidden.any():
-        return None
-    if cloud.free is not None and np.any(hidden | ~real.any(axis=1)):
-        rays = _rays_to(box, cloud.origin, cloud.free)
-        levels = np.quantile(cloud.xyz[near[inside], 2] + np.float32(cloud.origin[2] - box.bottom_m), LEVELS)
-        real, gap_m = _ends_by_rays(*rays, levels, low, high, real)
-        smaller = real.all(axis=1) & (high - low + gap_m.sum(axis=1) < MIN_SIZE_SHARE * size[:2])
-        if smaller.any() or (hidden.any() and not real.any(axis=1).all()):
-            return None
-    center, sigma = complete_box(low, high, size[:2], real, gap_m=gap_m)
-    if np.any(np.abs(center) > np.maximum(MAX_SHIFT_M, MAX_SHIFT_SHARE * size[:2])) or (
-        rays is not None and _passes(*rays, center, size)
-    ):
-        return None
-    sigma = np.hypot(sigma, UNIFORM_SIGMA * np.where(real.all(axis=1), gap_m.min(axis=1), gap_m.max(axis=1)))
-    mean_s = float(late_s[inside].mean())
-    return LidarMatch(
-        tick,
-        cloud.stamp_ns + round(mean_s * NS_PER_S),
-        rotate(center, box.yaw_rad) + box.xy_m + mean_s * box.velocity_mps,
-        oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), box.yaw_rad),
-        box.yaw_rad,
-        int(inside.sum()),
+    matches: list[LidarMatch | None] = [None] * len(boxes)
+    found = [cloud.near(box.xy_m, _reach_around(box.size_m)) for box in boxes]
+    near, of = (
+        np.concatenate([*found, np.zeros(0, dtype=np.intp)]),
+        np.repeat(np.arange(len(boxes)), [len(i) for i in found]),
     )
+    if len(near) < MIN_POINTS:
+        return matches
+    names = "size_m", "xy_m", "velocity_mps", "yaw_rad", "bottom_m"
+    size, place, velocity, yaw, bottom = (np.array([getattr(box, name) for box in boxes]) for name in names)
+    z = cloud.xyz[near, 2] + (cloud.origin[2] - bottom).astype(np.float32)[of]
+    tall = np.flatnonzero((z > 0.15) & (z < size[of, 2] + 0.4))
+    near, of, z = near[tall], of[tall], z[tall]
+    size, late_s = size[:, :2], cloud.t_s[near].astype(np.float64)
+    local = rotate(cloud.xyz[near, :2] + (cloud.origin[:2] - place)[of] - late_s[:, None] * velocity[of], -yaw[of])
+    outside_m = np.maximum(*(np.abs(local) - size[of] / 2).T)
+    inside, around = outside_m <= MARGIN_M, outside_m <= MARGIN_M + SHELL_M
+    count, in_shell = (np.bincount(of[mask], minlength=len(boxes)) for mask in (inside, around & ~inside))
+    usable = (count >= MIN_POINTS) & (in_shell <= MAX_SHELL_RATIO * count)
+    rows, kept = np.flatnonzero(usable), np.flatnonzero(inside & usable[of])
+    if not len(rows):
+        return matches
+    local, count = local[kept], count[rows]
+    # The pose of what stands is known from all ticks.
+    turn_rad, moves = np.zeros(len(rows)), velocity[rows].any(axis=1)
+    if moves.any():
+        turn_rad[moves] = correct_yaws(local[np.repeat(moves, count)], count[moves], turn_rad[moves])
+    low, high = extents_of_clusters(local, count, turn_rad)
+    start = np.cumsum(count) - count
+    points = [slice(a, a + n) for a, n in zip(start.tolist(), count.tolist())]
+    mean_s = np.add.reduceat(late_s[kept], start) / count
+    size, place, velocity, yaw = size[rows], place[rows], velocity[rows], yaw[rows] + turn_rad
+    good: NDArray[np.bool_] = np.all(high - low <= size + np.maximum(0.6, MAX_SHIFT_SHARE * size), axis=1)
+    seen_from = np.array([cloud.sensor_of(near[kept[part]])[:2] for part in points], dtype=np.float64)
+    real = facing_ends(low, high, rotate(seen_from + cloud.origin[:2] - place, -yaw))
+    gap_m = np.zeros(real.shape)
+    hidden = size - (high - low) > MAX_HIDDEN_SHARE * np.maximum(size, 1.0)
+    rays = dict[int, tuple[Array, Array]]()
+    if cloud.free is None:
+        good &= ~hidden.any(axis=1)
+    else:
+        for n in np.flatnonzero(good & (hidden | ~real.any(axis=2)).any(axis=1)).tolist():
+            rays[n] = _rays_to(replace(boxes[rows[n]], yaw_rad=float(yaw[n])), cloud.origin, cloud.free)
+            levels = np.quantile(z[kept[points[n]]], LEVELS)
+            real[n], gap_m[n] = _ends_by_rays(*rays[n], levels, low[n], high[n], real[n])
+            smaller = real[n].all(axis=1) & (high[n] - low[n] + gap_m[n].sum(axis=1) < MIN_SIZE_SHARE * size[n])
+            good[n] = not (smaller.any() or (hidden[n].any() and not real[n].any(axis=1).all()))
+    center, sigma = complete_box(low, high, size, real, gap_m=gap_m)
+    good &= (np.abs(center) <= np.maximum(MAX_SHIFT_M, MAX_SHIFT_SHARE * size)).all(axis=1)
+    sigma = np.hypot(sigma, UNIFORM_SIGMA * np.where(real.all(axis=2), gap_m.min(axis=2), gap_m.max(axis=2)))
+    covariance = oriented_covariance(np.hypot(sigma, 2 * SENSOR_SIGMA_M), yaw)
+    xy_m = rotate(center, yaw) + place + mean_s[:, None] * velocity
+    for n in np.flatnonzero(good).tolist():
+        k = int(rows[n])
+        if n not in rays or not _passes(*rays[n], center[n], boxes[k].size_m):
+            t_ns = cloud.stamp_ns + round(float(mean_s[n]) * NS_PER_S)
+            matches[k] = LidarMatch(tick, t_ns, xy_m[n], covariance[n], float(yaw[n]), int(count[n]))
+    return matches
 
 
 def left_free(

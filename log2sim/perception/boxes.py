@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, Measurements
-from log2sim.geometry import Array, median, wrap_angle
+from log2sim.geometry import Array, wrap_angle
 
 SEARCH_STEP_RAD = np.deg2rad(2.0)
 # Distances to an edge below the noise of a LiDAR score alike.
@@ -89,7 +89,7 @@ def _closeness(xy: Array, count: NDArray[np.intp], angles: Array, most: int) -> 
         directions = np.concatenate([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1, dtype=np.float32)
         # Distance of every point to the nearer end of all, without one stray point at each.
         offsets = directions @ points
-        low, high = _lower_end(offsets, valid)[:, :, None], -_lower_end(-offsets, valid)[:, :, None]
+        low, high = _outer_ends(offsets, valid)
         distance = np.minimum(np.abs(offsets - low), np.abs(high - offsets))
         nearer = np.minimum(distance[:, : angles.shape[1]], distance[:, angles.shape[1] :])
         score = np.reciprocal(np.maximum(nearer, np.float32(MIN_EDGE_DISTANCE_M))) * valid[:, None]
@@ -97,13 +97,14 @@ def _closeness(xy: Array, count: NDArray[np.intp], angles: Array, most: int) -> 
     return out
 
 
-def _lower_end(offsets: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the second lowest valid value (M, K) of every row, or the lowest of fewer than `MIN_POINTS_WITH_STRAY`."""
-    values = offsets.copy() if valid.all() else np.where(valid[:, None], offsets, np.float32(np.inf))
-    place = values.argmin(axis=2)[:, :, None]
-    lowest = np.take_along_axis(values, place, axis=2)[:, :, 0]
-    np.put_along_axis(values, place, np.inf, axis=2)
-    return np.where(valid.sum(axis=1)[:, None] < MIN_POINTS_WITH_STRAY, lowest, values.min(axis=2))
+def _outer_ends(
+    offsets: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the second lowest and second highest valid values (M, K, 1) of every row, or the outermost of fewer than `MIN_POINTS_WITH_STRAY`."""
+    ordered = np.sort(np.where(valid[:, None], offsets, np.float32(np.inf)), axis=2)
+    count, rows = valid.sum(axis=1), np.arange(len(valid))
+    stray = count >= MIN_POINTS_WITH_STRAY
+    return ordered[rows, :, stray.astype(np.intp), None], ordered[rows, :, count - 1 - stray, None]
 
 
 def _parabolic_peak(score: Array, best: NDArray[np.intp]) -> Array:
@@ -220,13 +221,20 @@ def subsample(points: NDArray[Any], max_count: int) -> NDArray[Any]:
     return points[np.linspace(0, len(points) - 1, max_count).round().astype(np.int64)]
 
 
-def azimuth_step_rad(xy: Array) -> float:
-    """Return the angle between neighboring columns of points (n, 2), seen from the origin; 0 where they are one column."""
-    place = np.ascontiguousarray(xy, dtype=np.float64).view(np.complex128)[:, 0]
-    turned = place * place.mean().conjugate()
-    steps = np.diff(np.sort(np.arctan2(turned.imag, turned.real)))
-    steps = steps[steps > MIN_AZIMUTH_STEP_RAD]
-    return median(steps) if len(steps) else 0.0
+def azimuth_steps(xy_m: Array, count: NDArray[np.intp]) -> Array:
+    """Return the angles (R,), rad, between neighboring columns of clusters seen from the origin; 0 for one that is one column."""
+    start = np.cumsum(count) - count
+    place = np.ascontiguousarray(xy_m, dtype=np.float64).view(np.complex128)[:, 0]
+    turned = place * np.repeat(np.add.reduceat(place, start).conj(), count)
+    azimuth = np.arctan2(turned.imag, turned.real)[None]
+    sort_clusters(azimuth, count)
+    steps = np.diff(azimuth, append=np.inf)
+    steps[0, start[1:] - 1] = np.inf
+    steps[steps <= MIN_AZIMUTH_STEP_RAD] = np.inf
+    sort_clusters(steps, count)
+    columns = np.add.reduceat(np.isfinite(steps[0]).astype(np.intp), start)
+    low, high = (steps[0, start + np.maximum(columns - of, 0) // 2] for of in (1, 0))
+    return np.where(columns > 0, (low + high) / 2, 0.0)
 
 
 def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -388,7 +396,7 @@ def end_gaps(step_rad: Array | float, low: Array, high: Array, real: NDArray[np.
 
     An end seen from the side is up to one such distance beyond the outermost point. One that faces the sensor is hit.
 
-    `step_rad`: (...), rad: angle between neighboring rays, from `azimuth_step_rad`. `low`, `high`: (..., 2), m:
+    `step_rad`: (...), rad: angle between neighboring rays, from `azimuth_steps`. `low`, `high`: (..., 2), m:
     ends of the extents along the length and the width, relative to the sensor. `real`: (..., 2, 2): from `real_ends`.
 
     Rays that are a small angle apart meet a side at distance d from the sensor's foot point on it, which is c away, at

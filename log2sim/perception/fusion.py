@@ -60,7 +60,7 @@ def fuse_tick(measurements: Measurements, *, across: bool = True) -> Measurement
     # Boxes that a detector found in one sweep are different objects.
     possible &= ~((rows.camera[:, None] == "") & (rows.camera == ""))
     owner = np.arange(len(rows))
-    for i in range(len(rows)):
+    for i in np.flatnonzero(np.tril(possible, -1).any(axis=1)).tolist():
         for j in np.flatnonzero(possible[i, :i]).tolist():
             # Without points their positions suffice.
             alike = not len(rows.cluster[i]) or not len(rows.cluster[j])

@@ -203,7 +203,7 @@ def sketch_sweep(log: Log, name: str, sweep: Sweep) -> SweepSketch:
     """
     xyz, lidar = sweep.xyz_m, log.lidars[name]
     if len(xyz) > SLICES * MIN_SLICED_POINTS:
-        xyz = xyz.take(np.flatnonzero(np.floor(xyz[:, 0] / CELL_M).astype(np.int64) % SLICES == 0), axis=0)
+        xyz = xyz.take(np.flatnonzero(np.floor(xyz[:, 0] / CELL_M).astype(np.int64) & (SLICES - 1) == 0), axis=0)
     if lidar.mount != "map":
         # Well above flat ground under the ego, and not on the ego; all points of a LiDAR that stands.
         above_ground_m = float(lidar.mount_T_lidar[2, 3]) - log.ground_z_ego_m

@@ -18,6 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from fits.logistic import logistic_regression
 from kitti import choice
 from kitti.boxes import (
     Boxes,
@@ -45,7 +46,7 @@ HEAD = ["class", "sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "IDS", "FRA
 LEARNED = ("0000", "0002", "0004", "0005", "0007", "0009", "0011")
 FEATURES = {True: ("score", "near_score", "near_share", "hidden", "height"), False: ("near_score", "near_share")}
 # Standard deviation of the weights beforehand is 1.
-PENALTY, CONSTANT_PENALTY, ITERATIONS = 1.0, 0.01, 30
+PENALTY, CONSTANT_PENALTY = 1.0, 0.01
 
 
 def main(folder: Path, online: bool = False, fit: bool = False, results: Path | None = None) -> None:
@@ -119,18 +120,9 @@ def weights_of(
         columns = [np.ones(len(d.boxes)), *(d.features[feature] for feature in FEATURES[seen])]
         rows.append(np.column_stack(columns)[wanted])
         truth.append(on_label[wanted])
-    weights = logistic_regression(np.concatenate(rows), np.concatenate(truth))
+    precision = np.r_[CONSTANT_PENALTY, np.full(len(FEATURES[seen]), PENALTY)]
+    weights = logistic_regression(np.concatenate(rows), np.concatenate(truth), precision)
     return dict(zip(("constant", *FEATURES[seen]), weights.round(2).tolist()))
-
-
-def logistic_regression(x: Array, y: Array) -> Array:
-    """Weights of the columns of `x` (N, K), the first of which is constant, for the log-odds of `y` (N,); Newton's method."""
-    penalty = np.r_[CONSTANT_PENALTY, np.full(x.shape[1] - 1, PENALTY)]
-    w = np.zeros(x.shape[1])
-    for _ in range(ITERATIONS):
-        p = 1 / (1 + np.exp(-x @ w))
-        w += np.linalg.solve((x * (p * (1 - p))[:, None]).T @ x + np.diag(penalty), x.T @ (y - p) - penalty * w)
-    return w
 
 
 def told_by_others(

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -26,7 +25,7 @@ from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, LidarModel
 from log2sim.synth.terrain import Road
 from log2sim.synth.traffic import TrafficObject, TrafficScene, draw_scene
-from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, TrafficRun, poses_of, run_of, stamps_of
+from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, poses_of, run_of, stamps_of
 from log2sim.synth.traffic_shapes import ROAD_USERS
 
 TARGET_M, TARGET_DEG, TARGET_S = 0.1, 0.3, 0.02
@@ -41,16 +40,16 @@ def main(first: int = 100, seeds: int = 4, lidars: list[str] = ["tilted16", "lev
     """Disturb the pole of each world in several ways and print what is left, over all delays, and what of that is not told."""
     rows = defaultdict(list)
     for kind, lidar, k in itertools.product(("street", "open"), lidars, range(seeds)):
-        world = draw_world(WorldSpec(kind, first + k, lidar, RATES_HZ[k % 4], RATES_HZ[(k + k // 4 + 1) % 4]))
+        true = draw_world(kind, first + k, lidar, (RATES_HZ[k % 4], RATES_HZ[(k + k // 4 + 1) % 4]))
         for noise, delay_s in itertools.product(NOISES, DELAYS_S):
             rng = np.random.default_rng([first + k, 0, *(round(100 * v) for v in noise)])
             # The poses of the ego err as registration expects them to, without which NEES would be too small.
-            log = disturbed(drifting(world.log, rng), POLE, *noise, delay_s, rng)
+            log = disturbed(drifting(true, rng), POLE, *noise, delay_s, rng)
             config = choose_detector(log, Config())
             found = register_road(log, config, select_sensors(log, config), progress=lambda *_: None)
-            kinds, left = {fault.kind for fault in found.faults}, np.abs(errors_of(found.log, world.log, POLE))
+            kinds, left = {fault.kind for fault in found.faults}, np.abs(errors_of(found.log, true, POLE))
             told = [kind in kinds for kind in ("unknown_road_pose", "unknown_road_clock", "wrong_road_pose")]
-            rows[f"{kind} {lidar}", noise].append([*left, *told, nees(found.units[0], log, world.log, delay_s)])
+            rows[f"{kind} {lidar}", noise].append([*left, *told, nees(found.units[0], log, true, delay_s)])
     table = []
     for (name, noise), figures in rows.items():
         away, turned, late, unknown, unknown_clock, left_out, squared = np.array(figures).T
@@ -78,62 +77,74 @@ TRAFFIC_SPEED_MPS = 1.0
 ALONG, STANDING_SHARE = 0.9, 0.1
 
 
-@dataclass(frozen=True)
-class WorldSpec:
-    """What a world is like.
+def draw_world(
+    kind: str, seed: int, road_lidar: str, rates_hz: tuple[float, float] = (10.0, 10.0), duration_s: float = 4.5, step_deg: float = 0.5
+) -> Log:  # fmt: skip
+    """Draw a log without errors: a vehicle with a LiDAR and a pole with another, at rates of their own.
 
-    `kind` in {"street", "open"}: with houses, fences, trees and parked vehicles as they are drawn; or a road with nothing but
-    moving traffic. `road_lidar`: "tilted16", "level32" or "level64". `azimuth_step_deg`: of all LiDARs; coarse ones are cast
-    faster.
+    `kind`: "street" with houses, fences, trees and parked vehicles as they are drawn, or "open", a road with nothing but moving traffic;
+    `road_lidar`: "tilted16", "level32" or "level64"; `step_deg` in azimuth of both: coarse ones are cast faster. Every sweep depends on
+    the seed and its index alone.
     """
-
-    kind: str = "street"
-    seed: int = 0
-    road_lidar: str = "tilted16"
-    vehicle_rate_hz: float = 10.0
-    road_rate_hz: float = 10.0
-    duration_s: float = 4.5
-    azimuth_step_deg: float = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """A log without errors."""
-
-    log: Log
-    spec: WorldSpec
-
-
-def draw_world(spec: WorldSpec) -> World:
-    """Draw a world; every sweep depends on the seed and its index alone."""
-    rng = np.random.default_rng([spec.seed, 15])
-    lidar = LIDAR_MODELS["hdl32e"].model_copy(
-        update={"azimuth_step_deg": spec.azimuth_step_deg, "rate_hz": spec.vehicle_rate_hz}
-    )
+    rng = np.random.default_rng([seed, 15])
+    step = {"azimuth_step_deg": step_deg}
+    lidar = LIDAR_MODELS["hdl32e"].model_copy(update={**step, "rate_hz": rates_hz[0]})
     scene = _draw_drive(lidar, rng)
-    if spec.kind == "open":
-        kept = tuple(
-            o for o in scene.objects if (o.category and o.speed_mps > TRAFFIC_SPEED_MPS) or o.kind == "own car"
-        )
-        scene = replace(scene, objects=kept)
-    run = run_of(scene, spec.duration_s + 0.5)
-    size, _ = ego_body = _car(rng)
+    if kind == "open":
+        moving = [o for o in scene.objects if (o.category and o.speed_mps > TRAFFIC_SPEED_MPS) or o.kind == "own car"]
+        scene = replace(scene, objects=tuple(moving))
+    run, (size, parts) = run_of(scene, duration_s + 0.5), ROAD_USERS["car"](rng)
+    while not 4.0 < size[0] < 5.0:
+        size, parts = ROAD_USERS["car"](rng)
     ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
-    lidars = {VEHICLE: Lidar(VEHICLE, "ego", ego_T_lidar)}
-    streams = {
-        VEHICLE: _stream(VEHICLE, spec.vehicle_rate_hz, spec.duration_s, 0.0, _ego_reader(run, lidar, spec.seed))
-    }
-    model, map_T_lidar = _pole(spec, scene, rng)
-    lidars[POLE] = Lidar(POLE, "map", map_T_lidar)
-    phase_s = float(rng.uniform(0, 1 / spec.road_rate_hz))
-    reader = _road_reader(run, ego_body, model, map_T_lidar, spec.seed + 1000)
-    streams[POLE] = _stream(POLE, spec.road_rate_hz, spec.duration_s, phase_s, reader)
-    t_pose = np.arange(int(np.ceil(spec.duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
-    log = Log(
-        name=f"{spec.kind}-{spec.seed}", format="synthetic", cameras={}, lidars=lidars, streams=streams,
+    model, map_T_pole = _pole(road_lidar, {**step, "rate_hz": rates_hz[1]}, scene, rng)
+    phase_s = float(rng.uniform(0, 1 / rates_hz[1]))
+
+    def of_vehicle(i: int, t_s: float) -> Sweep:
+        now = run.at(t_s)
+        return _sweep(now, lidar, now.sensor, now.objects, (seed, i), t_s)
+
+    def of_pole(i: int, t_s: float) -> Sweep:
+        """Cast a sweep in which the ego is one of the road users."""
+        now = run.at(t_s)
+        R, place = now.sensor.rotation, now.sensor.position_m
+        yaw, speed = float(np.arctan2(R[1, 0], R[0, 0])), float(np.hypot(*now.sensor.velocity_mps))
+        middle = place[:2] + 0.3 * np.array([np.cos(yaw), np.sin(yaw)])
+        ego = TrafficObject("car", np.append(middle, now.surface.elevation(middle)), yaw, size, parts, speed)
+        others = tuple(o for o in now.objects if o.kind != "own car")
+        sensor = SensorState(map_T_pole[:3, :3], map_T_pole[:3, 3], np.zeros(2))
+        sweep = _sweep(now, model, sensor, (*others, ego), (seed + 1000, i), t_s)
+        return replace(sweep, xyz_m=apply(inverse(map_T_pole), sweep.xyz_m), frame="lidar")
+
+    streams = {}
+    for name, cast, period_s, begin_s in (
+        (VEHICLE, of_vehicle, 1 / rates_hz[0], 0.0),
+        (POLE, of_pole, 1 / rates_hz[1], phase_s),
+    ):
+        middle_s = np.arange(period_s / 2 + begin_s, duration_s - period_s / 2, period_s)
+        read = lru_cache(maxsize=256)(lambda i, cast=cast, middle_s=middle_s: cast(i, float(middle_s[i])))
+        streams[name] = Stream(name, stamps_of(middle_s + period_s / 2), read)
+    t_pose = np.arange(int(np.ceil(duration_s * POSE_RATE_HZ)) + 1) / POSE_RATE_HZ
+    return Log(
+        name=f"{kind}-{seed}", format="synthetic", cameras={}, streams=streams,
+        lidars={VEHICLE: Lidar(VEHICLE, "ego", ego_T_lidar), POLE: Lidar(POLE, "map", map_T_pole)},
         ego=poses_of(run, ego_T_lidar, t_pose), ego_vehicle=EgoVehicle(size, REAR_AXLE_OFFSET_M),
     )  # fmt: skip
-    return World(log, spec)
+
+
+def _sweep(
+    now: TrafficScene, model: LidarModel, sensor: SensorState, objects: tuple[TrafficObject, ...], seed: tuple[int, int], t_s: float
+) -> Sweep:  # fmt: skip
+    """Cast a sweep whose middle is at a time, in the map; its stamp is its end."""
+    passes = np.random.default_rng([seed[0], 3]).uniform(0.3, 0.9, len(objects))
+    solids = [
+        Solid(o.parts, o.position_m, o.yaw_rad, o.speed_mps * np.array([np.cos(o.yaw_rad), np.sin(o.yaw_rad)]), glass_passes=float(p))
+        for o, p in zip(objects, passes)
+    ]  # fmt: skip
+    rng = np.random.default_rng([seed[0], 4, seed[1]])
+    returns = cast_polytopes(model, sensor, solids, now.surface, rng, now.returns)
+    (end_ns,) = stamps_of(np.array([t_s + 0.5 / model.rate_hz])).tolist()
+    return Sweep(end_ns, returns.xyz_m, "map", stamps_of(t_s + returns.t_s.astype(np.float64)))
 
 
 def _draw_drive(lidar: LidarModel, rng: np.random.Generator) -> TrafficScene:
@@ -149,14 +160,7 @@ def _draw_drive(lidar: LidarModel, rng: np.random.Generator) -> TrafficScene:
         return replace(scene, objects=tuple(own), sensor=replace(scene.sensor, velocity_mps=speed * forward))
 
 
-def _car(rng: np.random.Generator) -> tuple[tuple[float, float, float], tuple]:
-    while True:
-        size, parts = ROAD_USERS["car"](rng)
-        if 4.0 < size[0] < 5.0:
-            return size, parts
-
-
-def _pole(spec: WorldSpec, scene: TrafficScene, rng: np.random.Generator) -> tuple[LidarModel, Array]:
+def _pole(name: str, step: dict[str, float], scene: TrafficScene, rng: np.random.Generator) -> tuple[LidarModel, Array]:
     """Place a LiDAR beside the main road, ahead of the vehicle."""
     road: Road = scene.roads[0]
     heading = np.arctan2(*scene.sensor.rotation[1::-1, 0])
@@ -168,77 +172,15 @@ def _pole(spec: WorldSpec, scene: TrafficScene, rng: np.random.Generator) -> tup
         if all(np.hypot(*(o.position_m[:2] - xy)) > 1.5 for o in scene.objects):
             break
     towards = direction - side * np.pi / 2 + rng.uniform(-0.6, 0.6)
-    step = {"azimuth_step_deg": spec.azimuth_step_deg, "rate_hz": spec.road_rate_hz}
-    if spec.road_lidar == "tilted16":
+    if name == "tilted16":
         model = LIDAR_MODELS["rslidar16-roadside"].model_copy(update=step)
         height, pitch = 3.6 + rng.normal(0, 0.1), np.deg2rad(model.pitch_deg + rng.normal(0, 0.6))
     else:
-        lines = int(spec.road_lidar.removeprefix("level"))
-        elevation = tuple(np.linspace(-25, 10, lines).tolist())
+        elevation = tuple(np.linspace(-25, 10, int(name.removeprefix("level"))).tolist())
         model = LIDAR_MODELS["vlp16"].model_copy(update={**step, "elevation_deg": elevation, "noise_m": 0.02})
         height, pitch = 3.0 + rng.normal(0, 0.1), np.deg2rad(rng.normal(0, 0.6))
     z = scene.surface.elevation(xy) + height
-    rotation = rotation_from_rpy(np.deg2rad(rng.normal(0, 0.6)), pitch, towards)
-    return model, transform(rotation, np.array([*xy, z]))
-
-
-def _stream(
-    name: str, rate_hz: float, duration_s: float, phase_s: float, cast: Callable[[int, float], Sweep]
-) -> Stream:
-    """Make a stream whose stamps are the ends of sweeps."""
-    period = 1.0 / rate_hz
-    middle = np.arange(period / 2 + phase_s, duration_s - period / 2, period)
-    t_ns = stamps_of(middle + period / 2)
-
-    @lru_cache(maxsize=256)
-    def read(i: int) -> Sweep:
-        return cast(i, float(middle[i]))
-
-    return Stream(name, t_ns, read)
-
-
-def _solids(objects: tuple[TrafficObject, ...], seed: int) -> list[Solid]:
-    rng = np.random.default_rng([seed, 3])
-    passes = rng.uniform(0.3, 0.9, len(objects))
-    return [
-        Solid(o.parts, o.position_m, o.yaw_rad, o.speed_mps * np.array([np.cos(o.yaw_rad), np.sin(o.yaw_rad)]), glass_passes=float(p))
-        for o, p in zip(objects, passes)
-    ]  # fmt: skip
-
-
-def _ego_reader(run: TrafficRun, model: LidarModel, seed: int) -> Callable[[int, float], Sweep]:
-    period = 1 / model.rate_hz
-
-    def cast(i: int, t_s: float) -> Sweep:
-        now = run.at(t_s)
-        rng = np.random.default_rng([seed, 4, i])
-        returns = cast_polytopes(model, now.sensor, _solids(now.objects, seed), now.surface, rng, now.returns)
-        t_ns = stamps_of(t_s + returns.t_s.astype(np.float64))
-        return Sweep(int(stamps_of(np.array([t_s + period / 2]))[0]), returns.xyz_m, "map", t_ns)
-
-    return cast
-
-
-def _road_reader(
-    run: TrafficRun, body: tuple[tuple[float, float, float], tuple], model: LidarModel, map_T_lidar: Array, seed: int
-) -> Callable[[int, float], Sweep]:
-    period, lidar_T_map = 1 / model.rate_hz, inverse(map_T_lidar)
-
-    def cast(i: int, t_s: float) -> Sweep:
-        now = run.at(t_s)
-        objects = [o for o in now.objects if o.kind != "own car"]
-        R, place = now.sensor.rotation, now.sensor.position_m
-        yaw, speed = float(np.arctan2(R[1, 0], R[0, 0])), float(np.hypot(*now.sensor.velocity_mps))
-        middle = place[:2] + 0.3 * np.array([np.cos(yaw), np.sin(yaw)])
-        floor = now.surface.elevation(middle)
-        objects.append(TrafficObject("car", np.append(middle, floor), yaw, body[0], body[1], speed))
-        sensor = SensorState(map_T_lidar[:3, :3], map_T_lidar[:3, 3], np.zeros(2))
-        rng = np.random.default_rng([seed, 4, i])
-        returns = cast_polytopes(model, sensor, _solids(tuple(objects), seed), now.surface, rng, now.returns)
-        t_ns = stamps_of(t_s + returns.t_s.astype(np.float64))
-        return Sweep(int(stamps_of(np.array([t_s + period / 2]))[0]), apply(lidar_T_map, returns.xyz_m), "lidar", t_ns)
-
-    return cast
+    return model, transform(rotation_from_rpy(np.deg2rad(rng.normal(0, 0.6)), pitch, towards), np.array([*xy, z]))
 
 
 def drifting(log: Log, rng: np.random.Generator) -> Log:
@@ -252,27 +194,27 @@ def drifting(log: Log, rng: np.random.Generator) -> Log:
     return replace_poses(log, replace(log.ego, map_T_ego=log.ego.map_T_ego @ off))
 
 
+def remounted(log: Log, pole: str, mount: Array) -> Log:
+    """Put a LiDAR of the roadside elsewhere."""
+    return log.changed(lidars={**log.lidars, pole: replace(log.lidars[pole], mount_T_lidar=mount)})
+
+
 def misplaced(log: Log, pole: str, shift_m: float, turn_deg: float) -> Log:
-    """Put a LiDAR of the roadside elsewhere on the ground and turn it about the vertical, as by a wrong entry in a table."""
+    """Shift a LiDAR of the roadside on the ground and turn it about the vertical, as by a wrong entry in a table."""
     mount = log.lidars[pole].mount_T_lidar
-    turn = transform(rotation_from_rpy(0.0, 0.0, np.radians(turn_deg)), np.zeros(3)) @ mount
-    turn[:3, 3] = mount[:3, 3] + [shift_m, 0.0, 0.0]
-    return log.changed(lidars={**log.lidars, pole: replace(log.lidars[pole], mount_T_lidar=turn)})
+    turn = rotation_from_rpy(0.0, 0.0, np.radians(turn_deg)) @ mount[:3, :3]
+    return remounted(log, pole, transform(turn, mount[:3, 3] + [shift_m, 0.0, 0.0]))
 
 
 def disturbed(log: Log, pole: str, shift_m: float, turn_deg: float, delay_s: float, rng: np.random.Generator) -> Log:
     """Move and turn a LiDAR of the roadside in a random direction, and let its stamps be late."""
-    shift, axis = rng.normal(size=3), rng.normal(size=3)
-    twist = np.concatenate(
-        [shift_m * shift / np.linalg.norm(shift), np.radians(turn_deg) * axis / np.linalg.norm(axis)]
+    shift, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    error, mount = (
+        exp_of(np.concatenate([shift_m * shift, np.radians(turn_deg) * axis])),
+        log.lidars[pole].mount_T_lidar,
     )
-    mount = log.lidars[pole].mount_T_lidar
-    wrong = mount.copy()
-    error = exp_of(twist)
-    wrong[:3, :3], wrong[:3, 3] = error[:3, :3] @ mount[:3, :3], mount[:3, 3] + error[:3, 3]
-    lidars = {**log.lidars, pole: replace(log.lidars[pole], mount_T_lidar=wrong)}
-    streams = {**log.streams, pole: shift_stream(log.streams[pole], round(delay_s * NS_PER_S))}
-    return log.changed(lidars=lidars, streams=streams)
+    log = remounted(log, pole, transform(error[:3, :3] @ mount[:3, :3], mount[:3, 3] + error[:3, 3]))
+    return log.changed(streams={**log.streams, pole: shift_stream(log.streams[pole], round(delay_s * NS_PER_S))})
 
 
 def errors_of(log: Log, true: Log, pole: str) -> tuple[float, float, float]:

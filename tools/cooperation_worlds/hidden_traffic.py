@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -58,40 +58,63 @@ class HiddenTraffic:
     ego_size: tuple[float, float, float]
     late_s: float  # of the pole's sweeps after those of the vehicle
 
-    def vehicle_returns(self, t_s: float, index: int) -> Returns:
-        """Cast the vehicle's sweep whose middle is at a time."""
-        return self.run.at(t_s).cast(np.random.default_rng([self.seed, 4, index]))
+    def middle_s(self, name: str, index: int) -> float:
+        """The time of the middle of a LiDAR's sweep."""
+        return PERIOD_S * (index + 0.5) + (self.late_s if name == ROAD_LIDAR else 0.0)
 
-    def road_returns(self, t_s: float, index: int) -> Returns:
-        """Cast the pole's sweep; the ego is the last of the objects."""
-        scene, rng = self.run.at(t_s), np.random.default_rng([self.seed, 7, index])
-        solids = [_solid(o.parts, o.position_m, o.yaw_rad, o.speed_mps) for o in scene.objects if o.kind != "own car"]
-        ahead = scene.sensor.rotation[:2, 0] / np.hypot(*scene.sensor.rotation[:2, 0])
-        middle = scene.sensor.position_m[:2] + (REAR_AXLE_OFFSET_M - REAR_AXLE_TO_LIDAR_M) * ahead
-        floor = np.append(middle, scene.surface.elevation(middle))
-        yaw = float(np.arctan2(ahead[1], ahead[0]))
-        solids.append(_solid(self.ego_parts, floor, yaw, float(np.hypot(*scene.sensor.velocity_mps))))
-        return cast_polytopes(self.pole, self.place, solids, scene.surface, rng, scene.returns)
+    @cached_property
+    def log(self) -> Log:
+        """The log of all sweeps."""
+        height = float(self.run.scene.sensor.position_m[2])
+        ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, height]))
+        map_T_pole = transform(self.place.rotation, self.place.position_m)
+
+        def sweep(name: str, index: int) -> Sweep:
+            r, (middle_ns,) = returns_of(self, name, index), stamps_of(np.array([self.middle_s(name, index)])).tolist()
+            t_ns = middle_ns + np.rint(r.t_s.astype(np.float64) * NS_PER_S).astype(np.int64)
+            end_ns = int(middle_ns + PERIOD_S / 2 * NS_PER_S)
+            if name == VEHICLE_LIDAR:
+                return Sweep(end_ns, r.xyz_m, "map", t_ns)
+            local = ((r.xyz_m - map_T_pole[:3, 3]) @ map_T_pole[:3, :3]).astype(np.float32)
+            return Sweep(end_ns, local, "lidar", t_ns)
+
+        streams = {}
+        for name in (VEHICLE_LIDAR, ROAD_LIDAR):
+            sweeps = [sweep(name, index) for index in range(SWEEPS)]
+            streams[name] = Stream(name, np.array([s.stamp_ns for s in sweeps]), sweeps.__getitem__)
+        return Log(
+            name=f"hidden_traffic_{self.seed}", format="synthetic", cameras={}, streams=streams,
+            lidars={VEHICLE_LIDAR: Lidar(VEHICLE_LIDAR, "ego", ego_T_lidar), ROAD_LIDAR: Lidar(ROAD_LIDAR, "map", map_T_pole)},
+            ego=poses_of(self.run, ego_T_lidar, np.arange(-0.1, SWEEPS * PERIOD_S + 0.2, 0.02)),
+            ego_vehicle=EgoVehicle(self.ego_size, REAR_AXLE_OFFSET_M),
+        )  # fmt: skip
 
 
-def _solid(parts: Parts, position: Array, yaw: float, speed: float) -> Solid:
-    return Solid(parts, position, yaw, speed * np.array([np.cos(yaw), np.sin(yaw)]))
+@lru_cache(maxsize=2 * SWEEPS)
+def returns_of(traffic: HiddenTraffic, name: str, index: int) -> Returns:
+    """Cast a sweep of a LiDAR; the ego is the last of the objects that the pole sees."""
+    scene = traffic.run.at(traffic.middle_s(name, index))
+    if name == VEHICLE_LIDAR:
+        return scene.cast(np.random.default_rng([traffic.seed, 4, index]))
+    ahead = scene.sensor.rotation[:2, 0] / np.hypot(*scene.sensor.rotation[:2, 0])
+    middle = _ego_xy(scene)
+    floor, yaw = np.append(middle, scene.surface.elevation(middle)), float(np.arctan2(ahead[1], ahead[0]))
+    users = [(o.parts, o.position_m, o.yaw_rad, o.speed_mps) for o in scene.objects if o.kind != "own car"]
+    users.append((traffic.ego_parts, floor, yaw, float(np.hypot(*scene.sensor.velocity_mps))))
+    solids = [Solid(parts, at, turn, pace * np.array([np.cos(turn), np.sin(turn)])) for parts, at, turn, pace in users]
+    rng = np.random.default_rng([traffic.seed, 7, index])
+    return cast_polytopes(traffic.pole, traffic.place, solids, scene.surface, rng, scene.returns)
 
 
-def draw(seed: int) -> SeenTraffic:
+def draw(seed: int) -> HiddenTraffic:
     """Draw a scene in which many vehicles hide from the LiDAR of the one that records, and a pole that may see them."""
     for attempt in range(MAX_TRIES):
         traffic = drawn(seed, attempt)
-        # The first sweep of each end alone decides, without a log.
-        first = {
-            VEHICLE_LIDAR: [traffic.vehicle_returns(PERIOD_S / 2, 0)],
-            ROAD_LIDAR: [traffic.road_returns(PERIOD_S / 2, 0)],
-        }
-        one = SeenTraffic(traffic, Log("", "", {}, {}, {}, None), first)
-        truth, hidden = truth_at(one, START_NS + round(PERIOD_S * NS_PER_S), "vehicle")
+        # The first sweep of each end decides, as if they were cast at once.
+        truth, hidden = truth_at(replace(traffic, late_s=0.0), START_NS + round(PERIOD_S * NS_PER_S), "vehicle")
         counted = ~truth.ignored
         if (hidden & counted).sum() >= MIN_HIDDEN_SHARE * max(counted.sum(), MIN_COUNTED):
-            return seen(traffic)
+            return traffic
     raise RuntimeError(f"hidden traffic, seed {seed}: none of {MAX_TRIES} scenes hides enough vehicles")
 
 
@@ -120,62 +143,22 @@ def drawn(seed: int, attempt: int) -> HiddenTraffic:
     return HiddenTraffic(seed, run, pole, place, parts, size, float(rng.uniform(0, 0.05)))
 
 
-@dataclass(frozen=True, eq=False)
-class SeenTraffic:
-    """A log of hidden traffic, and the returns of its sweeps."""
-
-    traffic: HiddenTraffic
-    log: Log
-    returns: dict[str, list[Returns]]
-
-
-def seen(traffic: HiddenTraffic) -> SeenTraffic:
-    """Cast all sweeps and make the log."""
-    middles = PERIOD_S * (np.arange(SWEEPS) + 0.5)
-    returns = {
-        VEHICLE_LIDAR: [traffic.vehicle_returns(float(t), i) for i, t in enumerate(middles)],
-        ROAD_LIDAR: [traffic.road_returns(float(t), i) for i, t in enumerate(middles + traffic.late_s)],
-    }
-    scene = traffic.run.scene
-    ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
-    map_T_pole = transform(traffic.place.rotation, traffic.place.position_m)
-    stamps = {VEHICLE_LIDAR: stamps_of(middles), ROAD_LIDAR: stamps_of(middles + traffic.late_s)}
-    streams = {}
-    for name, all_returns in returns.items():
-        sweeps = []
-        for middle, r in zip(stamps[name], all_returns):
-            local = ((r.xyz_m - map_T_pole[:3, 3]) @ map_T_pole[:3, :3]).astype(np.float32)
-            xyz, frame = (r.xyz_m, "map") if name == VEHICLE_LIDAR else (local, "lidar")
-            t_ns = middle + np.rint(r.t_s.astype(np.float64) * NS_PER_S).astype(np.int64)
-            sweeps.append(Sweep(int(middle + PERIOD_S / 2 * NS_PER_S), xyz, frame, t_ns))  # type: ignore[arg-type]
-        streams[name] = Stream(name, np.array([s.stamp_ns for s in sweeps]), sweeps.__getitem__)
-    t_s = np.arange(-0.1, SWEEPS * PERIOD_S + 0.2, 0.02)
-    lidars = {
-        VEHICLE_LIDAR: Lidar(VEHICLE_LIDAR, "ego", ego_T_lidar), ROAD_LIDAR: Lidar(ROAD_LIDAR, "map", map_T_pole),
-    }  # fmt: skip
-    log = Log(
-        name=f"hidden_traffic_{traffic.seed}", format="synthetic", cameras={}, lidars=lidars, streams=streams,
-        ego=poses_of(traffic.run, ego_T_lidar, t_s), ego_vehicle=EgoVehicle(traffic.ego_size, REAR_AXLE_OFFSET_M),
-    )  # fmt: skip
-    return SeenTraffic(traffic, log, returns)
-
-
-def points_of(view: SeenTraffic, name: str, index: int) -> NDArray[np.int64]:
+def points_of(view: HiddenTraffic, name: str, index: int) -> NDArray[np.int64]:
     """Number of points (M,) of a sweep on each object of the scene."""
-    objects = view.traffic.run.scene.objects
+    objects = view.run.scene.objects
     keep = [k for k, o in enumerate(objects) if name == VEHICLE_LIDAR or o.kind != "own car"]
-    hit = view.returns[name][index].hit
+    hit = returns_of(view, name, index).hit
     count = np.bincount(hit[(hit >= 0) & (hit < len(keep))], minlength=len(keep))
     out = np.zeros(len(objects), np.int64)
     out[keep] = count[: len(keep)]
     return out
 
 
-def truth_at(view: SeenTraffic, stamp_ns: int, kind: str) -> tuple[SceneBoxes, NDArray[np.bool_]]:
+def truth_at(view: HiddenTraffic, stamp_ns: int, kind: str) -> tuple[SceneBoxes, NDArray[np.bool_]]:
     """True boxes of a kind at the middle of a sweep that ends at a stamp, and which of them hide from the vehicle."""
     middle_s = (stamp_ns - START_NS) / NS_PER_S - PERIOD_S / 2
     index = int(np.clip(np.floor(middle_s / PERIOD_S), 0, SWEEPS - 1))
-    scene = view.traffic.run.at(middle_s)
+    scene = view.run.at(middle_s)
     vehicle, road = (points_of(view, name, index) for name in (VEHICLE_LIDAR, ROAD_LIDAR))
     rows = [k for k, o in enumerate(scene.objects) if _is(o.category, kind)]
     of = [scene.objects[k] for k in rows]
@@ -187,14 +170,14 @@ def truth_at(view: SeenTraffic, stamp_ns: int, kind: str) -> tuple[SceneBoxes, N
     return SceneBoxes.of(boxes, range_m=away, ignored=few | (away > REACH_M)), vehicle[rows] < MIN_POINTS
 
 
-def found_at(view: SeenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> SceneBoxes:
+def found_at(view: HiddenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> SceneBoxes:
     """Found boxes of a kind, each moved with the object that it is nearest to from its own time to the middle of the sweep."""
     middle_s = (stamp_ns - START_NS) / NS_PER_S - PERIOD_S / 2
-    now = view.traffic.run.at(middle_s)
+    now = view.run.at(middle_s)
     users = [k for k, o in enumerate(now.objects) if o.category]
     boxes = np.column_stack([found.center_m, found.size_m, found.yaw_rad])
     for row, t_ns in enumerate(found.t_ns):
-        then = _at(view.traffic.run, (int(t_ns) - START_NS) / NS_PER_S)
+        then = _at(view.run, (int(t_ns) - START_NS) / NS_PER_S)
         if users:
             k = min(users, key=lambda k: float(np.hypot(*(then.objects[k].position_m - boxes[row, :3])[:2])))
             boxes[row, :3] += now.objects[k].position_m - then.objects[k].position_m
@@ -209,12 +192,12 @@ def found_at(view: SeenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> Sce
 BoxesOfSweep = dict[str, tuple[SceneBoxes, SceneBoxes, NDArray[np.bool_]]]
 
 
-def measured(view: SeenTraffic, log: Log, way: str) -> list[BoxesOfSweep]:
+def measured(view: HiddenTraffic, log: Log, way: str) -> list[BoxesOfSweep]:
     """Boxes of each sweep beside the true ones, of all road users that both ends together have points of."""
     return sweeps(view, *detect(log, way, min_score=MIN_SCORE))
 
 
-def sweeps(view: SeenTraffic, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> list[BoxesOfSweep]:
+def sweeps(view: HiddenTraffic, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> list[BoxesOfSweep]:
     """Boxes of each sweep beside the true ones."""
     return [
         {kind: (found_at(view, t, found, kind), *truth_at(view, t, kind)) for kind in KINDS}
@@ -244,7 +227,7 @@ def figures(rows: dict[str, list[BoxesOfSweep]]) -> dict[str, Any]:
     return {"ap": ap, "recall": recall, "vehicles": count, "hidden_from_vehicle": share}
 
 
-def table(_: Sequence[SeenTraffic], rows: dict[str, list[BoxesOfSweep]]) -> str:
+def table(_: Sequence[HiddenTraffic], rows: dict[str, list[BoxesOfSweep]]) -> str:
     """The figures, by way."""
     found = figures(rows)
     lines = [[kind, *(cell(ap[w] and 100 * ap[w], 1) for w in rows)] for kind, ap in found["ap"].items()]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ from log2sim.geometry import (
     Array,
     PoseTrack,
     apply,
+    box_iou,
     inverse,
     nearest_index,
     rotation_from_rpy,
@@ -168,7 +169,7 @@ class SimulatedDetector:
             # Two objects in one box, for the whole log.
             for j in range(k):
                 both = np.random.default_rng([self._seed, 3, *sorted((name, names[j]))])
-                if categories[j] == categories[k] and _iou(boxes[j], boxes[k]) > 0.15 and both.random() < 0.08:
+                if categories[j] == categories[k] and box_iou(boxes[j], boxes[k])[0, 0] > 0.15 and both.random() < 0.08:
                     boxes[j] = np.append(np.minimum(boxes[j][:2], boxes[k][:2]), np.maximum(boxes[j][2:], boxes[k][2:]))
                     gone.add(k)
         rows: list[tuple[Array, str, float]] = []
@@ -272,34 +273,19 @@ class MistakenDetector:
                 level_m = float(forward @ (cloud.origin + cloud.sensor - at))
                 at = at + float(np.clip(level_m, -reach_m - along, reach_m - along)) * forward
             center, own = at + rng.normal(0, 0.25) * forward, size * np.exp(rng.normal(0, 0.06, 3))
-            turned, score = (
-                yaw + np.pi * rng.integers(2) + rng.normal(0, 0.03),
-                probability_of(odds + rng.normal(0, SWEEP_ODDS)),
-            )
-            category = str(categories[int(rng.random() < 0.2)])
-            points = points_of_boxes(
-                cloud.xyz, (center - cloud.origin)[None], own[None], np.array([turned]), ~cloud.ground
-            ).count
-            if (
-                score >= MIN_SCORE
-                and points[0] >= MIN_SEEN_IN_BOX
-                and not (np.hypot(*(found.center_m - center)[:, :2].T) < 2).any()
-            ):
-                rows.append((center, own, wrap_angle(turned), rng.uniform(0.5, 0.8), category, score, points[0]))
+            turned = yaw + np.pi * rng.integers(2) + rng.normal(0, 0.03)
+            score = probability_of(odds + rng.normal(0, SWEEP_ODDS))
+            category, box = str(categories[int(rng.random() < 0.2)]), (center - cloud.origin, own, turned)
+            (points,) = points_of_boxes(cloud.xyz, *(np.array([v]) for v in box), ~cloud.ground).count
+            known = (np.hypot(*(found.center_m - center)[:, :2].T) < 2).any()
+            if score >= MIN_SCORE and points >= MIN_SEEN_IN_BOX and not known:
+                rows.append((center, own, wrap_angle(turned), rng.uniform(0.5, 0.8), category, score, points))
         if not rows:
             return found
         center, own, yaw, heading, category, score, points = (np.array(column) for column in zip(*rows))
         stamps = np.full(len(rows), cloud.stamp_ns)
         mistaken = Boxes3D(stamps, center, own, yaw, heading, category.astype("<U16"), score, points)
-        names = [f.name for f in fields(Boxes3D) if f.name != "seen_by"]
-        return Boxes3D(*(np.concatenate([getattr(found, name), getattr(mistaken, name)]) for name in names))
-
-
-def _iou(a: Array, b: Array) -> float:
-    w, h = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
-    if w <= 0 or h <= 0:
-        return 0.0
-    return float(w * h / ((a[2:] - a[:2]).prod() + (b[2:] - b[:2]).prod() - w * h))
+        return Boxes3D.join([found, mistaken])
 
 
 def seen_from(log: Log, true: PoseTrack | None, t_ns: int) -> Array:

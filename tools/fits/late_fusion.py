@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.logistic import logistic_regression
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Boxes3D, Measurements, Scenario
 from log2sim.geometry import NS_PER_S, Array
@@ -67,18 +68,6 @@ def _features(boxes: Boxes3D, images: Measurements, pairs: Pairs, truth: Scenari
     return x, right
 
 
-def fit(x: Array, right: NDArray[np.bool_]) -> Array:
-    """Find the most likely weights (4,) for features (P, 4) of pairs that are right or wrong (P,)."""
-    from scipy.optimize import minimize
-
-    prior = np.array(list(vars(PAIR_WEIGHTS).values()))
-
-    def loss(w: Array) -> float:
-        return float(loss_of(x, right, w) + (((w - prior) / PRIOR_SIGMA) ** 2).sum() / 2)
-
-    return np.asarray(minimize(loss, prior, method="BFGS").x)
-
-
 def loss_of(x: Array, right: NDArray[np.bool_], w: Array) -> float:
     """Negative log-likelihood of weights (4,)."""
     return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (x @ w)).sum())
@@ -87,7 +76,8 @@ def loss_of(x: Array, right: NDArray[np.bool_], w: Array) -> float:
 def main(scenes: list[Path], images: str = "ssd-mobilenet-v2", sweeps: str = "lidar:vehicle", seed: int = 1) -> None:
     """Print the weights for a detector in images and one in sweeps."""
     x, right = (np.concatenate(part) for part in zip(*(pairs_of(scene, images, sweeps, seed) for scene in scenes)))
-    before, weights = np.array(list(vars(PAIR_WEIGHTS).values())), fit(x, right)
+    before = np.array(list(vars(PAIR_WEIGHTS).values()))
+    weights = logistic_regression(x, right, PRIOR_SIGMA**-2, before)
     print(f"{len(x)} pairs, {int(right.sum())} right; seed {seed}")
     for name, w in (("independent", before), ("fitted", weights)):
         print(f"{name:12s} loss a pair {loss_of(x, right, w) / max(len(x), 1):.4f}")

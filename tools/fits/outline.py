@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fits.logistic import logistic_regression
 from log2sim.agents.heading import HEIGHT_CELLS, Outline, outline_of
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import rotation_from_rpy
@@ -120,16 +121,6 @@ def measured(seen: Seen, rng: np.random.Generator) -> Outline | None:
     )
 
 
-def fit(rows: np.ndarray) -> np.ndarray:
-    """Fit a logistic regression to rows of which all are right by Newton's method."""
-    weights = np.zeros(rows.shape[1])
-    for _ in range(25):
-        wrong = probability_of(-rows @ weights)
-        hessian = (rows * (wrong * (1 - wrong))[:, None]).T @ rows + RIDGE * np.eye(len(weights))
-        weights += np.linalg.solve(hessian, rows.T @ wrong - RIDGE * weights)
-    return weights
-
-
 def report(name: str, odds: np.ndarray) -> None:
     """Print the share that is right by the probability that the log-odds state."""
     stated = probability_of(np.abs(odds))
@@ -157,7 +148,8 @@ def main(vehicles: int = 4000, test: int = 500) -> None:
                 found[outline.kind].append(outline.features)
             elif outline is not None:
                 tests.append(outline)
-    weights = {kind: fit(np.array(rows)) for kind, rows in found.items()}
+    # All rows are right: their features are those of the true direction less those of the other.
+    weights = {kind: logistic_regression(np.array(rows), 1.0, RIDGE) for kind, rows in found.items()}
     for kind, name in NAMES.items():
         report(name, np.array([o.features @ weights[kind] for o in tests if o.kind == kind]))
     for kind, name in NAMES.items():

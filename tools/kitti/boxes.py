@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import VEHICLE, Measurements, seen_from
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, apply, box_corners, inverse, rectangle_overlap, rotation_from_quaternion, transform
 from log2sim.logs.kitti import labels
 
@@ -36,7 +35,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
+class Boxes(Columns):
     """3D boxes (N,) of one sequence, one row a box and frame, in the rectified camera's frame (x right, y down, z forward).
 
     `frame`, `track_id` (N,) int64, `category` (N,) str as KITTI spells it, `truncation`, `occlusion` (N,), `alpha` (N,)
@@ -55,18 +54,6 @@ class Boxes:
     bottom_m: Array
     yaw_rad: Array
     score: Array
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    def take(self, index: Any) -> Boxes:
-        """The rows at `index` (integers or a mask)."""
-        return Boxes(*(getattr(self, f.name)[index] for f in fields(self)))
-
-    @classmethod
-    def join(cls, parts: Sequence[Boxes]) -> Boxes:
-        """Rows of several sets, one after the other."""
-        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))
 
 
 def read_detections(path: Path) -> Boxes:

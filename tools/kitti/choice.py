@@ -59,7 +59,7 @@ def choose(described: Described, *, online: bool) -> Boxes:
     keep, score = _people(described, online=online)
     keep_car, score_car = _cars(described, online=online)
     keep = np.where(car, keep_car, keep)
-    told = Boxes(**{**vars(described.boxes), "score": np.where(car, score_car, score)}).take(keep)
+    told = replace(described.boxes, score=np.where(car, score_car, score)).take(keep)
     return told.take(np.lexsort([told.track_id, told.frame]))
 
 
@@ -148,8 +148,9 @@ class Described:
 
 def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *, online: bool) -> Described:
     """Boxes of the camera and features of all rows that it can see, given by track and frame; online no later frame is used."""
-    columns = {**vars(boxes.take(rows.model)), "frame": rows.frame, "track_id": rows.track, "category": rows.category}
-    out = Boxes(**(columns | from_map(*smooth_shapes(rows, boxes, measurements, online=online), rows.frame, view)))
+    told = {"frame": rows.frame, "track_id": rows.track, "category": rows.category}
+    in_camera = from_map(*smooth_shapes(rows, boxes, measurements, online=online), rows.frame, view)
+    out = replace(boxes.take(rows.model), **told, **in_camera)
     # In the image the detector knows better than a box around a box.
     (predicted,) = (rows.source < 0).nonzero()
     out.box_px[predicted] = project(out.take(predicted), view.P)

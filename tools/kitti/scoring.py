@@ -11,7 +11,7 @@ of its scores; MOTA and the counts are those at the threshold with the highest M
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -119,14 +119,13 @@ def make_scene(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], catego
 
 
 def _shifted(boxes: Boxes, begin: int, sequence: int) -> Boxes:
-    columns = {**vars(boxes), "frame": boxes.frame + begin, "track_id": boxes.track_id + sequence * 10_000_000}
-    return Boxes(**columns)
+    return replace(boxes, frame=boxes.frame + begin, track_id=boxes.track_id + sequence * 10_000_000)
 
 
 def _in_order(boxes: Boxes) -> Boxes:
     boxes = boxes.take(np.lexsort([boxes.track_id, boxes.frame]))
     _, index = np.unique(boxes.track_id, return_inverse=True)
-    return Boxes(**{**vars(boxes), "track_id": index.astype(np.int64)})
+    return replace(boxes, track_id=index.astype(np.int64))
 
 
 class Matcher:

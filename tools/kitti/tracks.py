@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kitti.boxes import PERIOD_NS, Boxes, Index, Mask
 from log2sim.datatypes import GROUP_OF, Measurements, Track
+from log2sim.files.arrays import Columns
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.tracking.forward import (
     ACCELERATION_MPS2,
@@ -33,7 +34,7 @@ SCALE = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(Columns):
     """Boxes of tracks (N,)."""
 
     frame: Index  # (N,)
@@ -42,10 +43,6 @@ class Rows:
     model: Index  # (N,): row of the detection that tells size, height and heading
     xy_m: Array  # (N, 2): center in the map
     category: NDArray[np.str_]  # (N,)
-
-    def take(self, index: NDArray[np.generic]) -> Rows:
-        """The rows at `index`."""
-        return Rows(*(column[index] for column in vars(self).values()))
 
 
 def rows_online(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
@@ -176,7 +173,7 @@ def _mean_of_track(values: Array, weight: Array, begin: Index, *, online: bool) 
 
 
 @dataclass(frozen=True, eq=False)
-class Paths:
+class Paths(Columns):
     """Smoothed states, one row a track and tick, sorted by track."""
 
     track: Index  # (N,)
@@ -210,10 +207,8 @@ def smooth_paths(tracks: Sequence[Track], t_ns: Index, beyond: Index) -> Paths:
     origin, later = origin[there], tick[origin[there]] + step[there]
     dt_s = (t_ns[later] - t_ns[tick[origin]]) / NS_PER_S
     predicted = predict(paths.mean[origin], paths.covariance[origin], dt_s, noise[track[origin]])
-    more = (track[origin], later, np.full(len(later), -1), *predicted)
-    columns = [np.concatenate(both) for both in zip(vars(paths).values(), more)]
-    order = np.lexsort([columns[1], columns[0]])
-    return Paths(*(column[order] for column in columns))
+    paths = Paths.join([paths, Paths(track[origin], later, np.full(len(later), -1), *predicted)])
+    return paths.take(np.lexsort([paths.tick, paths.track]))
 
 
 def _smoothed(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from fits.logistic import logistic_regression
 from torch import Tensor, nn
 
 from lidar_training.clouds import Example
@@ -36,7 +37,7 @@ RIGHT = {
 MIN_SCORE = 0.1
 # Of the largest value; half floats have 11 bits.
 MAX_EXPORT_ERROR, MAX_HALVED_ERROR = 1e-4, 2e-3
-RIDGE = 1e-3
+RIDGE = 1e-3  # a box, which keeps the weights of rare groups finite
 RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
 
 
@@ -197,7 +198,11 @@ def calibrate(path: Path, examples: list[Example]) -> dict[str, list[float]]:
             counted = matches.right | matches.false
             features[group].append(columns[own][counted])
             right[group].append(matches.right[counted])
-    return {g: logistic(np.concatenate(features[g]), np.concatenate(right[g])).tolist() for g in GROUPS}
+    weights = {}
+    for group in GROUPS:
+        x, y = np.concatenate(features[group]), np.concatenate(right[group])
+        weights[group] = logistic_regression(x, y, RIDGE * max(len(y), 1), RAW_CALIBRATION).round(5).tolist()
+    return weights
 
 
 def group_of(boxes: SceneBoxes, group: str) -> SceneBoxes:
@@ -214,23 +219,6 @@ def _raw_boxes(detector: NetworkDetector, example: Example) -> tuple[SceneBoxes,
     some = np.flatnonzero(points > 0)
     table = SceneBoxes.of(rows, names, 1 / (1 + np.exp(-boxes.heat)), points=points)
     return table.take(some), found.terms.T[some]
-
-
-def logistic(features: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Fit a logistic regression by Newton's method, with a ridge that keeps rare groups finite."""
-    weights = np.array(RAW_CALIBRATION)
-    prior = weights.copy()
-    if not len(right):
-        return weights
-    for _ in range(30):
-        p = 1 / (1 + np.exp(-np.clip(features @ weights, -30, 30)))
-        gradient = features.T @ (p - right) / len(right) + RIDGE * (weights - prior)
-        hessian = (features * (p * (1 - p))[:, None]).T @ features / len(right) + RIDGE * np.eye(len(weights))
-        step = np.linalg.solve(hessian, gradient)
-        weights = weights - step
-        if np.abs(step).max() < 1e-8:
-            break
-    return np.round(weights, 5)
 
 
 SCORE = 0.5

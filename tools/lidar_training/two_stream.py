@@ -33,7 +33,16 @@ from log2sim.errors import RecordError
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import average_precision
 from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion
-from log2sim.geometry import Array, inverse, nearest_index, rotation_from_rpy, transform, wrap_angle
+from log2sim.geometry import (
+    Array,
+    box_corners,
+    box_iou,
+    inverse,
+    nearest_index,
+    rotation_from_rpy,
+    transform,
+    wrap_angle,
+)
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, open_network
@@ -54,10 +63,6 @@ class Pair:
     boxes: Array  # (M, 7): x, y, height of the center above the ground, length, width, height, heading
     truth: SceneBoxes  # the same, with z in the cloud's frame
     views: tuple[LogView, ...]  # the cameras in whose images road users were labeled, for the cloud's frame
-
-    def labeled(self, xyz: Array) -> NDArray[np.bool_]:
-        """Mark positions (N, 3) in the cloud's frame where road users have labels."""
-        return labeled_by(self.views, xyz)
 
     def in_picture_only(self) -> Pair:
         """Leave out the points beside the picture, which the network does not see, to save memory."""
@@ -240,13 +245,9 @@ def image_boxes_of(
     anchors: NDArray[np.float32], ground: Array, projection: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Places (N, 4) of anchors in the picture, clipped to it, and whether it shows them (N,)."""
-    c, s = np.cos(anchors[:, 6:7]), np.sin(anchors[:, 6:7])
-    signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), -1).reshape(1, 8, 3)
-    corners = signs * anchors[:, None, 3:6]
-    x = anchors[:, :1] + corners[..., 0] * c - corners[..., 1] * s
-    y = anchors[:, 1:2] + corners[..., 0] * s + corners[..., 1] * c
-    z = anchors[:, 2:3] + corners[..., 2] + ground[0] * x + ground[1] * y + ground[2]
-    p = np.stack([x, y, z, np.ones_like(z)], axis=-1) @ projection.T
+    corners = box_corners(anchors[:, :3], anchors[:, 3:6], anchors[:, 6])
+    corners[..., 2] += corners[..., :2] @ ground[:2] + ground[2]
+    p = corners @ projection[:, :3].T + projection[:, 3]
     ahead = (p[..., 2] > MIN_DEPTH_M).all(axis=1)
     uv = p[..., :2] / np.where(p[..., 2:] > MIN_DEPTH_M, p[..., 2:], 1.0)
     limit = np.array([shape[1], shape[0]], float)
@@ -266,7 +267,7 @@ def targets_of(
     assert points is not None
     known = np.isin(category, CLASSES) & (points >= MIN_POINTS_INSIDE) & ~pair.truth.ignored
     # What overlaps a box that nobody has to find is not judged.
-    label[(overlaps(rectangles(anchors), rectangles(boxes[~known])) > 0).any(axis=1)] = UNJUDGED
+    label[(box_iou(rectangles(anchors), rectangles(boxes[~known])) > 0).any(axis=1)] = UNJUDGED
     for k, name in enumerate(CLASSES):
         own, true = np.flatnonzero(kind == k), boxes[known & (category == name)]
         if not len(own) or not len(true):
@@ -275,7 +276,7 @@ def targets_of(
             fit = -np.hypot(*(anchors[own, None, :2] - true[None, :, :2]).transpose(2, 0, 1))
             positive, negative = -POSITIVE_M, -NEGATIVE_M
         else:
-            fit = overlaps(rectangles(anchors[own]), rectangles(true))
+            fit = box_iou(rectangles(anchors[own]), rectangles(true))
             positive, negative = POSITIVE_IOU, NEGATIVE_IOU
             # An anchor across the object has to turn too far.
             turn = np.abs(wrap_angle(2 * (anchors[own, None, 6] - true[None, :, 6]))) / 2
@@ -290,14 +291,6 @@ def targets_of(
         label[own[found]] = POSITIVE
         goal[own[found]] = encode(true[best[found]], anchors[own[found]])
     return label, goal
-
-
-def overlaps(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Intersection over union (N, M) of rectangles along the axes."""
-    low, high = np.maximum(a[:, None, :2], b[None, :, :2]), np.minimum(a[:, None, 2:], b[None, :, 2:])
-    shared = np.clip(high - low, 0, None).prod(axis=2)
-    area_a, area_b = ((r[:, 2:] - r[:, :2]).prod(axis=1) for r in (a, b))
-    return np.asarray(shared / (area_a[:, None] + area_b[None, :] - shared))
 
 
 def encode(boxes: Array, anchors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -103,32 +103,31 @@ def marginal_likelihood(positions: Positions, motion: MotionPriorSigmas) -> tupl
 def _likelihoods(p: Positions, motion: MotionPriorSigmas) -> tuple[float, Array]:
     """Return the log-likelihood of all positions, and that of each given all others (n,)."""
     s = p.t_s - (p.t_s[0] + p.t_s[-1]) / 2
-    middle = np.median(p.xy_m, axis=0) if motion.speed_mps == 0 else p.xy_m[np.argmin(np.abs(s))]
-    z = p.xy_m - middle
+    away = np.abs(s)
+    middle = np.median(p.xy_m, axis=0) if motion.speed_mps == 0 else p.xy_m[np.argmin(away)]
+    z = (p.xy_m - middle).T
     k = PLACE_SIGMA_M**2 + motion.speed_mps**2 * np.outer(s, s)
     if motion.acceleration_mps2:
-        near = np.minimum(np.abs(s)[:, None], np.abs(s)[None, :]) * (np.sign(s)[:, None] == np.sign(s)[None, :])
-        far = np.maximum(np.abs(s)[:, None], np.abs(s)[None, :])
+        near = np.minimum(away[:, None], away) * (np.sign(s)[:, None] == np.sign(s))
+        far = np.maximum(away[:, None], away)
         k += motion.acceleration_mps2**2 * near**2 * (far / 2 - near / 6)
-    log, each = 0.0, np.zeros(len(p))
-    for axis in range(2):
-        covariance = k + NOISE_SCALES[:, None, None] ** 2 * noise_of(p, axis)
-        inverse = np.linalg.inv(covariance)
-        weighted = inverse @ z[:, axis]
-        squared = weighted @ z[:, axis] + np.linalg.slogdet(covariance)[1]
-        logs = NOISE_SCALE_LOG - 0.5 * (squared + len(p) * np.log(2 * np.pi))
-        log += float(np.logaddexp.reduce(logs))
-        best = int(np.argmax(logs))
-        variance = 1.0 / np.diag(inverse[best])
-        each -= 0.5 * (np.log(2 * np.pi * variance) + variance * weighted[best] ** 2)
-    return log, each
+    # Axes, scales, n, n.
+    covariance = k + NOISE_SCALES[:, None, None] ** 2 * noise_of(p)[:, None]
+    weighted = np.linalg.solve(covariance, z[:, None, :, None])[..., 0]
+    determinant = 2 * np.log(np.diagonal(np.linalg.cholesky(covariance), axis1=2, axis2=3)).sum(axis=2)
+    squared = (weighted * z[:, None]).sum(axis=2)
+    logs = NOISE_SCALE_LOG - 0.5 * (squared + determinant + len(p) * np.log(2 * np.pi))
+    best = np.arange(2), logs.argmax(axis=1)
+    variance = 1.0 / np.diagonal(np.linalg.inv(covariance[best]), axis1=1, axis2=2)
+    each = -0.5 * (np.log(2 * np.pi * variance) + variance * weighted[best] ** 2).sum(axis=0)
+    return float(np.logaddexp.reduce(logs, axis=1).sum()), each
 
 
-def noise_of(p: Positions, axis: int = 0) -> Array:
-    """Return the covariance (n, n), m2, of the errors along an axis: a part repeats while the view stays the same, one does not."""
-    sigma = np.sqrt(p.variance[:, axis])
-    repeated = np.exp(-np.abs(p.t_s[:, None] - p.t_s[None, :]) / VIEW_S)
-    return np.outer(sigma, sigma) * (REPEATED_SHARE * repeated + (1 - REPEATED_SHARE) * np.eye(len(p)))
+def noise_of(p: Positions) -> Array:
+    """Return the covariances (2, n, n), m2, of the errors along both axes: a part repeats while the view stays the same, one does not."""
+    sigma = np.sqrt(p.variance.T)
+    repeated = REPEATED_SHARE * np.exp(-np.abs(p.t_s[:, None] - p.t_s) / VIEW_S)
+    return np.asarray(sigma[:, :, None] * sigma[:, None] * (repeated + (1 - REPEATED_SHARE) * np.eye(len(p))))
 
 
 # A longer way backward is one.

@@ -99,7 +99,8 @@ def estimate_homography(
     if len(rows) < 4:
         return refused_fit(f"{len(rows)} correspondences, at least 4 are needed", len(uv), ticks)
     rows = rows[np.argsort(number[rows], kind="stable")]
-    dense = np.unique(number[rows], return_inverse=True)[1]
+    of_rows = number[rows]
+    dense = np.cumsum(np.diff(of_rows, prepend=of_rows[0]) > 0, dtype=np.int64)
     data = NormalizedCorrespondences.of(uv[rows], xy[rows], dense, options.sigma_px, sigma_m)
     if of_stream:
         image_K = None
@@ -126,7 +127,7 @@ def estimate_homography(
         fit = fit_frames(data, estimate, keep_all=method != "min-frame")
     # From the rows that were used to all. A tick without any gets NaN, or the homography of the stream where there is one, and
     # may have any angle that other ticks have.
-    inliers, of_ticks = np.zeros(len(uv), dtype=bool), np.unique(number[rows])
+    inliers, of_ticks = np.zeros(len(uv), dtype=bool), of_rows[data.start]
     inliers[rows] = fit.inliers
     per_tick, sigmas = fit.per_tick, fit.tick_sigmas
     if per_tick is not None:

@@ -97,8 +97,6 @@ OPTIMIZATION_ROWS = 160
 OPTIMIZATION_GATES = (4 * CHI2_2DOF_99, 1.5 * CHI2_2DOF_99)
 # The pose nearest to a homography misses what the homography fits, most of all with few correspondences.
 POSE_GATES = (100 * CHI2_2DOF_99, 16 * CHI2_2DOF_99, 4 * CHI2_2DOF_99, CHI2_2DOF_99)
-# Rows beyond this squared error cannot become inliers in the final refinement.
-REFINEMENT_GATE = 8 * CHI2_2DOF_99
 NOISE_ROUNDS, FINAL_ROUNDS = 1, 2
 
 
@@ -166,17 +164,13 @@ def ransac(
     best_h: Array = candidates[0]
     if pitch_sigma:
         return RobustFit(best_h, data)
-    # Refined over all inliers, whose errors tell the noise. Leaving far outliers out saves half of the time where there are many.
-    near = np.flatnonzero(squared_errors(data, best_h[None])[0] < REFINEMENT_GATE)
-    if len(near) >= 4:
-        part, parameters = data.take(near), 8 if image_K is None else 6
-        for _ in range(NOISE_ROUNDS):
-            linear = linearize(part, best_h[None])
-            best_h = newton_step(linear, best_h, image_K)
-            part = part.scale_noise(*noise_factors(part, linear, parameters))
-        best_h = refine(part, best_h, FINAL_ROUNDS, image_K)
-        data = replace(data, sigma_image=part.sigma_image, sigma_ground=part.sigma_ground)
-    return RobustFit(best_h, data, linearize(data, best_h[None]))
+    # Refined over all inliers, whose errors tell the noise.
+    for _ in range(NOISE_ROUNDS):
+        linear = linearize(data, best_h[None])
+        best_h = newton_step(linear, best_h, image_K)
+        data = data.scale_noise(*noise_factors(data, linear, 8 if image_K is None else 6))
+    best_h, linear = refine(data, best_h, FINAL_ROUNDS, image_K)
+    return RobustFit(best_h, data, linear)
 
 
 # Ratio of the eighth to the first singular value of the normalized DLT matrix: about 0.3 for points that spread over the

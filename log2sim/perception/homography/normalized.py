@@ -112,10 +112,8 @@ def squared_errors(
     c[0, :, 0:3], c[0, :, 3:6] = -a, d
     c[1, :, 0:3], c[1, :, 6:9] = -b, d
     c[2, :, 0:3] = d
-    aa, bb, dd, ab, ad, bd = (
-        data.sigma_ground**2 * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1])
-        for p, q in ((a, a), (b, b), (d, d), (a, b), (a, d), (b, d))
-    )
+    by_ground = data.sigma_ground * image_H_ground[:, :, :2]
+    (aa, ab, ad), (_, bb, bd), (_, _, dd) = (by_ground @ by_ground.swapaxes(1, 2)).transpose(1, 2, 0)
     c[3, :, 2], c[3, :, 5], c[3, :, 9] = aa, -2 * ad, dd
     c[4, :, 2], c[4, :, 8], c[4, :, 10] = bb, -2 * bd, dd
     c[5, :, 2], c[5, :, 5], c[5, :, 8], c[5, :, 11] = ab, -bd, -ad, dd
@@ -258,28 +256,37 @@ def linearize(data: NormalizedCorrespondences, h: Array, warps: Array | None = N
 
 def refine_many(data: NormalizedCorrespondences, h: Array, gates: tuple[float, ...]) -> Array:
     """Take one Gauss-Newton step of all homographies (K, 3, 3) for each of `gates` on the squared error; none where undetermined."""
-    h, count = h / np.linalg.norm(h, axis=(1, 2), keepdims=True), len(h)
     for gate in gates:
-        linear = linearize(data, h)
-        use = linear.squared < gate
-        slope = (linear.slope * use[:, None, None]).reshape(count, 9, -1)
-        normal, right = slope @ slope.swapaxes(1, 2), slope @ linear.error.reshape(count, -1, 1)
-        # The scale of a homography is free: steps are taken across it, never along it.
-        along = h.reshape(count, 9, 1)
-        size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 9
-        normal += size * (along @ along.swapaxes(1, 2)) + 1e-14 * size * np.eye(9)
-        enough = np.count_nonzero(use, axis=1) >= 4
-        normal[~enough] = np.eye(9)
-        try:
-            step = -np.linalg.solve(normal, right).reshape(count, 3, 3)
-        except np.linalg.LinAlgError:
-            step = np.full((count, 3, 3), np.nan)
-        h = h + np.where((enough & np.isfinite(step).all(axis=(1, 2)))[:, None, None], step, 0.0)
-        h /= np.linalg.norm(h, axis=(1, 2), keepdims=True)
+        h = _homography_steps(linearize(data, h), h, gate)
     return h
 
 
-def refine(data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Array | None = None) -> Array:
+_DAMPING = 1e-14 * np.eye(9)
+
+
+def _homography_steps(linear: Linearization, h: Array, gate: float) -> Array:
+    """Take a Gauss-Newton step of each homography (K, 3, 3), over rows whose squared error is below `gate`; none where undetermined."""
+    use, count = linear.squared < gate, len(h)
+    slope = (linear.slope * use[:, None, None]).reshape(count, 9, -1)
+    normal, right = slope @ slope.swapaxes(1, 2), slope @ linear.error.reshape(count, -1, 1)
+    # The scale of a homography is free: steps are taken across it, never along it.
+    along = h.reshape(count, 9, 1) / np.linalg.norm(h, axis=(1, 2))[:, None, None]
+    size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 9
+    enough = use.sum(axis=1) >= 4
+    normal = np.where(enough[:, None, None], normal + size * (along @ along.swapaxes(1, 2) + _DAMPING), np.eye(9))
+    try:
+        step = -np.linalg.solve(normal, right)
+    except np.linalg.LinAlgError:
+        return h
+    moved = h.reshape(count, 9, 1) + np.where(
+        enough[:, None, None] & np.isfinite(step).all(axis=1, keepdims=True), step, 0.0
+    )
+    return np.asarray(moved / np.sqrt((moved * moved).sum(axis=1, keepdims=True))).reshape(count, 3, 3)
+
+
+def refine(
+    data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Array | None = None
+) -> tuple[Array, Linearization]:
     """Minimize the bounded loss from `h` (3, 3); with intrinsics `image_K` (3, 3) over the poses of that camera."""
     linear = linearize(data, h[None])
     loss = float(np.minimum(linear.squared, CHI2_2DOF_99).sum())
@@ -292,15 +299,16 @@ def refine(data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Arra
         decrease, h, linear, loss = loss - proposed_loss, proposed, proposed_linear, proposed_loss
         if decrease < MIN_LOSS_DECREASE:
             break
-    return h
+    return h, linear
 
 
 def newton_step(
     linear: Linearization, h: Array, image_K: Array | None = None, gate: float = CHI2_2DOF_99, k: int = 0
 ) -> Array:
     """Take a Gauss-Newton step from `h` (3, 3), the `k`-th linearized; returns `h` if the step is undetermined."""
-    use = linear.squared[k] < gate
-    basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
+    if image_K is None:
+        return np.asarray(_homography_steps(linear, h[None], gate)[0])
+    use, basis = linear.squared[k] < gate, pose_tangent(image_K, h)
     slope = (linear.slope[k] * use).reshape(9, -1)
     normal, right = basis.T @ (slope @ slope.T) @ basis, basis.T @ (slope @ linear.error[k].ravel())
     size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
@@ -311,7 +319,7 @@ def newton_step(
     moved = h - (basis @ along).reshape(3, 3)
     if np.count_nonzero(use) < 4 or not np.isfinite(moved).all():
         return h
-    return np.asarray(moved / np.linalg.norm(moved)) if image_K is None else nearest_poses(image_K, moved[None])[0]
+    return np.asarray(nearest_poses(image_K, moved[None])[0], dtype=np.float64)
 
 
 def scale_free_basis(h: Array) -> Array:

@@ -183,8 +183,9 @@ class AzimuthIndex:
         if across.any():
             # Azimuths are negative for the points of a cluster that lie before the azimuth at which a turn begins.
             azimuth = np.where(across[group] & (azimuth >= STEPS_PER_TURN // 2), azimuth - STEPS_PER_TURN, azimuth)
-            order = np.lexsort((azimuth, group))
-            row, azimuth = row[order], azimuth[order]
+            some = np.flatnonzero(across[group])
+            order = some[np.lexsort((azimuth[some], group[some]))]
+            row[some], azimuth[some] = row[order], azimuth[order]
         # Stray points are left out.
         cut = np.minimum(np.round(TRIM * (count - 1)).astype(np.intp), MAX_TRIMMED_POINTS)
         end = np.stack([start + cut, start + count - 1 - cut], axis=1)
@@ -212,11 +213,14 @@ class AzimuthIndex:
         window, other = window[foreign], other[foreign]
         # Some points of each cluster show its faces as well as all do.
         some = np.flatnonzero((np.arange(len(row)) - start[group]) % -(-count // MAX_FACE_POINTS)[group] == 0)
-        unit, sides = _directions(), end.size
-        corner, xy = (self.range_m[of][..., None] * unit[self.azimuth[of]] for of in (row[end], row[some]))
-        at_end = [np.flatnonzero(((xy - corner[group[some], side]) ** 2).sum(axis=1) < FACE_M**2) for side in range(2)]
-        of = np.concatenate([2 * group[some[point]] + side for side, point in enumerate(at_end)])
-        x, y = xy[np.concatenate(at_end)].T
+        (cosine, sine), sides, owner = _directions(), end.size, group[some]
+        corner, (x, y) = (
+            [self.range_m[of] * unit[self.azimuth[of]] for unit in (cosine, sine)] for of in (row[end], row[some])
+        )
+        square = [sum((a - b[owner, side]) ** 2 for a, b in zip((x, y), corner)) for side in range(2)]
+        at_end = [np.flatnonzero(away < FACE_M**2) for away in square]
+        of = np.concatenate([2 * owner[point] + side for side, point in enumerate(at_end)])
+        x, y = (column[np.concatenate(at_end)] for column in (x, y))
         shown = np.maximum(np.bincount(of, minlength=sides), 1)
         center_x, center_y = np.bincount(of, x, sides) / shown, np.bincount(of, y, sides) / shown
         x, y = x - center_x[of], y - center_y[of]
@@ -227,9 +231,9 @@ class AzimuthIndex:
         angle = np.arctan2(2 * cross, xx - yy) / 2
         along_x, along_y = np.cos(angle), np.sin(angle)
         # The range along each ray of that face, were it to go on.
-        ray_x, ray_y = unit[self.azimuth[other]].T
-        sine = ray_x * along_y[window] - ray_y * along_x[window]
-        meets_m = (center_x * along_y - center_y * along_x)[window] / np.where(sine == 0, np.inf, sine)
+        turn = self.azimuth[other]
+        cross = cosine[turn] * along_y[window] - sine[turn] * along_x[window]
+        meets_m = (center_x * along_y - center_y * along_x)[window] / np.where(cross == 0, np.inf, cross)
         goes_on_m = np.where(is_face[window], np.where(meets_m > 0, meets_m, np.inf), 0.0)
         beyond = self.range_m[other] > np.maximum(goes_on_m, range_m.ravel()[window]) + MIN_DEPTH_STEP_M
         rays = np.bincount(window[beyond], minlength=end.size)
@@ -250,9 +254,9 @@ class AzimuthIndex:
 
 @lru_cache(maxsize=1)
 def _directions() -> NDArray[np.float64]:
-    """Return unit vectors (`STEPS_PER_TURN` + 1, 2) of all azimuths: a look-up takes a tenth of a sine and a cosine."""
+    """Return the cosines and sines (2, `STEPS_PER_TURN` + 1) of all azimuths: a look-up takes a tenth of the time."""
     angle = np.arange(STEPS_PER_TURN + 1) * STEP_RAD
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.stack([np.cos(angle), np.sin(angle)])
 
 
 # Rotation is constant within a bin, which errs by 2.5 cm at 1 rad/s and 50 m; translation is interpolated for every point.
@@ -578,11 +582,13 @@ def first_of_voxels(columns: NDArray[np.float32], voxel_m: float) -> NDArray[np.
     # Multiplicative hashing (Knuth, The Art of Computer Programming 3, 6.4).
     factor = np.array([0x9E3779B97F4A7C15], dtype=np.uint64)
     while len(left):
-        place = ((voxel[left] * factor) >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
-        table[place[::-1]] = left[::-1]
-        first = table[place]
-        kept[left[first == left]] = True
-        left, factor = left[voxel[first] != voxel[left]], factor * np.uint64(3)
+        place = ((voxel * factor) >> np.uint64(64 - TABLE_BITS)).astype(np.intp)
+        number = np.arange(len(voxel), dtype=np.int32)
+        table[place[::-1]] = number[::-1]
+        first = table.take(place)
+        kept[left[np.flatnonzero(first == number)]] = True
+        other = np.flatnonzero(voxel.take(first) != voxel)
+        left, voxel, factor = left.take(other), voxel.take(other), factor * np.uint64(3)
     return np.flatnonzero(kept)
 
 
@@ -621,11 +627,11 @@ def sample_rays(cloud: Cloud) -> Rays:
     # Written from the last to the first point, a cell holds its first one; cells without points are not read.
     first = np.empty(max(len(cloud.sensors), 1) * COLUMNS * CELLS_PER_COLUMN, dtype=np.int32)
     first[cell[::-1]] = point[::-1]
-    kept = point[first[cell] == point]
+    kept = point.take(np.flatnonzero(first.take(cell) == point))
     sensors = cloud.sensors or (CloudSensor(len(cloud.xyz), cloud.sensor.astype(np.float64), np.zeros(3)),)
     return Rays(
-        cloud.xyz[kept],
-        cloud.t_s[kept],
+        cloud.xyz.take(kept, axis=0),
+        cloud.t_s.take(kept),
         _sensor_of(cloud, kept).astype(np.uint8),
         np.array([s.position for s in sensors], dtype=np.float32),
         np.array([s.velocity_mps for s in sensors], dtype=np.float32),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, TYPICAL_SIZE_M
 from log2sim.geometry import NS_PER_S, Array, apply, box_iou, undistort
-from log2sim.perception.boxes import azimuth_step_rad, fit_yaw, oriented_covariance, rotate, subsample, upper_median
+from log2sim.perception.boxes import azimuth_steps, oriented_covariance, rotate, subsample, upper_median
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.projection import ProjectedPoints, View
 
@@ -158,29 +158,26 @@ def region_grow(xy_all: NDArray[np.float32], seed: NDArray[np.float32], category
     return np.asarray(kept[np.hypot(*(xy_all[kept] - center).T) <= reach])
 
 
-def continued_sides(
-    seed: Array, xy: Array, max_length_m: float, yaw_rad: float | None = None, max_gap_m: float = np.inf
-) -> Index:
-    """Find the points (m, 2) that continue the sides of a cluster (n, 2) where rays are far apart: their indices.
+def continued_sides(own: Array, others: Array, max_length_m: float, max_gap_m: float = np.inf) -> Index:
+    """Find the points (2, m) that continue the sides of a cluster (2, n) where rays are far apart: their indices.
 
-    `seed`, `xy`: (n, 2), (m, 2), m: relative to the sensor. `max_length_m`: no side grows beyond it. `yaw_rad`: along one of the
-    sides; fitted to the cluster where it is not known. `max_gap_m`: a wider gap ends a side also where rays are farther apart.
+    `own`, `others`: (2, n), (2, m), m: along two of the sides, relative to the sensor. `max_length_m`: no side grows beyond it.
+    `max_gap_m`: a wider gap ends a side also where rays are farther apart.
 
     The flank of a long vehicle is seen at so flat an angle that successive rays meet it farther apart than the cells of
     the clusters are: at 15 m along a flank 2.5 m aside, 0.4 degrees are 0.6 m.
     """
-    yaw, step_rad = fit_yaw(seed)[0] if yaw_rad is None else yaw_rad, azimuth_step_rad(seed)
-    own, others = rotate(seed, -yaw), rotate(xy, -yaw)
-    low, high = own.min(axis=0), own.max(axis=0)
-    found = np.zeros(len(xy), dtype=bool)
+    step_rad = float(azimuth_steps(own.T, np.array([own.shape[1]]))[0])
+    low, high = own.min(axis=1), own.max(axis=1)
+    found = np.zeros(others.shape[1], dtype=bool)
     for axis in range(2):
         across = 1 - axis
         side_m = low[across] if low[across] > 0 else high[across] if high[across] < 0 else 0.0
         if abs(side_m) < MIN_SIDE_DISTANCE_M:
             continue
-        on_side = np.flatnonzero(np.abs(others[:, across] - side_m) < SIDE_DEPTH_M)
+        on_side = np.flatnonzero(np.abs(others[across] - side_m) < SIDE_DEPTH_M)
         for sign, end in ((1.0, high[axis]), (-1.0, low[axis])):
-            along = sign * others[on_side, axis]
+            along = sign * others[axis].take(on_side)
             farthest = _walk(along, sign * end, step_rad, abs(side_m), max_gap_m)
             farthest = min(farthest, sign * end + max_length_m - (high[axis] - low[axis]))
             found[on_side[(along > sign * end) & (along <= farthest)]] = True

@@ -37,8 +37,9 @@ from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, Camera, box_iou
 from log2sim.perception.boxes import (
     TOP_QUANTILE,
-    corrected_yaw,
+    correct_yaws,
     fit_extents_of_clusters,
+    fit_yaw,
     place_boxes,
     quantile_of_clusters,
     rotate,
@@ -320,7 +321,9 @@ def _cluster_boxes(seen: Shown, rows: Index, columns: dict[str, Any]) -> dict[in
             other[members] = other[index[taken]] = False
             rest = rest[other[rest]]
             seed, more = (cloud.xyz[part, :2].astype(np.float64) - cloud.sensor[:2] for part in (members, rest))
-            members = np.union1d(members, rest[continued_sides(seed, more, MAX_SIZE_M[category[k]][0])])
+            yaw_rad = fit_yaw(seed)[0]
+            own, others = (np.ascontiguousarray(rotate(xy, -yaw_rad).T) for xy in (seed, more))
+            members = np.union1d(members, rest[continued_sides(own, others, MAX_SIZE_M[category[k]][0])])
         columns["height_px_m"][rows[k]] = _height_m(boxes_px[k], visible.depth[chosen], category[k], seen.view.camera)
         out[int(rows[k])] = members
     return out
@@ -453,24 +456,29 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
     edges = np.searchsorted(found.box[own], np.arange(len(boxes) + 1))
     free = np.ones(len(xyz), dtype=bool)
     free[found.point] = False
-    point, (x, y, _), place = found.point[own], cloud.obstacle_columns, xyz[:, :2] - cloud.sensor[:2]
+    point, (x, y, _) = found.point[own], cloud.obstacle_columns
+    place = cloud.obstacle_columns[:2] - cloud.sensor[:2, None]
     members = [point[a:b] for a, b in pairwise(edges)]
-    for k, category in enumerate(boxes.category):
-        longest_m, seed = MAX_SIZE_M[category][0], members[k]
-        if longest_m < MIN_LONG_M or len(seed) < MIN_CLUSTER_POINTS:
-            continue
+    longest_m = np.array([MAX_SIZE_M[category][0] for category in boxes.category])
+    is_long = (longest_m >= MIN_LONG_M) & (np.diff(edges) >= MIN_CLUSTER_POINTS)
+    seeds = place.take(point[np.repeat(is_long, np.diff(edges))], axis=1)
+    yaws = correct_yaws(seeds.T.astype(np.float64), np.diff(edges)[is_long], boxes.yaw_rad[is_long])
+    for k, yaw_rad in zip(np.flatnonzero(is_long).tolist(), yaws.tolist()):
         # The boxes of a detector that sees little of a long flank at a time end before it does.
-        middle = center[k].astype(xyz.dtype)
-        rest = np.flatnonzero(free & (np.abs(x - middle[0]) < longest_m) & (np.abs(y - middle[1]) < longest_m))
-        yaw_rad = corrected_yaw(place[seed].astype(np.float64), float(boxes.yaw_rad[k]))
+        middle, reach_m = center[k].astype(xyz.dtype), longest_m[k]
+        rest = np.flatnonzero(free & (np.abs(x - middle[0]) < reach_m) & (np.abs(y - middle[1]) < reach_m))
+        index = np.concatenate([members[k], rest])
+        (c, s), of_sensor = np.array([np.cos(yaw_rad), np.sin(yaw_rad)], dtype=xyz.dtype), place.take(index, axis=1)
+        sides = np.stack([of_sensor[0] * c + of_sensor[1] * s, of_sensor[1] * c - of_sensor[0] * s])
+        own = np.arange(len(index)) < len(members[k])
         for _ in range(2):  # along the flank, then round the corner
-            own, more = (place[index].astype(np.float64) for index in (seed, rest))
-            added = continued_sides(own, more, np.inf, yaw_rad, ROW_GAP_M)
-            seed, rest = np.sort(np.concatenate([seed, rest[added]])), np.delete(rest, added)
+            others = np.flatnonzero(~own)
+            added = others[continued_sides(sides[:, own], sides.take(others, axis=1), np.inf, ROW_GAP_M)]
+            own[added] = True
             if not len(added):
                 break
         # Sides that go on past the longest and widest vehicle are a wall's.
-        sides_m = np.sort(np.ptp(rotate(place[seed].astype(np.float64), -yaw_rad), axis=0))
-        if (sides_m <= MAX_SIZE_M[category][1::-1]).all():
-            free[seed], members[k] = False, seed
+        if (np.sort(np.ptp(sides[:, own], axis=1)) <= MAX_SIZE_M[boxes.category[k]][1::-1]).all():
+            members[k] = np.sort(index[own])
+            free[members[k]] = False
     return [cloud.obstacles[index] for index in members]
