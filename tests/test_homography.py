@@ -338,7 +338,14 @@ def test_obstacles_of_all_sizes_and_yaws_are_where_they_are_placed_within_what_i
         box = box_of(camera, category, xy, rng.uniform(0, 2 * np.pi), size) + rng.normal(0, FOOT_SIGMA_PX, 4)
         # What is cut off is anywhere inside.
         cut = rng.uniform(0.1, 0.5, 4) * np.tile(box[2:] - box[:2], 2) * [1, 1, -1, -1]
-        placed = place_obstacle(h, camera, box + np.where(seen, 0.0, cut), category, camera.mount_T_cam, seen=seen)
+        placed = place_obstacle(
+            h,
+            camera,
+            box + np.where(seen, 0.0, cut),
+            category,
+            camera.mount_T_cam,
+            edge_sigma_px=np.where(seen, FOOT_SIGMA_PX, np.inf),
+        )
         assert placed is not None
         errors.append(placed[0] - xy)
         squared.append(errors[-1] @ np.linalg.solve(placed[1], errors[-1]) / 2)
@@ -361,7 +368,12 @@ def test_edges_that_do_not_tell_a_distance_place_nothing() -> None:
     camera, h = make_camera()
     box = box_of(camera, "car", np.array([20.0, 2.0]), 0.3, np.array(TYPICAL_SIZE_M["car"]))
     for seen in ((True, True, True, False), (False, True, False, True)):
-        assert place_obstacle(h, camera, box, "car", camera.mount_T_cam, seen=seen) is None
+        assert (
+            place_obstacle(
+                h, camera, box, "car", camera.mount_T_cam, edge_sigma_px=np.where(seen, FOOT_SIGMA_PX, np.inf)
+            )
+            is None
+        )
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.3])

@@ -204,7 +204,7 @@ def seen_in_lines(log, t_ns, posts_xy):
     return box_px[valid], places[0][valid]
 
 
-@pytest.mark.parametrize(("told", "limit_m"), [(True, (0.0, 0.025)), (False, (0.028, 1.0))], ids=["told", "not told"])
+@pytest.mark.parametrize(("told", "limit_m"), [(True, (0.0, 0.023)), (False, (0.025, 1.0))], ids=["told", "not told"])
 def test_a_camera_that_turns_while_it_reads_its_lines_places_obstacles_where_they_are(told, limit_m):
     log, rng = turning_log(0.06 if told else 0.0), np.random.default_rng(2)
     camera, seen = log.cameras["front"], Observations(measurements=[], obstacles=[])

@@ -58,8 +58,9 @@ def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
 
 # Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand.
 FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
-# Of tracks that seem to drive one in fifty mixes up several objects, or stands (simulated logs with LiDAR; twice as many do no harm).
-MAX_COURSE_LOG_ODDS = 4.0
+# More than boxes say against it (`MAX_HEADING_SCORE` in all sweeps), so that what drives fast points ahead. Of tracks that seem to drive one
+# in fifty mixes up several objects, or stands (simulated logs with LiDAR).
+MAX_COURSE_LOG_ODDS = 7.0
 # A way shorter than so many standard deviations of its ends may be noise.
 CERTAIN_SIGMAS = 4.0
 

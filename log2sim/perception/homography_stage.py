@@ -33,6 +33,9 @@ MIN_CAMERA_HEIGHT_M = 0.2
 # Standard deviation of the angle between the wheels' plane under a vehicle and the ground that it sees: springs, and roads of
 # changing grade. In two recorded drives that look flat it is 0.5 degrees.
 TILT_SIGMA_RAD = np.deg2rad(0.5)
+# Standard deviation of an edge of a box that something nearer covers, as a share of the side of the box: detectors complete what is hidden, or
+# end the box where it begins.
+HIDDEN_SHARE = 0.25
 # Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
 # is empty.
 MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25
@@ -192,7 +195,7 @@ def place_by_homography(
                 if bent is not None:
                     h, by_slope = bent
                     uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
-            placed = place_obstacle(h, camera, box_px, category, base_T_cam, uncertainty, edges_seen(m, k, camera))
+            placed = place_obstacle(h, camera, box_px, category, base_T_cam, uncertainty, edge_sigmas(m, k, camera))
             if placed is None:
                 continue
             if obstacles is not None:
@@ -211,19 +214,20 @@ def place_by_homography(
     return out
 
 
-def edges_seen(m: Measurements, k: int, camera: Camera) -> tuple[bool, bool, bool, bool]:
-    """Return which edges of a box (left, top, right, bottom) the image and nearer obstacles do not cut off.
+def edge_sigmas(m: Measurements, k: int, camera: Camera) -> Array:
+    """Return the standard deviations (4,), px, of the edges of a box: left, top, right, bottom.
 
-    The box of what is nearer reaches further down, and covers an edge whose middle, or lower end, it holds.
+    Infinite where the box ends with the image. The box of what is nearer reaches further down; where it holds the middle of an edge the
+    obstacle goes on behind it.
     """
     box = m.box_px[k]
     x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
     others = m.box_px[(m.camera == m.camera[k]) & (m.t_ns == m.t_ns[k]) & (m.box_px[:, 3] > box[3])]
-    size = np.array([camera.width_px, camera.height_px])
-    seen = [*(box[:2] >= BORDER_PX).tolist(), *(box[2:] <= size - 1 - BORDER_PX).tolist()]
-    for edge, place in enumerate(((box[0], y), (x, box[1]), (box[2], y), (x, box[3]))):
-        seen[edge] &= not bool(np.any(np.all((others[:, :2] < place) & (others[:, 2:] > place), axis=1)))
-    return seen[0], seen[1], seen[2], seen[3]
+    middles = np.array([[box[0], y], [x, box[1]], [box[2], y], [x, box[3]]])
+    covered = np.any(np.all((others[:, None, :2] < middles) & (others[:, None, 2:] > middles), axis=2), axis=0)
+    sigma = np.hypot(FOOT_SIGMA_PX, np.where(covered, HIDDEN_SHARE * np.tile(box[2:] - box[:2], 2), 0.0))
+    last = np.array([camera.width_px, camera.height_px]) - 1 - BORDER_PX
+    return np.where(np.append(box[:2] < BORDER_PX, box[2:] > last), np.inf, sigma)
 
 
 def count_rays(

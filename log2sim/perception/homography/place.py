@@ -31,16 +31,16 @@ def place_obstacle(
     category: str,
     base_T_cam: Array,
     homography_covariance: Array | None = None,
-    seen: tuple[bool, bool, bool, bool] = (True, True, True, True),
+    edge_sigma_px: Array | None = None,
 ) -> tuple[Array, Array] | None:
     """Place an obstacle by the box (4,) around its image: a cuboid that the edges of the box touch.
 
     `ground_H_image`: (3, 3), of `homography_covariance` (9, 9), None for 0. `category`: its usual sizes are used.
-    `base_T_cam`: (4, 4): pose of the camera in the frame of the ground positions, m. `seen`: which edges of the box (left, top,
-    right, bottom) are edges of the obstacle and not of the image or of something before it.
+    `base_T_cam`: (4, 4): pose of the camera in the frame of the ground positions, m. `edge_sigma_px`: (4,): standard deviations
+    of the left, upper, right and lower edge of the box, infinite where it ends with the image; None for those of an obstacle in sight.
 
     Returns its center (2,), m, on the ground and the covariance (2, 2); None above the horizon, beyond `MAX_RANGE_M`, and where
-    its foot or both of its sides are not seen.
+    its foot or both of its sides are outside the image.
 
     From above, the left and the right edge of the box are rays, the lower edge is a line, and the height of the box tells the
     distance of the near side. For each yaw the center and the errors of length, width and edges are a linear least-squares
@@ -51,6 +51,8 @@ def place_obstacle(
     (left, right, foot), below = apply_homography(ground_H_image, np.array([corners[0], corners[1], uv]))
     origin = base_T_cam[:2, 3]
     range_m = float(np.hypot(*(foot - origin)))
+    edge_px = np.full(4, FOOT_SIGMA_PX) if edge_sigma_px is None else edge_sigma_px
+    seen = np.isfinite(edge_px)
     if not seen[BOTTOM] or not (seen[LEFT] or seen[RIGHT]) or not below.all() or range_m > MAX_RANGE_M:
         return None
     by_px = homography_jacobian(ground_H_image, uv[None])[0]
@@ -61,20 +63,20 @@ def place_obstacle(
     rows: list[tuple[Array, float, float, Array]] = []
     rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(camera.K).T @ base_T_cam[:3, :3].T
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
-    for is_seen, ground, turn, edge in ((seen[LEFT], left, 1.0, 0), (seen[RIGHT], right, -1.0, 1)):
-        if not is_seen:
+    for edge, ground, turn, corner in ((LEFT, left, 1.0, 0), (RIGHT, right, -1.0, 1)):
+        if not seen[edge]:
             continue
         # A camera that looks down sees uprights lean: any height may be that of the side.
-        lean = float(wrap_angle(bearing[edge + 2] - bearing[edge]))
+        lean = float(wrap_angle(bearing[corner + 2] - bearing[corner]))
         along = np.arctan2(*(ground - origin)[::-1]) + lean / 2
         normal = turn * np.array([-np.sin(along), np.cos(along)])
-        variance = (FOOT_SIGMA_PX * float(normal @ by_px[:, 0])) ** 2 + (UNIFORM_SIGMA * range_m * lean) ** 2
+        variance = (edge_px[edge] * float(normal @ by_px[:, 0])) ** 2 + (UNIFORM_SIGMA * range_m * lean) ** 2
         rows.append((normal, 0.0, variance, whole))
     ahead = (foot - origin) / range_m
     normal = np.array([left[1] - right[1], right[0] - left[0]])
     normal = normal / np.hypot(*normal)
     normal = -normal if normal @ ahead > 0 else normal
-    variance = (FOOT_SIGMA_PX * float(normal @ by_px[:, 1])) ** 2
+    variance = (edge_px[BOTTOM] * float(normal @ by_px[:, 1])) ** 2
     if homography_covariance is not None:
         variance += float(normal @ ground_covariances(ground_H_image, homography_covariance, uv[None])[0] @ normal)
     rows.append((normal, float(normal @ (foot - origin)), variance, contact))
@@ -82,7 +84,7 @@ def place_obstacle(
     above_m = -range_m * float(rays[:2, 2].sum() / np.hypot(rays[:2, 0], rays[:2, 1]).sum())
     # Seen from above, the upper edge is that of the far side.
     if seen[TOP] and spanned_m > 0 and above_m < typical[2] + size_sigma[2]:
-        share = np.hypot(size_sigma[2] / typical[2], np.sqrt(2) * FOOT_SIGMA_PX / float(box_px[3] - box_px[1]))
+        share = np.hypot(size_sigma[2] / typical[2], np.hypot(edge_px[TOP], edge_px[BOTTOM]) / (box_px[3] - box_px[1]))
         by_height_m = range_m * typical[2] / spanned_m
         rows.append((-ahead, -by_height_m, (share * by_height_m) ** 2, contact))
     normals, offsets, variances, parts = (np.array(column) for column in zip(*rows, strict=True))
