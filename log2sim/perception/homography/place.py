@@ -8,13 +8,11 @@ from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
 from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian, wrap_angle
 from log2sim.perception.boxes import LIMIT_SIGMAS, UNIFORM_SIGMA
 from log2sim.perception.homography.correspondences import undistorted_pixels
-from log2sim.perception.homography.estimate import FOOT_SIGMA_PX
+from log2sim.perception.homography.estimate import FOOT_SIGMA_M, FOOT_SIGMA_PX
 from log2sim.perception.homography.fit import ground_covariances
 
 # Beyond this range one pixel of a camera at car height is several meters.
 MAX_RANGE_M = 60.0
-# Standard deviation, m, of the ground itself and of where in its outline an obstacle is, along each axis.
-GROUND_POSITION_SIGMA_M = 0.2
 # Yaws at which an obstacle is tried, up to half turns; they are 10 degrees apart.
 YAWS_RAD = np.arange(18) * np.pi / 18
 # Shares of length and width within which an obstacle touches the ground: between the axles (a car's wheelbase is 2.7 of 4.4 m, that of
@@ -107,7 +105,7 @@ def place_obstacle(
     # Errors of edges that do not fit to each other are larger than they say (Birge, 1932).
     if len(rows) > 2:
         total *= max(1.0, float(squared.min()) / (len(rows) - 2))
-    return origin + mean, total + GROUND_POSITION_SIGMA_M**2 * np.eye(2)
+    return origin + mean, total + FOOT_SIGMA_M**2 * np.eye(2)
 
 
 def spanned_height_m(ground_H_image: Array, camera: Camera, box_px: Array, base_T_cam: Array) -> float:
