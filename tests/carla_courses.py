@@ -6,18 +6,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from worlds import waypoints
 
-from log2sim.datatypes import Agent, Scenario, Waypoints
+from log2sim.datatypes import Agent, Scenario
 from log2sim.simulation.carla.data import BY_CATEGORY
 
 SIZES = {blueprint: size_m for offers in BY_CATEGORY.values() for blueprint, size_m in offers.items()}
 
 
 def agent(name: str, t: Any, x: Any, y: Any, yaw: Any, speed: Any, **changes: Any) -> Agent:
-    t, x, y, yaw, speed = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (t, x, y, yaw, speed)))
-    z = np.full(len(t), 0.8)
-    w = Waypoints(t, x, y, z, yaw, speed, np.ones(len(t), dtype=bool), np.full(len(t), 0.1))
-    made = Agent(name, "car", (4.6, 1.9, 1.6), w, rear_axle_offset_m=1.4)
+    made = Agent(name, "car", (4.6, 1.9, 1.6), waypoints(t, x, y, 0.8, yaw, speed), rear_axle_offset_m=1.4)
     return replace(made, **changes)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import shlex
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -36,11 +37,12 @@ class Ran:
         return self.err.strip()
 
 
-def run(*arguments: object) -> Ran:
-    """Run `log2sim ARGUMENTS` through `main`, with its exit code and what it printed."""
+def run(command: object = "", *arguments: object) -> Ran:
+    """Run `log2sim COMMAND ARGUMENTS` through `main`, with its exit code and what it printed; a shell splits the command alone."""
+    argv = ["log2sim", *shlex.split(str(command)), *map(str, arguments)]
     out, err = io.StringIO(), io.StringIO()
     with (
-        mock.patch.object(sys, "argv", ["log2sim", *map(str, arguments)]),
+        mock.patch.object(sys, "argv", argv),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):

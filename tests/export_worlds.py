@@ -10,21 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds import waypoints
 
-from log2sim.datatypes import Agent, Scenario, Waypoints
+from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
 
 ROOT = Path(__file__).resolve().parents[1]
 RADIUS_M, SPEED_MPS, REAR_M = 12.0, 6.0, 1.4
-
-
-def waypoints(t_s: Array, x_m: Array, y_m: Array, yaw_rad: Array, speed_mps: Array | float) -> Waypoints:
-    """Waypoints on flat ground whose box centers are 0.8 m up."""
-    t = np.asarray(t_s, dtype=float)
-    x, y, yaw, speed, z = (
-        np.broadcast_to(np.asarray(v, dtype=float), t.shape) for v in (x_m, y_m, yaw_rad, speed_mps, 0.8)
-    )
-    return Waypoints(t, x, y, z, wrap_angle(yaw), speed, np.ones(len(t), dtype=bool), np.full(len(t), 0.1))
 
 
 def straight(
@@ -40,7 +32,7 @@ def straight(
     t = np.array([0.0, 0.13, 0.2, 0.55, 1.0, 1.9, 3.0]) if t_s is None else np.asarray(t_s, dtype=float)
     x, y = start[0] + speed * np.cos(yaw) * t, start[1] + speed * np.sin(yaw) * t
     return Agent(
-        name, category, (4.4, 1.8, 1.6), waypoints(t, x, y, np.full(len(t), yaw), speed), rear_axle_offset_m=1.3
+        name, category, (4.4, 1.8, 1.6), waypoints(t, x, y, 0.8, wrap_angle(yaw), speed), rear_axle_offset_m=1.3
     )
 
 
@@ -51,7 +43,9 @@ def circling(name: str = "ego") -> Agent:
     yaw = angle + np.pi / 2
     x = RADIUS_M * np.cos(angle) + REAR_M * np.cos(yaw)
     y = RADIUS_M * np.sin(angle) + REAR_M * np.sin(yaw)
-    return Agent(name, "car", (4.5, 1.9, 1.6), waypoints(t, x, y, yaw, SPEED_MPS), rear_axle_offset_m=REAR_M)
+    return Agent(
+        name, "car", (4.5, 1.9, 1.6), waypoints(t, x, y, 0.8, wrap_angle(yaw), SPEED_MPS), rear_axle_offset_m=REAR_M
+    )
 
 
 def world(*agents: Agent, name: str = "world") -> Scenario:

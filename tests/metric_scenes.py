@@ -5,19 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from worlds import waypoints
 
-from log2sim.datatypes import Agent, Scenario, Waypoints
+from log2sim.datatypes import Agent, Scenario
 
 T_S = np.arange(31) / 10
 CAR = (4.4, 1.8, 1.5)
 
 
 def agent(id, x, y=0.0, yaw=0.0, speed=0.0, t_s=T_S, category="car", size_m=CAR, visible=None, **kwargs):
-    n = len(t_s)
-    fill = [np.broadcast_to(np.asarray(v, dtype=float), n).copy() for v in (x, y, 0.0, yaw, speed)]
-    seen = None if visible is None else np.broadcast_to(visible, n).copy()
-    points = Waypoints(t_s, *fill, np.ones(n, dtype=bool), np.zeros(n), visible=seen)
-    return Agent(id, category, size_m, points, **kwargs)
+    seen = None if visible is None else np.broadcast_to(visible, len(t_s)).copy()
+    w = waypoints(t_s, x, y, 0.0, yaw, speed, sigma_m=0.0, visible=seen)
+    return Agent(id, category, size_m, w, **kwargs)
 
 
 def scenario(*agents, **kwargs):

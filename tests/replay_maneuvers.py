@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from worlds import waypoints
 
-from log2sim.datatypes import Agent, Scenario, Waypoints
+from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
 
 OFFSET_M = 1.3
@@ -27,20 +28,8 @@ def agent_from(
     static: bool = False,
 ) -> Agent:
     """An agent whose columns (T,) are box centers."""
-    n = len(t_s)
-    waypoints = Waypoints(
-        np.asarray(t_s, float),
-        np.asarray(x_m, float),
-        np.asarray(y_m, float),
-        np.zeros(n),
-        wrap_angle(yaw_rad),
-        np.asarray(speed_mps, float),
-        np.ones(n, bool),
-        np.full(n, 0.05),
-    )
-    return Agent(
-        id=id, category=category, size_m=size_m, waypoints=waypoints, rear_axle_offset_m=offset_m, static=static
-    )
+    w = waypoints(t_s, x_m, y_m, 0.0, wrap_angle(yaw_rad), speed_mps, sigma_m=0.05)
+    return Agent(id, category, size_m, w, rear_axle_offset_m=offset_m, static=static)
 
 
 def driven(

@@ -76,18 +76,8 @@ def reconstruct(folder: Path, *options: object, log: Path | None = None) -> Ran:
     """Reconstruct into `out/` beside the log; on an error nothing may be there."""
     out = folder.parent / "out"
     out.mkdir(exist_ok=True)
-    ran = run(
-        "reconstruct",
-        log or folder,
-        "--out",
-        out / "s.json",
-        "--report",
-        out / "r.json",
-        "--detector",
-        "labels",
-        *AGENTS_ONLY,
-        *options,
-    )
+    command = f"reconstruct '{log or folder}' --out {out}/s.json --report {out}/r.json --detector labels"
+    ran = run(command, *AGENTS_ONLY, *options)
     if ran.code != 0:
         assert names(out) == []
     return ran

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import names, run
-from worlds import tiny_log
+from worlds import tiny_log, waypoints
 
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Detections, Frame, Log, Scenario, Waypoints
@@ -89,11 +89,8 @@ def test_less_error_wins_and_of_equal_errors_the_cheaper() -> None:
 
 
 def moving(name: str, xy: Array, tick_s: float = 0.1) -> Agent:
-    n = len(xy)
-    speed = np.full(n, 3.0)
-    columns = {"z_m": np.zeros(n), "yaw_rad": np.zeros(n), "speed_mps": speed, "sigma_xy_m": np.full(n, 0.1)}
-    w = Waypoints(t_s=np.arange(n) * tick_s, x_m=xy[:, 0], y_m=xy[:, 1], observed=np.ones(n, dtype=bool), **columns)
-    return Agent(name, "car", (4.0, 1.8, 1.5), w, quality={"detections": n})
+    w = waypoints(np.arange(len(xy)) * tick_s, *xy.T, speed_mps=3.0)
+    return Agent(name, "car", (4.0, 1.8, 1.5), w, quality={"detections": len(xy)})
 
 
 def world(*offsets: tuple[float, float]) -> Scenario:

@@ -252,18 +252,7 @@ def test_every_command_names_the_files_it_wrote(
     monkeypatch.chdir(tmp_path)
     scenario = tiny_scenario
     commands = [
-        (
-            "reconstruct",
-            tiny_folder,
-            "--detector",
-            "labels",
-            "-o",
-            "s.json",
-            "--report",
-            "r.json",
-            "--topdown",
-            "t.png",
-        ),
+        (f"reconstruct {tiny_folder} --detector labels -o s.json --report r.json --topdown t.png",),
         ("detect", tiny_folder, "--detector", "lidar:labels", "-o", "boxes.json"),
         ("replay", scenario, "-o", "replay.json"),
         ("plot", scenario, "-o", "plot.svg"),

@@ -14,12 +14,12 @@ from test_size import T0_NS, measured, moved
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.evidence import SIGNS, Recording, gather
 from log2sim.agents.hypotheses import Part
-from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, judge, probabilities
+from log2sim.agents.judge import judge, probabilities
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
 from log2sim.agents.weights import RIGHT, THERE, VARIANCES
 from log2sim.datatypes import Finding, Log, Track
-from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
 from log2sim.perception.sync import Schedule
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
@@ -70,7 +70,7 @@ def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more, lid
     table[name] = table[name] + np.array([0.0, SIGNS[name] * more])
     there, right = probabilities(table, lidar=lidar)
     assert there[0] <= there[1]
-    assert MIN_CONFIDENCE <= right[0] <= right[1] <= MAX_CONFIDENCE
+    assert MIN_PROBABILITY <= right[0] <= right[1] <= MAX_PROBABILITY
 
 
 @pytest.mark.parametrize("make", [parked, driving])

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from cooperation_worlds import blind_area, curve, hidden_traffic, overlap
+from cooperation_worlds.blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S
+from cooperation_worlds.hidden_traffic import HiddenTraffic, sweeps
+from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast
 
 from log2sim.datatypes import Boxes3D
 from log2sim.synth.traffic_data import START_NS
-
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tools"))
-
-from cooperation_worlds import blind_area, curve, hidden_traffic, overlap  # noqa: E402
-from cooperation_worlds.blind_area import FIRST_SIGHT_S, ROAD_SIGHT_S  # noqa: E402
-from cooperation_worlds.hidden_traffic import HiddenTraffic, sweeps  # noqa: E402
-from cooperation_worlds.world import ROAD_LIDAR, VEHICLE_LIDAR, World, cast  # noqa: E402
 
 DRAW = {"range": curve.draw, "blind_area": blind_area.draw, "overlap": overlap.draw}
 SEEDS = (1, 5)  # the first one drawn for 5 shows the walker too early

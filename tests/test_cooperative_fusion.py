@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain_settings import AGENTS_ALONE
-from worlds import rows_at, tiny_log, tiny_table
+from worlds import cloud_at, rows_at, tiny_log, tiny_table
 
 from log2sim.config import Config
 from log2sim.datatypes import Boxes3D, Measurements
@@ -24,7 +24,7 @@ from log2sim.perception.cooperative import (
     refine_by_views,
     take_off_offset,
 )
-from log2sim.perception.lidar.cloud import Cloud, CloudSensor, assemble_views, join_parts, obstacles_of
+from log2sim.perception.lidar.cloud import CloudSensor, assemble_views, join_parts, obstacles_of
 from log2sim.perception.lidar.measure import follow_box, measure
 from log2sim.pipeline import reconstruct
 from log2sim.plan import FusionLevel, fusion_level
@@ -203,11 +203,8 @@ def outline_points(x, y, length=4.5, width=1.8, step=0.1):
 
 
 def view_of(xyz, sensor, *, end="vehicle", stamp_ns=0):
-    n = len(xyz)
-    return Cloud(
-        stamp_ns, np.zeros(3), xyz.astype(np.float32), np.zeros(n, np.float32), np.array(sensor, np.float32),
-        np.zeros(n, bool), xyz[:, 2].astype(np.float32), (CloudSensor(n, np.array(sensor, float), np.zeros(3), end),),
-    )  # fmt: skip
+    of = (CloudSensor(len(xyz), np.array(sensor, float), np.zeros(3), end),)
+    return cloud_at(xyz, stamp_ns=stamp_ns, sensor=sensor, ground=np.zeros(len(xyz), bool), sensors=of)
 
 
 def test_boxes_are_sought_where_the_other_end_sees_them_later() -> None:

@@ -203,7 +203,7 @@ def found_in(example, detector) -> SceneBoxes:
 @pytest.fixture(scope="module", params=["vehicle", "roadside"])
 def scenes(request):
     detector = open_shipped(request.param, LidarConfig())
-    examples = [draw_example(request.param, (31, k)) for k in range(10)]
+    examples = [draw_example(request.param, (31, k)) for k in range(7)]
     return detector, examples, [found_in(e, detector) for e in examples]
 
 
@@ -213,7 +213,7 @@ def test_most_vehicles_with_many_points_are_found_and_few_are_invented(scenes) -
     truth = SceneBoxes.join([vehicles(e.truth) for e in examples])
     near = truth.ignoring((truth.points < 50) | (truth.range_m > 25))
     matches = match_detections(sure, near, Criterion("iou_bev", 0.5))
-    assert matches.truths > 40
+    assert matches.truths > 25
     assert matches.right.sum() / matches.truths > 0.75
     # What is found farther away, or by few points, is no invention.
     every = match_detections(sure, truth, Criterion("iou_bev", 0.5))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_detect_labels import CAR, SECOND, log_with
+from worlds import cloud_at
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Boxes3D, Log
@@ -20,10 +21,8 @@ ORIGIN = np.array([1000.0, 2000.0, 30.0])
 
 def cloud_of(xyz_map: Any, *, stamp_ns: int = 0, ground_z: float = 30.0) -> Cloud:
     """A cloud of points (N, 3) of the map, on a flat ground, seen from 2 m above the origin."""
-    xyz = (np.asarray(xyz_map, np.float64).reshape(-1, 3) - ORIGIN).astype(np.float32)
-    height = (xyz[:, 2] + ORIGIN[2] - ground_z).astype(np.float32)
-    sensor = np.array([0.0, 0.0, 2.0], np.float32)
-    return Cloud(stamp_ns, ORIGIN, xyz, np.zeros(len(xyz), np.float32), sensor, np.abs(height) <= 0.2, height)
+    xyz = np.asarray(xyz_map, np.float64).reshape(-1, 3)
+    return cloud_at(xyz - ORIGIN, xyz[:, 2] - ground_z, stamp_ns=stamp_ns, origin=ORIGIN)
 
 
 def detect(log: Log, cloud: Cloud, **settings: Any) -> Boxes3D:

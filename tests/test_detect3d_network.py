@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from lidar_networks import INFO, empty_maps, encode, info, write_network
 from numpy.typing import ArrayLike, NDArray
+from worlds import cloud_at
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
@@ -27,13 +28,9 @@ LOG = Log("made", "log2sim", {}, {}, {})
 
 def cloud_of(level: ArrayLike, *, slope: Sequence[float] = (0.0, 0.0), t_s: ArrayLike = 0.0, **changes: Any) -> Cloud:
     """A cloud of points (N, 3) relative to `ORIGIN` whose z is the height above a ground with a slope."""
-    xyz = np.asarray(level, np.float32).reshape(-1, 3).copy()
-    height = xyz[:, 2].copy()
-    if any(slope):
-        xyz[:, 2] += xyz[:, :2] @ np.asarray(slope, np.float32)
-    stamps = np.broadcast_to(np.asarray(t_s, np.float32), len(xyz)).copy()
-    sensor = np.array([0, 0, 2], np.float32)
-    return replace(Cloud(10**18, ORIGIN, xyz, stamps, sensor, np.abs(height) <= 0.2, height), **changes)
+    flat = np.asarray(level, np.float32).reshape(-1, 3)
+    rise = (flat[:, :2] @ np.asarray(slope, np.float32))[:, None] * np.float32([0, 0, 1]) if any(slope) else 0.0
+    return replace(cloud_at(flat + rise, flat[:, 2], t_s=t_s, origin=ORIGIN), **changes)
 
 
 def solid(x: float, y: float, length: float = 4.0, width: float = 1.8, height: float = 1.5, yaw: float = 0.0) -> Array:

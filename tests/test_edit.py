@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from worlds import waypoints
 
 from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.edit.apply import edit
@@ -22,9 +23,7 @@ TRUTH = Path(__file__).resolve().parents[1] / "samples" / "crossing" / "truth.js
 
 def agent(id: str, t_s: Array, x_m: Any, y_m: Any, yaw_rad: Any, speed_mps: Any, **changes: Any) -> Agent:
     """A car with these columns, scalars standing for all times."""
-    x, y, yaw, speed = (np.broadcast_to(np.asarray(c, float), len(t_s)).copy() for c in (x_m, y_m, yaw_rad, speed_mps))
-    columns = {"observed": np.ones(len(t_s), bool), "sigma_xy_m": np.full(len(t_s), 0.1), "z_m": np.full(len(t_s), 0.8)}
-    w = Waypoints(t_s=t_s, x_m=x, y_m=y, yaw_rad=wrap_angle(yaw), speed_mps=speed, **columns)
+    w = waypoints(t_s, x_m, y_m, 0.8, wrap_angle(yaw_rad), speed_mps)
     return Agent(**{"id": id, "category": "car", "size_m": (4.0, 2.0, 1.6), "waypoints": w, **changes})
 
 

@@ -148,20 +148,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Callable[..., st
     python = peer("rerun")
     out = tmp_path_factory.mktemp("rerun")
     for folder in ("a", "b"):
-        python(
-            "-W",
-            "error",
-            "-m",
-            "log2sim",
-            "export",
-            SAMPLE / "truth.json",
-            "--to",
-            "rerun",
-            "--out",
-            out / folder,
-            "--log",
-            SAMPLE,
-        )
+        export = f"export {SAMPLE}/truth.json --to rerun --out {out / folder} --log {SAMPLE}"
+        python(*f"-W error -m log2sim {export}".split())
     return python, out / "a" / "crossing.rrd", out / "b" / "crossing.rrd"
 
 

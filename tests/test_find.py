@@ -230,18 +230,11 @@ def test_the_commands(folder, tmp_path) -> None:
     assert "overtaking" in counted.out
     fields = run("find", folder, "--fields")
     assert "ego.speed_mps" in fields.out
-    ran = run(
-        "find",
-        folder,
-        "overtaking and relative_speed_mps > 1",
-        "-o",
-        tmp_path / "hits.html",
-        "--table",
-        tmp_path / "hits.parquet",
-    )
+    asked = f"find {folder} 'overtaking and relative_speed_mps > 1'"
+    ran = run(f"{asked} -o {tmp_path}/hits.html --table {tmp_path}/hits.parquet")
     assert ran.code == 0
     assert "hits in 2 scenarios" in ran.out
-    rows = json.loads(run("find", folder, "overtaking and relative_speed_mps > 1", "--json").out)
+    rows = json.loads(run(f"{asked} --json").out)
     assert len(rows) == (tmp_path / "hits.html").read_text().count("<article>")
     assert all(r["tag"] == "overtaking" and r["relative_speed_mps"] > 1 for r in rows)
     assert "did you mean 'overtaking'" in run("find", folder, "overtakin").line

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from plain_settings import AGENTS_ALONE
-from worlds import camera_ahead, outline_px, scan, standing
+from worlds import camera_ahead, cloud_at, outline_px, scan, standing
 
 from log2sim.config import Config
 from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
@@ -20,7 +20,7 @@ from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rp
 from log2sim.perception.first_pass import base_poses, observe
 from log2sim.perception.frames import AHEAD, give_pictures, work_ahead
 from log2sim.perception.fusion import fuse
-from log2sim.perception.lidar.cloud import CELL_RAD, Cloud, CloudSensor, cloud_origin, obstacles_of, sample_rays
+from log2sim.perception.lidar.cloud import CELL_RAD, CloudSensor, cloud_origin, obstacles_of, sample_rays
 from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import synchronize
@@ -350,14 +350,8 @@ def test_closing_an_iterator_does_not_wait_for_its_work() -> None:
     assert in_time
 
 
-def cloud_of(xyz, *, height=None, sensors=(), t_s=None):
-    n = len(xyz)
-    height = xyz[:, 2] if height is None else height
-    t_s = np.zeros(n) if t_s is None else t_s
-    return Cloud(
-        10**18, np.array([1e5, 2e6, 3.0]), xyz.astype(np.float32), t_s.astype(np.float32),
-        np.array([0, 0, 2.0], np.float32), np.abs(height) < 0.1, height.astype(np.float32), tuple(sensors),
-    )  # fmt: skip
+def cloud_of(xyz, **columns):
+    return cloud_at(xyz, origin=(1e5, 2e6, 3.0), **columns)
 
 
 def directions(rays):

@@ -203,7 +203,7 @@ def test_sigmas_of_bridges_cover_their_errors(speed: float, turn: float, hz: int
     found = check_poses(frozen(true, start_s, start_s + 1.0))
     poses, known = found.track.at(true.t_ns)
     off = np.linalg.norm(poses[known, :2, 3] - true.map_T_ego[known, :2, 3], axis=1)
-    sigma = found.track.sigmas_at(true.t_ns[known], (0.02, 0.002))[:, 0]
+    sigma = found.track.sigmas_at(true.t_ns[known])[:, 0]
     assert kinds(found) == ["frozen_poses"]
     assert np.all(off < 5 * sigma)
 

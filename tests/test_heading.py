@@ -11,7 +11,7 @@ from fits import outline as fit_outline
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_size import bare
-from worlds import rows_at
+from worlds import rows_at, waypoints
 
 from log2sim.agents import heading
 from log2sim.agents.candidate import Timeline, candidate_of
@@ -29,7 +29,7 @@ from log2sim.agents.heading import (
 from log2sim.agents.moving import turn_to_courses
 from log2sim.agents.size import TrackGeometry
 from log2sim.config import Config
-from log2sim.datatypes import TYPICAL_SIZE_M, Boxes3D, Track, Waypoints
+from log2sim.datatypes import TYPICAL_SIZE_M, Boxes3D, Track
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.perception.boxes import rotate
 
@@ -45,10 +45,7 @@ def candidate(x, y, yaw, speed=0.0, *, front=None, score=0.9, axis=True, categor
     m = rows_at(xy, category, t_ns=T_NS)
     if front is not None:
         m = replace(m, box_yaw_rad=np.full(20, front), heading_score=np.full(20, score))
-    w = Waypoints(
-        t_s=t, x_m=xy[:, 0], y_m=xy[:, 1], z_m=np.zeros(20), yaw_rad=np.full(20, yaw), speed_mps=np.full(20, speed),
-        observed=np.ones(20, dtype=bool), sigma_xy_m=np.full(20, 0.1), sigma_yaw_rad=np.full(20, 0.02),
-    )  # fmt: skip
+    w = waypoints(t, *xy.T, 0.0, yaw, speed, sigma_yaw_rad=np.full(20, 0.02))
     geometry = TrackGeometry(CAR_M, xy, m.covariance, np.zeros(20), yaw if axis else None)
     return candidate_of(Track(category, np.arange(20), m), geometry, w, {}, static=speed == 0)
 
@@ -185,11 +182,7 @@ def odds_of(seen, turn=0.0, shift=(0.0, 0.0), yaw=0.0, ground_m=0.0):
         track.measurements, cluster=tuple(parts), bottom_m=np.full(3, ground_m),
         sensor_m=np.tile(np.append(rotate(seen.view_m, turn) + shift, ground_m + 2.0), (3, 1)),
     )  # fmt: skip
-    t = np.array([0.0, 0.2])
-    w = Waypoints(
-        t_s=t, x_m=np.full(2, shift[0]), y_m=np.full(2, shift[1]), z_m=np.zeros(2), yaw_rad=np.full(2, turn + yaw),
-        speed_mps=np.zeros(2), observed=np.ones(2, dtype=bool), sigma_xy_m=np.full(2, 0.1),
-    )  # fmt: skip
+    w = waypoints([0.0, 0.2], *shift, 0.0, turn + yaw)
     return heading.outline_log_odds(replace(track, measurements=m), w, np.array([0.0, 0.1, 0.2]), tuple(seen.size_m))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from worlds import camera_ahead, outline_px, scan, standing
+from worlds import camera_ahead, cloud_at, outline_px, scan, standing
 
 from log2sim.datatypes import Boxes3D, Detections, Measurements
 from log2sim.geometry import NS_PER_S
@@ -36,10 +36,7 @@ def in_image(*places: tuple[float, float], category: str = "car", score: float =
 
 def cloud_of(world: NDArray[np.float64] | None = None) -> Cloud:
     """The cloud of points (N, 3) on flat ground; none by default."""
-    world = np.zeros((0, 3)) if world is None else world
-    height = world[:, 2].astype(np.float32)
-    t_s, sensor = np.zeros(len(world), np.float32), np.array([0.0, 0.0, 1.9], np.float32)
-    return Cloud(NS_PER_S, np.zeros(3), world.astype(np.float32), t_s, sensor, height < 0.1, height)
+    return cloud_at(np.zeros((0, 3)) if world is None else world, stamp_ns=NS_PER_S, sensor=(0.0, 0.0, 1.9))
 
 
 def joined(

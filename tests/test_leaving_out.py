@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plain_settings import AGENTS_ALONE
 from test_pipeline import assert_same_agents
-from worlds import scan, standing, tiny_log
+from worlds import scan, standing, tiny_log, waypoints
 
 import log2sim.agents.estimate
 import log2sim.perception.lidar.cloud
@@ -19,7 +19,7 @@ import log2sim.pipeline
 import log2sim.plan
 from log2sim import Config, Scenario, reconstruct, replay
 from log2sim.agents.estimate import simplify_waypoints
-from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep, Waypoints
+from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.files.documents import check
 from log2sim.geometry import PoseTrack, transform
@@ -280,16 +280,8 @@ def test_a_parked_car_needs_no_controller(tiny: Log) -> None:
 # --- waypoints
 
 
-def way(
-    t: np.ndarray, x: np.ndarray, y: np.ndarray, speed: np.ndarray, observed: np.ndarray | None = None
-) -> Waypoints:
-    seen = np.ones(len(t), bool) if observed is None else observed
-    yaw = np.arctan2(np.gradient(y), np.gradient(x))
-    return Waypoints(t, x, y, np.full(len(t), 0.7), yaw, speed, seen, np.full(len(t), 0.1))
-
-
 T = np.arange(51) * 0.1
-DRIVE = way(T, 10.0 * T, np.zeros(51), np.full(51, 10.0))
+DRIVE = waypoints(T, 10.0 * T, z_m=0.7, speed_mps=10.0)
 
 
 def test_constant_motion_keeps_a_waypoint_a_second() -> None:

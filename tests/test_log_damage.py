@@ -160,17 +160,8 @@ def test_reconstruct_inspect_and_validate_tell_the_same(log_folder: Path, tmp_pa
     )
     told = {moved_box, cut_row}
     report = tmp_path / "r.json"
-    ran = run(
-        "reconstruct",
-        log_folder,
-        "--out",
-        tmp_path / "s.json",
-        "--report",
-        report,
-        "--detector",
-        "labels",
-        *AGENTS_ONLY,
-    )
+    command = f"reconstruct {log_folder} --out {tmp_path}/s.json --report {report} --detector labels"
+    ran = run(command, *AGENTS_ONLY)
     assert ran.code == 0
     assert {f"note: {line}" for line in told} <= set(ran.out.splitlines())
     assert told <= set(json.loads(report.read_text())["log"]["notes"])
@@ -198,17 +189,7 @@ def test_no_pose_at_the_ticks_of_a_run_is_told_by_its_reason(tiny_folder: Path, 
     later = log.ego.t_ns > log.streams["front"].t_ns[0] + NS_PER_S // 2
     part = log.changed(ego=PoseTrack(log.ego.t_ns[later], log.ego.map_T_ego[later]))
     write_log(part, tmp_path / "log")
-    ran = run(
-        "reconstruct",
-        tmp_path / "log",
-        "--out",
-        tmp_path / "s.json",
-        "--detector",
-        "labels",
-        "--stop",
-        "0.1",
-        "--quiet",
-    )
+    ran = run(f"reconstruct {tmp_path}/log --out {tmp_path}/s.json --detector labels --stop 0.1 --quiet")
     assert ran.code == 4
     assert "the ego poses are from 17" in ran.line
     assert "no ego poses" not in ran.line

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from worlds import waypoints
 
 from log2sim import Scenario
-from log2sim.datatypes import Agent, MapFeatures, MapFrame, MapLane, Marking, RoadBorder, Signal, Waypoints
+from log2sim.datatypes import Agent, MapFeatures, MapFrame, MapLane, Marking, RoadBorder, Signal
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array
 
@@ -35,14 +36,9 @@ def features() -> MapFeatures:
 
 
 def scenario(**parts: Any) -> Scenario:
-    flat = np.zeros(2)
-    waypoints = Waypoints(
-        t_s=np.array([0.0, 1.0]), x_m=flat, y_m=flat, z_m=flat, yaw_rad=flat, speed_mps=flat,
-        observed=np.ones(2, bool), sigma_xy_m=flat,
-    )  # fmt: skip
     signal = Signal("s1", np.array([1.0, 2.0, 5.1]), 0.3, np.array([0.0, 2.5]), np.array(["red", "green"]), 0.2)
     parts = {"map_features": features(), "signals": (signal,), **parts}
-    return Scenario("s", 10**18, 5.0, (Agent("a", "car", (4.0, 2.0, 1.5), waypoints),), **parts)
+    return Scenario("s", 10**18, 5.0, (Agent("a", "car", (4.0, 2.0, 1.5), waypoints([0.0, 1.0])),), **parts)
 
 
 def test_a_file_gives_back_the_same_numbers(tmp_path: Path) -> None:

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from ground_worlds import World, empty_scenario, height_at, is_paint, world_log
+from worlds import waypoints
 
 from log2sim.config import MapConfig
-from log2sim.datatypes import Agent, Stream, Sweep, Waypoints
+from log2sim.datatypes import Agent, Stream, Sweep
 from log2sim.geometry import Array, apply
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap, Raster
@@ -92,10 +93,9 @@ def test_cameras_alone_lie_on_the_ground_under_the_ego() -> None:
 def moving_car(speed_mps: float = 5.0) -> Agent:
     """A car that drives along beside the ego, ahead of it."""
     t = np.linspace(0, 2, 5)
-    x, one = 8.0 + speed_mps * t, np.ones(5)
-    z = height_at(np.column_stack([x, -2.5 * one])) + 0.75
-    waypoints = Waypoints(t, x, -2.5 * one, z, 0 * one, speed_mps * one, one > 0, 0.1 * one)
-    return Agent("car", "car", (4.5, 1.8, 1.5), waypoints)
+    x = 8.0 + speed_mps * t
+    z = height_at(np.column_stack([x, np.full(5, -2.5)])) + 0.75
+    return Agent("car", "car", (4.5, 1.8, 1.5), waypoints(t, x, -2.5, z, 0.0, speed_mps))
 
 
 def test_pictures_and_points_of_moving_agents_are_left_out() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
-from worlds import Solid, camera_ahead, outline_px, scan, standing
+from worlds import Solid, camera_ahead, cloud_at, outline_px, scan, standing
 
 from log2sim.datatypes import Boxes3D, Detections
 from log2sim.geometry import apply, inverse, transform
 from log2sim.perception.boxes import rotate
-from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
+from log2sim.perception.lidar.cloud import ON_GROUND_M
 from log2sim.perception.lidar.clusters import continued_sides
 from log2sim.perception.lidar.measure import measure
 from log2sim.perception.lidar.projection import View
@@ -31,19 +31,9 @@ def view_ahead(far=(0.0, 0.0, 0.0), yaw=0.0):
     return View(camera, T0_NS, transform(camera.mount_T_cam[:3, :3], at))
 
 
-def cloud_of(world, *, far=(0.0, 0.0, 0.0), height=None, t_s=None):
+def cloud_of(world, *, far=(0.0, 0.0, 0.0), height=None, t_s=0.0):
     """The cloud of points (N, 3) on flat ground, with exact heights, as seen from `SENSOR`, all moved by `far`."""
-    height = world[:, 2] if height is None else height
-    t_s = np.zeros(len(world)) if t_s is None else t_s
-    return Cloud(
-        T0_NS,
-        np.array(far),
-        world.astype(np.float32),
-        np.asarray(t_s, dtype=np.float32),
-        np.array(SENSOR, dtype=np.float32),
-        np.abs(height) <= ON_GROUND_M,
-        height.astype(np.float32),
-    )
+    return cloud_at(world, height, t_s=t_s, stamp_ns=T0_NS, origin=far, sensor=SENSOR)
 
 
 def measure_view(view, found, cloud, mode="robust"):

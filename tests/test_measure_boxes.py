@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import Solid, scan, standing
+from worlds import Solid, cloud_at, scan, standing
 
 from log2sim.agents.evidence import image_confidence
 from log2sim.agents.moving import heading_log_odds
@@ -26,13 +26,9 @@ def cloud_of(solids: list[Solid], *, turn_rad: float = 0.0, flip: float = 1.0, n
     """A sweep all around over flat ground, turned about the sensor or mirrored in y."""
     xyz, owner = scan(solids, azimuth_deg=(-180.0, 180.0), steps=(1440, 40), noise_m=noise_m, seed=1)
     xyz = (xyz * [1.0, flip, 1.0]) @ rotation_from_rpy(0, 0, turn_rad).T
-    height = xyz[:, 2].astype(np.float32)
     near = np.flatnonzero(np.abs(xyz[:, :2]).max(axis=1) < 70)
     ground = (owner < 0)[near]
-    return Cloud(
-        NS_PER_S, ORIGIN, xyz[near].astype(np.float32), np.zeros(len(near), np.float32), np.array(SENSOR, np.float32),
-        ground, height[near],
-    )  # fmt: skip
+    return cloud_at(xyz[near], stamp_ns=NS_PER_S, origin=ORIGIN, sensor=SENSOR, ground=ground)
 
 
 def boxes_of(solids: list[Solid], *, turn_rad: float = 0.0, flip: float = 1.0, yaw_error_rad: float = 0.0) -> Boxes3D:

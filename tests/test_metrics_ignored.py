@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import tiny_log
+from worlds import tiny_log, waypoints
 
-from log2sim.datatypes import Agent, IgnoreRegions, ImageRegions, LabelView, Scenario, Waypoints
+from log2sim.datatypes import Agent, IgnoreRegions, ImageRegions, LabelView, Scenario
 from log2sim.errors import LogError, ScenarioError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check
@@ -28,9 +28,7 @@ AHEAD_WXYZ = np.array([0.5, -0.5, 0.5, -0.5])
 
 
 def agent(id, x, y=0.0, z=EYE_M, t_s=T_S, category="car", size_m=CAR):
-    n = len(t_s)
-    columns = [np.broadcast_to(np.asarray(v, dtype=float), n).copy() for v in (x, y, z, 0.0, 0.0)]
-    return Agent(id, category, size_m, Waypoints(t_s, *columns, np.ones(n, dtype=bool), np.zeros(n)))
+    return Agent(id, category, size_m, waypoints(t_s, x, y, z, sigma_m=0.0))
 
 
 def scenario(*agents, **kwargs):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,6 @@ from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check, write_json
 from log2sim.report import Result
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
 

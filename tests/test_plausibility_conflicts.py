@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import rows_at
+from worlds import rows_at, waypoints
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents
 from log2sim.agents.judge import conflict_doubts, extend_static, find_conflicts, resolve_conflicts, suppress_duplicates
-from log2sim.datatypes import Agent, Track, Waypoints
+from log2sim.datatypes import Agent, Track
 
 T = np.linspace(0.0, 4.0, 5)
 
@@ -104,12 +104,7 @@ def test_static_agents_exist_all_the_time_but_where_something_else_is() -> None:
 
 def agent(x_m, y_m=0.0, yaw=0.0, category="car", size=(4.4, 1.8, 1.5), t=(0.0, 4.0), speed=0.0):
     t_s = np.linspace(*t, 5)
-    n = len(t_s)
-    waypoints = Waypoints(
-        t_s=t_s, x_m=x_m + speed * t_s, y_m=np.full(n, y_m), z_m=np.full(n, 0.7), yaw_rad=np.full(n, yaw),
-        speed_mps=np.full(n, speed), observed=np.ones(n, dtype=bool), sigma_xy_m=np.full(n, 0.1),
-    )  # fmt: skip
-    return Agent("", category, size, waypoints)
+    return Agent("", category, size, waypoints(t_s, x_m + speed * t_s, y_m, 0.7, yaw, speed))
 
 
 def candidate(built, confidence=0.5):

@@ -12,8 +12,9 @@ from export_worlds import straight, world
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
+from worlds import waypoints
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Finding, Scenario, Waypoints
+from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Finding, Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.simulation.policy import Controls
@@ -32,10 +33,9 @@ def make_agent(
 ) -> Agent:
     t = np.arange(count) * 0.1
     vx, vy = velocity
-    n, speed = np.ones(count), float(np.hypot(vx, vy))
-    x, y, yaw = start[0] + vx * t, start[1] + vy * t, np.arctan2(vy, vx) * n
-    waypoints = Waypoints(t, x, y, 0.8 * n, yaw, speed * n, np.ones(count, dtype=bool), 0.1 * n)
-    return Agent(name, category, TYPICAL_SIZE_M[category], waypoints, static=speed == 0)
+    speed = float(np.hypot(vx, vy))
+    w = waypoints(t, start[0] + vx * t, start[1] + vy * t, 0.8, np.arctan2(vy, vx), speed)
+    return Agent(name, category, TYPICAL_SIZE_M[category], w, static=speed == 0)
 
 
 def make_scenario(*agents: Agent, name: str = "scene") -> Scenario:

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from benchmarks.tag_worlds import traffic
 from command_line import run
+from worlds import waypoints
 
-from log2sim.datatypes import EGO, Agent, MapFeatures, Marking, Scenario, Signal, Waypoints
+from log2sim.datatypes import EGO, Agent, MapFeatures, Marking, Scenario, Signal
 from log2sim.errors import ConfigError
 from log2sim.scenarios.failure import LIMITS, Outcome, judge_run, report_page, search, with_ego
 from log2sim.scenarios.index import open_index
@@ -123,8 +124,7 @@ def test_runs_are_judged_by_what_the_ego_did(folder) -> None:
 def test_who_passes_the_stop_line_of_a_red_light_breaks_a_rule(red_from_s, expected_s, lanes) -> None:
     """At 10 m/s its front is at the line at 5.4 s; the light stands across the junction, and another faces the road that crosses."""
     t = np.linspace(0.0, 14.0, 141)
-    n = len(t)
-    w = Waypoints(t, 10.0 * (t - 5.62), *np.zeros((3, n)), np.full(n, 10.0), np.ones(n, bool), np.zeros(n))
+    w = waypoints(t, 10.0 * (t - 5.62), speed_mps=10.0, sigma_m=0.0)
     line = Marking("s", "stop_line", np.array([[0.0, -1.75, 0.0], [0.0, 1.75, 0.0]]), 0.4, "white")
     times, states = (
         (np.array([0.0, red_from_s]), np.array(["yellow", "red"])) if red_from_s else (t[:1], np.array(["green"]))

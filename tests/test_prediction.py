@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks import prediction as prediction_worlds
 from command_line import run
 from replay_maneuvers import agent_from
 from replay_scenes import line, parked, walker
@@ -23,10 +23,6 @@ from log2sim.simulation.prediction.prediction import (
     measure_predictions,
     predict_scenario,
 )
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-from benchmarks import prediction as prediction_worlds  # noqa: E402
 
 Array = np.ndarray
 

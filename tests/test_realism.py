@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import waypoints
 
-from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal, Waypoints
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, Scenario, Signal
 from log2sim.errors import ConfigError
 from log2sim.simulation.drivers import roll_out
 from log2sim.simulation.metrics.realism import Motions, Road, features, realism, signed_distance
@@ -15,9 +16,7 @@ T_S = np.arange(0.0, 9.01, 0.1)
 
 
 def agent(id, x, y, yaw, speed, category="car", size=(4.5, 1.8, 1.5)):
-    columns = [np.broadcast_to(np.asarray(c, dtype=float), T_S.shape).copy() for c in (x, y, 0.75, yaw, speed)]
-    n = len(T_S)
-    return Agent(id, category, size, Waypoints(T_S, *columns, np.ones(n, bool), np.zeros(n)))
+    return Agent(id, category, size, waypoints(T_S, x, y, 0.75, yaw, speed, sigma_m=0.0))
 
 
 def scenario(*agents):

@@ -88,16 +88,8 @@ def test_a_wheel_of_the_sdist_works_outside_the_checkout(checkout: Path, tiny_fo
     call(*pip, "wheel", "--no-build-isolation", "--no-deps", "-w", tmp_path, tmp_path / "log2sim-1.2.3", cwd=tmp_path)
     site, away = tmp_path / "site", tmp_path / "away"
     away.mkdir()
-    call(
-        *pip,
-        "install",
-        "--no-deps",
-        "--no-index",
-        "--target",
-        site,
-        tmp_path / "log2sim-1.2.3-py3-none-any.whl",
-        cwd=away,
-    )
+    install = (*pip, "install", "--no-deps", "--no-index", "--target", site)
+    call(*install, tmp_path / "log2sim-1.2.3-py3-none-any.whl", cwd=away)
     # Without site an editable installation of the checkout is out of the way, and what log2sim needs is still there.
     paths = os.pathsep.join([str(site), sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
 

@@ -146,14 +146,8 @@ def test_backward_the_forces_of_the_published_model_oppose_the_slip_as_well(acce
             (front + rear) / speed - yaw_rate,
         ]
 
-    end = run(
-        step_single_track,
-        p,
-        vehicle(speed_mps=-6.0, steer_rad=steer, pedal_mps2=-accel),
-        command(-accel, steer, True),
-        1.0,
-        0.005,
-    )[-1]
+    start = vehicle(speed_mps=-6.0, steer_rad=steer, pedal_mps2=-accel)
+    end = run(step_single_track, p, start, command(-accel, steer, True), 1.0, 0.005)[-1]
     start = [to_rear, 0.0, -6.0, 0.0, 0.0, 0.0]  # the yaw rate and the lateral velocity are zero
     solved = solve_ivp(rates, (0, 1.0), start, method="Radau", rtol=1e-9, atol=1e-11).y[:, -1]
     cg = end[0] + to_rear * math.cos(end[2]), end[1] + to_rear * math.sin(end[2])

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from worlds import waypoints
 
 from log2sim import Scenario
-from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, RoadBorder, Signal, Waypoints
+from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, RoadBorder, Signal
 from log2sim.geometry import Array
 from log2sim.visualization.page.document import SCALES, feature_columns
 from log2sim.visualization.plot import style
@@ -25,10 +26,9 @@ def line(y_m: float, *, reverse: bool = False) -> Array:
 
 def world() -> Scenario:
     t = np.arange(5.0)
-    flat = np.zeros(5)
-    waypoints = Waypoints(t, 2 * t, flat - 1.75, flat + 0.8, flat, flat + 2.0, np.ones(5, bool), flat)
+    way = waypoints(t, 2 * t, -1.75, 0.8, 0.0, 2.0, sigma_m=0.0)
     red = {"rgb": [200, 20, 30], "name": "red", "confidence": 0.9}
-    car = Agent("car", "car", (4.0, 2.0, 1.6), waypoints, color=red)
+    car = Agent("car", "car", (4.0, 2.0, 1.6), way, color=red)
     markings = (
         Marking("middle", "dashed", line(0.0), 0.12, "white"),
         Marking("side", "solid", line(3.5), 0.12, "yellow", confidence=0.3),

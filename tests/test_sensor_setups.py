@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from command_line import names, run
+from plain_settings import AGENTS_ONLY
 from worlds import tiny_log, tiny_table
 
 from log2sim.datatypes import Scenario
@@ -46,8 +47,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path
             log, truth = tiny_log(name=name, **changes)
             write_log(log, root / name)
             truth.save(root / name / "truth.json")
-            scenario = root / f"{name}.json"
-            ran = run("reconstruct", root / name, "--out", scenario, "--detector", detector, "--quiet")
+            scenario, quick = root / f"{name}.json", AGENTS_ONLY if detector == "labels" else ()
+            ran = run("reconstruct", root / name, "--out", scenario, "--detector", detector, "--quiet", *quick)
             assert ran.code == 0, ran.err
             known[name] = root / name, scenario
         return known[name]

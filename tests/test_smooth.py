@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import numpy as np
 import pytest
+from benchmarks import smoothing as maneuvers
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
@@ -295,15 +291,8 @@ def test_impossible_motion_is_flagged() -> None:
     assert "acceleration" in [limit.kind for limit in broken]
 
 
-@pytest.fixture(scope="module")
-def maneuvers() -> ModuleType:
-    """The module of maneuvers with known truth that the benchmark uses as well."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-    return importlib.import_module("benchmarks.smoothing")
-
-
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
-def test_covariances_are_honest(maneuvers: ModuleType, sigma: float) -> None:
+def test_covariances_are_honest(sigma: float) -> None:
     ratios: dict[str, list[float]] = {}
     for world in maneuvers.worlds(sigma, 0.01, seeds=6):
         path = smooth_track(world.truth.t_s, world.xy_m, world.valid, sigma_m=sigma)
@@ -316,7 +305,7 @@ def test_covariances_are_honest(maneuvers: ModuleType, sigma: float) -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.3, 0.6])
-def test_no_yaw_leaps_or_swings_at_the_ends(maneuvers: ModuleType, sigma: float) -> None:
+def test_no_yaw_leaps_or_swings_at_the_ends(sigma: float) -> None:
     for world in maneuvers.worlds(sigma, 0.03, seeds=4):
         path = smooth_track(world.truth.t_s, world.xy_m, world.valid)
         off = np.degrees(np.abs(wrap_angle(path.yaw_rad - world.truth.yaw_rad)))
@@ -325,9 +314,7 @@ def test_no_yaw_leaps_or_swings_at_the_ends(maneuvers: ModuleType, sigma: float)
 
 
 @pytest.mark.parametrize("rate_hz", [2, 4, 20])
-def test_errors_follow_the_number_of_observations_and_nothing_else_of_the_rate(
-    maneuvers: ModuleType, rate_hz: int
-) -> None:
+def test_errors_follow_the_number_of_observations_and_nothing_else_of_the_rate(rate_hz: int) -> None:
     by_rate = {}
     for rate in (rate_hz, 10):
         rows = []
@@ -344,7 +331,7 @@ def test_errors_follow_the_number_of_observations_and_nothing_else_of_the_rate(
 
 @pytest.mark.parametrize("rate_hz", [2, 4, 10, 20])
 @pytest.mark.parametrize("sigma", [0.05, 0.15])
-def test_a_queue_stands_and_rolls_at_every_rate(maneuvers: ModuleType, rate_hz: int, sigma: float) -> None:
+def test_a_queue_stands_and_rolls_at_every_rate(rate_hz: int, sigma: float) -> None:
     verdicts = []
     for truth, t, xy in maneuvers.rate_worlds(maneuvers.QUEUE, rate_hz, sigma, seeds=6):
         path = smooth_track(t, xy, sigma_m=sigma, at_s=truth.t_s, motion=MotionModel(heading_rad=0.4))
@@ -580,13 +567,13 @@ def test_of_courses_too_different_for_the_way_between_them_the_surer_one_is_know
 
 
 @pytest.mark.parametrize("density", [0.3, 1.0])
-def test_drawn_motions_are_followed_as_well_as_is_possible(maneuvers: ModuleType, density: float) -> None:
+def test_drawn_motions_are_followed_as_well_as_is_possible(density: float) -> None:
     """No estimator passes the posterior Cramer-Rao bound on average; one that knows neither noise nor motion nears it."""
     ratio = maneuvers.drawn_error_m(density, 0.1, seeds=8) / maneuvers.cramer_rao_m(density, 0.1)
     assert 0.85 < ratio < 1.1
 
 
-def test_maneuvers_are_followed_nearly_as_well_as_by_who_is_told_their_jerk(maneuvers: ModuleType) -> None:
+def test_maneuvers_are_followed_nearly_as_well_as_by_who_is_told_their_jerk() -> None:
     error_m, constant_m, following_m = maneuvers.maneuver_bounds("turn", 0.3, seeds=3)
     assert following_m < constant_m
     assert 0.8 * constant_m < error_m < 1.2 * following_m

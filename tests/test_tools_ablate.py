@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import importlib
 import sys
-from pathlib import Path
 
+import ablate
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-import ablate  # noqa: E402
-
-from log2sim.config import Config  # noqa: E402
+from log2sim.config import Config
 
 pytestmark = pytest.mark.slow
 

@@ -16,11 +16,6 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.geometry import NS_PER_S, wrap_angle
 
 
-@pytest.fixture(autouse=True)
-def _tools_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "tools"))
-
-
 def truth() -> Scenario:
     return scenario(straight("ego", speed_mps=5.0), straight("a", y_m=6.0), parked("b"), straight("c", y_m=-10.0))
 

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import pickle
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from fits import confidence as fit_confidence
 from fits import confidence_logs
 

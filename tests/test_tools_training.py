@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from lidar_training.clouds import CATEGORIES, Sample, write_shard
+from worlds import cloud_at
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.geometry import Camera, project_boxes, rotation_from_rpy, transform
 from log2sim.perception.detect3d.network import load_network
-from log2sim.perception.lidar.cloud import Cloud
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("onnx", reason="needs the extra 'train'")
@@ -147,14 +147,10 @@ def pair_of_a_slope(yaw: float = 0.6) -> Any:
     rng = np.random.default_rng(3)
     flat = np.column_stack([rng.uniform(0, 40, 9000), rng.uniform(-15, 15, 9000), rng.normal(0, 0.01, 9000)])
     xyz = np.concatenate([flat, points_in(BOXES, 300, rng)])
-    height = xyz[:, 2].astype(np.float32)
-    xyz = xyz + xyz[:, :1] * [0, 0, SLOPE]
+    height, xyz = xyz[:, 2], xyz + xyz[:, :1] * [0, 0, SLOPE]
     turn = rotation_from_rpy(0, 0, yaw)
     origin = np.array([50.0, -20.0, 3.0])
-    cloud = Cloud(
-        7, origin, (xyz @ turn.T).astype(np.float32), np.zeros(len(xyz), np.float32),
-        np.array([0, 0, 1.7], np.float32), height < 0.1, height,
-    )  # fmt: skip
+    cloud = cloud_at(xyz @ turn.T, height, stamp_ns=7, origin=origin, sensor=(0.0, 0.0, 1.7))
     rows = BOXES.copy()
     rows[:, 2] += SLOPE * rows[:, 0]
     rows[:, :3] = rows[:, :3] @ turn.T

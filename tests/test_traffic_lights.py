@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from worlds import cloud_at
 
 from log2sim.datatypes import Log, Scenario
 from log2sim.geometry import box_corners, inverse, project
 from log2sim.perception.frames import LightBox, add_ranges, crop_lights
+from log2sim.perception.lidar.projection import view_of
 from log2sim.road.signals import STATES, find_signals, lamp_evidence, place_lights
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
@@ -121,18 +123,13 @@ def test_the_lamp_that_shines_is_told(state: str, glare: bool, height: int) -> N
 
 
 def test_points_in_the_middle_of_a_box_give_its_range() -> None:
-    from log2sim.perception.lidar.cloud import Cloud
-    from log2sim.perception.lidar.projection import view_of
-
     log, truth = junction(moving=False)
     box = boxes_of(moving=False)[0]
     signal = min(
         truth.signals, key=lambda s: abs(_azimuth(log, box) - np.arctan2(s.position_m[1] + 1.8, s.position_m[0] + 12.4))
     )
     offsets = np.array([[0, 0, 0], [0, 0.03, 0.1], [0, -0.03, -0.1], [3.0, 0, 0], [0, 0, -2.5]])
-    points = (signal.position_m + offsets).astype(np.float32)
-    empty = np.zeros(5, np.float32)
-    cloud = Cloud(0, np.zeros(3), points, empty, np.zeros(3, np.float32), np.zeros(5, bool), points[:, 2])
+    cloud = cloud_at(signal.position_m + offsets, sensor=(0.0, 0.0, 0.0))
     view = view_of(log, "front", box.t_ns)
     assert view is not None
     expected = np.linalg.norm(signal.position_m - view.map_T_cam[:3, 3])

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from browser import Browser
 from command_line import names, run
+from worlds import waypoints
 
-from log2sim.datatypes import Agent, Finding, Scenario, Waypoints
+from log2sim.datatypes import Agent, Finding, Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.road.ground_map import GroundMap
@@ -36,10 +37,8 @@ EVIL = '</script x></script><script>window.hacked = 1</script><img src=x onerror
 
 def agent(id: str, x_m: Array, y_m: float, yaw_rad: float = 0.0, **changes: Any) -> Agent:
     """An agent with a waypoint a second along x."""
-    n, x = len(x_m), np.asarray(x_m, float)
-    speed = np.gradient(x) if n > 1 else np.zeros(1)
-    columns = {"x_m": x, "y_m": np.full(n, y_m), "z_m": np.zeros(n), "yaw_rad": np.full(n, yaw_rad), "speed_mps": speed}
-    w = Waypoints(t_s=np.arange(float(n)), observed=np.ones(n, bool), sigma_xy_m=np.zeros(n), **columns)
+    speed = np.gradient(np.asarray(x_m, float)) if len(x_m) > 1 else 0.0
+    w = waypoints(np.arange(len(x_m)), x_m, y_m, 0.0, yaw_rad, speed, sigma_m=0.0)
     return Agent(**{"id": id, "category": "car", "size_m": (4.0, 2.0, 1.6), "waypoints": w, **changes})
 
 

@@ -17,9 +17,9 @@ from browser import Browser
 from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import Solid, camera_ahead, outline_px
+from worlds import Solid, camera_ahead, outline_px, waypoints
 
-from log2sim.datatypes import Agent, Finding, Lidar, Log, Scenario, Stream, Sweep, Waypoints
+from log2sim.datatypes import Agent, Finding, Lidar, Log, Scenario, Stream, Sweep
 from log2sim.geometry import Camera
 from log2sim.visualization.page.writer import write_page
 from log2sim.visualization.recording import (
@@ -49,9 +49,8 @@ def camera_of(name: str = "a", **placed: Any) -> Camera:
 def agent(id: str, x_m: Any, y_m: float, **changes: Any) -> Agent:
     """An agent with a waypoint a second along x, heading east."""
     x = np.asarray(x_m, float)
-    speed = np.gradient(x) if len(x) > 1 else np.zeros(1)
-    flat, z = np.full(len(x), y_m), np.full(len(x), CAR_SIZE[2] / 2)
-    w = Waypoints(np.arange(float(len(x))), x, flat, z, 0 * x, speed, np.ones(len(x), bool), 0 * x)
+    speed = np.gradient(x) if len(x) > 1 else 0.0
+    w = waypoints(np.arange(len(x)), x, y_m, CAR_SIZE[2] / 2, 0.0, speed, sigma_m=0.0)
     return Agent(**{"id": id, "category": "car", "size_m": CAR_SIZE, "waypoints": w, **changes})
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Scenario
+from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Log, Measurements, Scenario, Waypoints
 from log2sim.geometry import Array, Camera, Mount, apply, box_corners, inverse, rotation_from_rpy, transform
 from log2sim.perception.boxes import fit_extents, place_boxes, top_of
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
 from log2sim.synth.scene import Scene, scene_from_table
 from log2sim.synth.synthesis import synthesize
 
@@ -83,6 +84,29 @@ def tiny_log(
     calm = {"dropout": 0.0, "resolution_m": 0.0} if noise_m == 0 else {}
     lidars = tuple(spec.model_copy(update={"noise_m": noise_m, **calm}) for spec in scene.lidar)
     return synthesize(scene.model_copy(update={"lidar": lidars}), seed=seed, observe=observe)
+
+
+def waypoints(
+    t_s: ArrayLike, x_m: ArrayLike = 0.0, y_m: ArrayLike = 0.0, z_m: ArrayLike = 0.0, yaw_rad: ArrayLike = 0.0, speed_mps: ArrayLike = 0.0,
+    *, sigma_m: ArrayLike = 0.1, **columns: Any,
+) -> Waypoints:  # fmt: skip
+    """Waypoints (T,) that are all observed unless `columns` say otherwise; one value stands for all times."""
+    t = np.asarray(t_s, dtype=np.float64)
+    given = (x_m, y_m, z_m, yaw_rad, speed_mps, sigma_m)
+    *state, sigma = (np.broadcast_to(np.asarray(v, dtype=np.float64), t.shape).copy() for v in given)
+    return Waypoints(t, *state, **{"observed": np.ones(len(t), bool), "sigma_xy_m": sigma, **columns})
+
+
+def cloud_at(
+    xyz: ArrayLike, height: ArrayLike | None = None, *, t_s: ArrayLike = 0.0, stamp_ns: int = 10**18, origin: ArrayLike = (0.0, 0.0, 0.0),
+    sensor: ArrayLike = (0.0, 0.0, 2.0), **columns: Any,
+) -> Cloud:  # fmt: skip
+    """A cloud of points (N, 3) about its origin; the ground is at z = 0 unless heights (N,) above it are given."""
+    points = np.asarray(xyz, np.float32).reshape(-1, 3)
+    above = points[:, 2] if height is None else np.asarray(height, np.float32)
+    t = np.broadcast_to(np.asarray(t_s, np.float32), len(points)).copy()
+    columns = {"ground": np.abs(above) <= ON_GROUND_M, "height": above, **columns}
+    return Cloud(stamp_ns, np.asarray(origin, np.float64), points, t, np.asarray(sensor, np.float32), **columns)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Switch off every rule, option and constant of the method, one at a time, and measure what becomes of the results.
 
-    python tools/ablate.py LOG|SCENE.toml ... --out FILE.jsonl [--stages tracking,agents] [--idle] [--detector labels]
+    python tools/ablate.py LOG|SCENE.toml ... --out FILE.jsonl [--stages tracking,agents] [--idle] [--off] [--workers 8] [--detector labels]
     python tools/ablate.py --out FILE.jsonl           # tables of what was measured so far
 
 Constants are numbers, or tables of numbers, that modules assign to names in capitals, and numeric settings: each is taken 0.7
@@ -122,21 +122,25 @@ WORK: list[Any] = []
 
 def main(
     logs: Annotated[list[str] | None, typer.Argument(metavar="LOG|SCENE.toml")] = None, out: Path = Path("ablation.jsonl"),
-    stages: str = ",".join(STAGES), idle: bool = False, detector: str = "labels",
+    stages: str = ",".join(STAGES), idle: bool = False, off: bool = False, workers: int | None = None, detector: str = "labels",
 ) -> None:  # fmt: skip
-    """Measure what is missing in the file, with `idle` only of what changes nothing beyond noise so far, and print its tables."""
+    """Measure what is missing in the file, with `idle` only of what changes nothing beyond noise so far, and print its tables.
+
+    With `off`, numbers are not scaled but only switched off.
+    """
     rows = rows_of(out)
     if logs:
         config = Config.load(detect={"name": detector})
         matter, done = matters(rows) if idle else set(), {(r["case"], r["label"], r["change"]) for r in rows}
         chosen = [v for v in variations(config) if v.stage in stages.split(",") and v.label not in matter]
+        chosen = [v for v in chosen if not (off and v.change in ("x0.7", "x1.3"))]
         seeds = [Variation("localization", "", "seed", str(k), k) for k in range(SEEDS + 1)]
         cases = [recorded(case_of(name, detector), config) for name in logs]
         tasks = [(c, v) for v in (*seeds, *chosen) for c in cases if (c.name, v.label, v.change) not in done]
         print(f"{len(chosen)} variations, {len(cases)} logs, {len(tasks)} runs", file=sys.stderr, flush=True)
         WORK[:] = [config, Imports(method_modules()), tasks]
         with (
-            multiprocessing.get_context("fork").Pool(maxtasksperchild=1) as pool,
+            multiprocessing.get_context("fork").Pool(workers, maxtasksperchild=1) as pool,
             out.open("a", encoding="utf-8") as file,
         ):
             for index, figures, outcome in pool.imap_unordered(run_one, range(len(tasks))):

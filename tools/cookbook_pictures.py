@@ -87,7 +87,6 @@ def prepare(work: Path) -> Path:
 
 def screenshots(work: Path, sample: Path, names: set[str]) -> None:
     """Photograph the page of `view`, the studio and the table of `batch`."""
-    sys.path.insert(0, str(ROOT / "tests"))
     from browser import Browser, browsing
 
     from log2sim import Scenario, open_log

@@ -13,6 +13,8 @@ from typing import Any
 import typer
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+# Small worlds, the encoders of formats and the browser are those of the tests.
+sys.path.append(str(SAMPLES.parent / "tests"))
 
 
 def run(main: Callable[..., Any], doc: str | None, arguments: list[str] | None = None, name: str = "") -> Any:

@@ -29,6 +29,7 @@ from log2sim.datatypes import (
 )
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, yaw_of
+from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.perception.sync import Schedule
 from log2sim.tracking.forward import MAX_MISSES
 
@@ -61,10 +62,6 @@ def estimate_agents(
     return candidates
 
 
-# Standard deviations of ego positions and yaws from GNSS/INS with RTK or LiDAR odometry.
-EGO_SIGMA_M, EGO_SIGMA_RAD = 0.02, 0.002
-
-
 def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log") -> Agent | None:
     """Make the ego an agent with a waypoint at every tick; None for a log without poses at them.
 
@@ -78,7 +75,7 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
     vehicle = log.ego_vehicle
     center = log.ego_centers(map_T_ego[valid])
     t, yaw = timeline.seconds(timeline.t_ns[valid]), yaw_of(map_T_ego[valid])
-    sigma_m = log.ego.sigmas_at(timeline.t_ns[valid], (EGO_SIGMA_M, EGO_SIGMA_RAD))[:, 0]
+    sigma_m = log.ego.sigmas_at(timeline.t_ns[valid])[:, 0]
     path = smooth_track(t, center[:, :2], sigma_m=sigma_m)
     # Poses that bridge a gap are off together, so that smoothing does not make them better.
     bridging_m2 = bridging_variances(log.ego, timeline.t_ns[valid])[:, 0]
@@ -102,8 +99,8 @@ def ego_agent(log: Log, timeline: Timeline, source: str = "ego poses of the log"
 
 def bridging_variances(poses: PoseTrack, t_ns: NDArray[np.int64]) -> Array:
     """Return the variances (N, 2) of positions, m2, and yaws, rad2, at stamps (N,), beyond those of measured poses."""
-    sigmas = poses.sigmas_at(t_ns, (EGO_SIGMA_M, EGO_SIGMA_RAD))
-    known = zip((EGO_SIGMA_M, EGO_SIGMA_RAD), (poses.sigma_m, poses.sigma_yaw_rad), strict=True)
+    sigmas = poses.sigmas_at(t_ns)
+    known = zip((USUAL_SIGMA_M, USUAL_SIGMA_RAD), (poses.sigma_m, poses.sigma_yaw_rad), strict=True)
     measured = np.array([usual if sigma is None else float(sigma.min()) for usual, sigma in known])
     return np.asarray(np.maximum(sigmas**2 - measured**2, 0.0))
 

@@ -17,7 +17,7 @@ from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
 from log2sim.agents.rays import count_rays
 from log2sim.agents.size import independent
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, AgentTable, Log, Obstacles, Track
-from log2sim.datatypes.log_odds import log_odds_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, median, project
 from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
@@ -104,7 +104,7 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int
 
 # Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
 # of ten of clutter. A box of one size that is moved on by its velocity alone seldom does by chance.
-MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), 4.6
+MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), float(log_odds_of(MAX_PROBABILITY))
 
 
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
@@ -158,7 +158,9 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "odd_size": float(np.hypot(*odd)),
         "odd_height": float(np.sqrt(np.mean(high**2))) if placed.any() else 0.0,
         "thin": max(thin, 0.0) if group == "pedestrian" else 0.0,
-        "heading": float(log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), 0.01, 0.99))),
+        "heading": float(
+            log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), MIN_PROBABILITY, MAX_PROBABILITY))
+        ),
         "other_category": float((m.category != agent.category).mean()),
         "impossible": float(any(d.kind != "heading_ambiguous" for d in agent.doubts)),
         "sigma_speed": 0.0 if speed_sigma is None else np.log(np.median(speed_sigma) / 0.3 + 1e-3),

@@ -18,7 +18,7 @@ from log2sim.agents.rays import count_at
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
 from log2sim.agents.weights import RIGHT, THERE, VARIANCES
 from log2sim.datatypes import GROUP_OF, MARGIN_S, MAX_SIZE_M, Agent, AgentTable, Finding, Obstacles
-from log2sim.datatypes.log_odds import probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, probability_of
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
 # Of a long log, so that the memory does not grow with agents times ticks.
@@ -166,8 +166,6 @@ def _doubt(found: Finding, conflict: Conflict, t_s: Array, agent: Agent) -> Find
 
 # Rays tell whether a place is free up to this distance: a car holds about ten of them there by a LiDAR of 64 lines.
 MAX_FREE_RANGE_M = 60.0
-# A place is free at a tick at which more than this share of the rays toward it goes on behind it.
-FREE_SHARE = 0.5
 
 
 def extend_static(
@@ -193,7 +191,7 @@ def extend_static(
         near = np.flatnonzero(outside & (np.hypot(*(boxes.xy_m[:, 0] - cloud.origin[:2]).T) < MAX_FREE_RANGE_M))
         if len(near):
             inside, through, _ = count_at(boxes.take(near), 0, cloud.origin, cloud.free)
-            free[near, tick] = (inside + through >= MIN_TICK_RAYS) & (through > FREE_SHARE * (inside + through))
+            free[near, tick] = (inside + through >= MIN_TICK_RAYS) & (through > inside)
     out = [*agents, *([] if ego is None else [ego])]
     low, high = (
         np.array([[f(a.waypoints.x_m), f(a.waypoints.y_m)] for a in out], dtype=np.float64) for f in (np.min, np.max)
@@ -235,8 +233,6 @@ def extend_static(
 MIN_THERE = {True: 0.5, False: 0.25}
 # A reason that makes an agent e times less likely is told.
 DOUBT_NATS = 1.0
-# Never 0 or 1: an agent may be right or wrong for a reason that no evidence shows.
-MIN_CONFIDENCE, MAX_CONFIDENCE = 0.01, 0.99
 SAME_M = 0.005  # rounding
 
 
@@ -274,7 +270,7 @@ def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
         probability_of(np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0))
         for weights in (THERE, RIGHT)
     )
-    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
+    return there, np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY)
 
 
 def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: bool) -> list[Finding] | None:

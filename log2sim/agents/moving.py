@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of, spans_of
-from log2sim.agents.size import independent, independent_along, moving_geometry
+from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M, independent, independent_along, moving_geometry
 from log2sim.agents.smooth.motion_model import MAX_CURVATURE_1PM as ROAD_CURVATURE_1PM
 from log2sim.agents.smooth.motion_model import SIGNIFICANT_SIGMAS, UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
@@ -29,14 +29,12 @@ from log2sim.datatypes import (
     Track,
     Waypoints,
 )
-from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import align_to
 from log2sim.tracking.forward import CENTER_SIGMA_M
 from log2sim.tracking.tracker import VELOCITY_WINDOW_S, track, velocities
 
-# A probability nearer to 1 is not believed: networks are surer than right.
-MAX_HEADING_SCORE = 0.99
 # A box turned farther than this from the axis of the object says nothing about its front.
 MIN_AXIS_COS = 0.7
 
@@ -51,13 +49,16 @@ def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
     rows, along = rows[np.abs(along) >= MIN_AXIS_COS], along[np.abs(along) >= MIN_AXIS_COS]
     if len(rows) == 0:
         return 0.0
-    p = np.clip(m.heading_score[rows], 0.5, MAX_HEADING_SCORE)
+    p = np.clip(m.heading_score[rows], 0.5, MAX_PROBABILITY)
     votes = np.sign(along) * log_odds_of(p)
     return float(votes.mean()) * independent(len(rows))
 
 
 # Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand.
 FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
+# More than boxes say against it (`MAX_HEADING_SCORE` in all sweeps), so that what drives fast points ahead. Of tracks that seem to drive one
+# in fifty mixes up several objects, or stands (simulated logs with LiDAR).
+MAX_COURSE_LOG_ODDS = 7.0
 # A way shorter than so many standard deviations of its ends may be noise.
 CERTAIN_SIGMAS = 4.0
 
@@ -79,7 +80,7 @@ def course_log_odds(w: Waypoints, length_m: float) -> float:
         speed_mps = np.maximum(sign * w.speed_mps, 0.0)
         distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
         if time_s > 0:
-            one_way = min(forward_log_odds(distance_m / time_s), MAX_FORWARD_LOG_ODDS)
+            one_way = min(forward_log_odds(distance_m / time_s), MAX_COURSE_LOG_ODDS)
             odds += sign * one_way * min(distance_m / certain_m, 1.0)
     return odds
 
@@ -112,7 +113,7 @@ def turn_to_courses(found: Sequence[Boxes3D], t_ns: NDArray[np.int64], config: T
         for k in np.flatnonzero(moves):
             tick = int(one.tick[k])
             row = int(np.argmin(np.abs(found[tick].center_m - m.box_center_m[k]).sum(axis=1)))
-            own = float(log_odds_of(np.clip(m.heading_score[k], 0.5, MAX_HEADING_SCORE)))
+            own = float(log_odds_of(np.clip(m.heading_score[k], 0.5, MAX_PROBABILITY)))
             odds = own + np.sign(along[k]) * min(forward_log_odds(float(speed[k])), MAX_FORWARD_LOG_ODDS)
             score[tick][row] = probability_of(abs(odds))
             if odds < 0:
@@ -128,8 +129,6 @@ MAX_REVERSING_MPS, MAX_REVERSING_M = 3.0, 20.0
 MIN_BESIDE = 2
 # One measurement in twenty is an outlier; twice as many are more than that.
 MIN_BESIDE_SHARE = 0.1
-# No road vehicle is wider, mirrors included, so a longer side is its length (Directive 96/53/EC allows 2.6 m).
-MAX_WIDTH_M = 2.7
 # Above this speed a vehicle goes along its length, but for the slip angle, up to 30 degrees where it turns at full lock.
 MIN_COURSE_MPS, MAX_SLIP_RAD, MIN_ACROSS = 1.5, np.deg2rad(45.0), 3
 
@@ -162,7 +161,9 @@ def sideways_doubts(m: BoxEvidence, t_s: Array, heading_rad: Array, speed_mps: A
     """
     has_box = np.isfinite(m.box_yaw_rad)
     axis = np.where(has_box, m.box_yaw_rad, m.yaw_rad)
-    certain = (has_box | ((m.high_m - m.low_m)[:, 0] > MAX_WIDTH_M)) & (np.abs(speed_mps) > MIN_COURSE_MPS)
+    certain = (has_box | ((m.high_m - m.low_m)[:, 0] > MAX_ROAD_WIDTH_M + WHOLE_SIDE_SIGMA_M)) & (
+        np.abs(speed_mps) > MIN_COURSE_MPS
+    )
     across = certain & (np.abs(wrap_angle(2 * (axis - heading_rad))) / 2 > MAX_SLIP_RAD)
     rows = np.flatnonzero(across)
     if len(rows) < MIN_ACROSS or len(rows) <= certain.sum() / 2:
@@ -188,8 +189,6 @@ CERTAIN_COURSE_M = 1.0
 # Standard deviation of the yaw of a single measurement.
 BOX_YAW_SIGMA_RAD = 0.2
 SAME_MOMENT_S = 1e-3
-# A yaw of points that is farther from the course is that of their width.
-MAX_YAW_OFF_RAD = np.pi / 4
 # Heights of the ground under a track are smoothed by a median over this many measurements on either side.
 HEIGHT_MEDIAN_HALF = 4
 # So many places tell enough.
@@ -226,14 +225,10 @@ def moving_candidate(
     tick = track.tick.tolist()
     spans = [(0, range(tick[0] - 1, -1, -1)), (len(tick) - 1, range(tick[-1] + 1, len(timeline.t_ns)))]
     spans += [(k, range(a + 1, b)) for k, (a, b) in enumerate(pairwise(tick))]
-    bottom_m, axis = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2, headings.copy()
-    if group == "vehicle":
-        # At the end of a track the sides of a box tell its direction better than its course does.
-        off = np.nan_to_num(wrap_angle(2 * (m.yaw_rad - headings)) / 2)
-        axis += np.where(np.abs(off) < MAX_YAW_OFF_RAD, off, 0.0)
+    bottom_m = float(np.median(geometry.z_m)) - geometry.size_m[2] / 2
     matches = []
     for k, wanted in spans:
-        place = rough.xy_m[k], rough.velocity_mps[k], float(axis[k])
+        place = rough.xy_m[k], rough.velocity_mps[k], float(headings[k])
         start = BoxState(int(m.t_ns[k]), *place, geometry.size_m, bottom_m)
         matches += track_with_lidar(obstacles, wanted, timeline.t_ns, start)
     # Measurements and matches together, one at a moment.

@@ -69,8 +69,6 @@ MAX_POINTS_PER_TICK = 150
 # car on none. Trucks and buses are as high at the one end as at the other.
 MIN_SIDE_SINE, MIN_BOX_SIDE_SINE = 0.35, 0.15
 BOXES = ("truck", "bus")
-# A length axis is told by the lengths of the sides if the odds are e to one.
-CLEAR_LOG_ODDS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +137,7 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     size = (corners[1] - corners[0])[0]
     doubt_m = boxes.UNIFORM_SIGMA * gap.sum(axis=-1)
     log_odds = boxes.swapped_log_odds(size, np.all(real, axis=-1), doubt_m, track.category)
-    across = log_odds > 0
-    if abs(log_odds) < CLEAR_LOG_ODDS:
-        sensors = boxes.rotate(m.sensor_m[:, :2] - origin, -yaw)
-        across = boxes.axes_swapped(high - low, sensors - (ends.low + ends.high) / 2, typical)
-    return (yaw + np.pi / 2, ends.swapped()) if across else (yaw, ends)
+    return (yaw + np.pi / 2, ends.swapped()) if log_odds > 0 else (yaw, ends)
 
 
 def ends_of(track: Track, rows: NDArray[np.intp], yaw_rad: Array, velocity_mps: Array) -> Ends:
@@ -202,9 +196,6 @@ WHOLE_SIDE_SIGMA_M, BOX_SIZE_SIGMA_SHARE = 0.15, 0.07
 MAX_SHORT_SIGMAS = 1.5
 # Directive 96/53/EC, Annex I: 2.55 m, refrigerated vehicles 2.6 m; the United States allow 102 inches. What is beyond are mirrors.
 MAX_ROAD_WIDTH_M = 2.6
-# The same allows a height of 4.0 m, and lengths of 12 m for rigid and 16.5 m for articulated vehicles, between which a truck of
-# that height is expected.
-HIGHEST_TRUCK_M, HIGHEST_TRUCK_LENGTH_M = 4.0, 14.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,11 +216,17 @@ def static_geometry(track: Track) -> TrackGeometry:
     origin = np.append(np.median(m.center_m[:, :2], axis=0), 0.0)
     cloud = persistent_points([m.points_of(k) - origin for k in range(len(m))])
     if len(cloud) < MIN_STATIC_POINTS:
-        return _geometry_without_points(track)
+        # The mean by the covariances; errors of one object are alike.
+        geometry, n = _geometry_without_points(track), len(m)
+        information = np.linalg.inv(geometry.covariance)
+        covariance = np.linalg.inv(information.sum(axis=0))
+        mean = covariance @ np.einsum("nij,nj->i", information, geometry.xy_m)
+        covariance = covariance * n / independent(n)
+        return replace(geometry, xy_m=np.tile(mean, (n, 1)), covariance=np.tile(covariance, (n, 1, 1)))
     yaw, ends = static_ends(track, cloud[:, :2], origin[:2])
     known = typical_box_size(m)
     height, z = _height(track)
-    size, is_likely = _estimate_size(ends, track.category, height, known)
+    size, is_likely = _estimate_size(ends, track.category, known)
     low, high, real, gap = (column[0] for column in (ends.low, ends.high, ends.real, ends.gap_m))
     center, sigma = boxes.complete_box(low, high, size, real, known is not None, gap_m=gap)
     # The robust mean of the box centers of a 3D detector and its standard deviation; NaN without boxes.
@@ -277,7 +274,7 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
     moved = np.zeros((len(m), 2)) if velocity_mps is None else velocity_mps
     ends = ends_of(track, rows, yaw, moved[rows])
     height, z = _height(track)
-    size, is_likely = _estimate_size(ends, track.category, height, typical_box_size(m))
+    size, is_likely = _estimate_size(ends, track.category, typical_box_size(m))
     has_box = np.isfinite(m.box_yaw_rad[rows])
     center, sigma = boxes.complete_box(ends.low, ends.high, size, ends.real, has_box, gap_m=ends.gap_m)
     center, sigma = boxes.weighted_center(
@@ -299,17 +296,13 @@ def _is_likely_height(size_m: Array, height_m: float, category: str) -> bool:
     return bool(size_m.max() <= CATEGORY[category].max_length_per_height * height_m)
 
 
-def _estimate_size(ends: Ends, category: str, height_m: float, known: Array | None) -> tuple[Array, bool]:
+def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Array, bool]:
     """Estimate length and width (2,) from the ends in n views, and whether they are likely.
 
     What was seen from end to end and what is expected, `known` (3,) from a 3D detector or typical of the category, are
     averaged by their variances. A side that was never seen so is as long as expected, or as the longest part that was seen.
     """
-    length, width, height = TYPICAL_SIZE_M[category]
-    if category == "truck" and height_m > height:  # high trucks are longer
-        exponent = np.log(HIGHEST_TRUCK_LENGTH_M / length) / np.log(HIGHEST_TRUCK_M / height)
-        length = min(length * (height_m / height) ** exponent, HIGHEST_TRUCK_LENGTH_M)
-    typical = np.array([length, width])
+    typical = np.array(TYPICAL_SIZE_M[category][:2])
     smallest, limit = (np.array(t[category][:2]) for t in (MIN_SIZE_M, MAX_SIZE_M))
     is_vehicle = GROUP_OF[category] == "vehicle"
     largest = np.minimum(limit, [np.inf, MAX_ROAD_WIDTH_M]) if is_vehicle else limit

@@ -42,8 +42,8 @@ MAX_MISSES = 2
 # A match is rejected when a larger share of the box's length or width is unobserved: its position along that axis is
 # undetermined.
 MAX_HIDDEN_SHARE = 0.7
-# A ray that goes on behind a side by this passed it. Where more than this share of those toward a box go on, nothing is there.
-SIDE_DEPTH_M, MAX_THROUGH_SHARE = 0.3, 0.5
+# A ray that goes on behind a side by this passed it.
+SIDE_DEPTH_M = 0.3
 # An end is where a ray passes within this distance of the last point.
 MAX_GAP_M = 1.5
 # Quantiles of the heights of points between which a side is: below a truck and above a hood rays pass.
@@ -52,8 +52,6 @@ LEVELS = 0.25, 0.75
 MIN_SIZE_SHARE = 0.5
 # Gains of the constant-velocity filter.
 POSITION_GAIN, VELOCITY_GAIN = 0.6, 0.15
-# What is longer than so many widths moves along its length.
-LONG_WIDTHS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +112,6 @@ def track_with_lidar(
         innovation, velocity = match.xy_m - expected, state.velocity_mps
         if abs(dt_s) > 1e-3:
             velocity = velocity + VELOCITY_GAIN * innovation / dt_s
-            if match.yaw_rad != state.yaw_rad and state.size_m[0] > LONG_WIDTHS * state.size_m[1]:
-                axis = np.array([np.cos(match.yaw_rad), np.sin(match.yaw_rad)])
-                velocity = (velocity @ axis) * axis
         position = expected + POSITION_GAIN * innovation
         state = replace(state, t_ns=match.t_ns, xy_m=position, velocity_mps=velocity, yaw_rad=match.yaw_rad)
     return matches
@@ -286,7 +281,7 @@ def _passes(start: Array, end: Array, center: Array, size: Array) -> bool:
     first = start - np.append(center, size[2] / 2)
     ending = classify_rays(first, end - start, np.zeros(len(first)), np.tile(size, (len(first), 1)))
     passed, met = (ending == Ending.THROUGH).sum(), (ending <= Ending.THROUGH).sum()
-    return bool(met >= MIN_POINTS and passed > MAX_THROUGH_SHARE * met)
+    return bool(met >= MIN_POINTS and 2 * passed > met)
 
 
 # Standard deviations of a yaw known up to half a turn: of the box of one tick, and the least of any.

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from log2sim.batch.discovery import FoundLog
 from log2sim.config import Config
 from log2sim.datatypes import Scenario
+from log2sim.datatypes.agent import MAX_LISTED
 from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import first_problem, read_json, replaced, write_json
 from log2sim.files.outputs import claim, is_left_over, is_temporary, remove, replaced_folder
@@ -165,7 +166,6 @@ LOGS = "logs"
 SCENARIO_FILE, REPORT_FILE, ROW_FILE, ERROR_FILE = "scenario.json", "report.json", "row.json", "error.txt"
 REPLAY_FILE = "replay.json"
 TOKEN_BYTES = 8
-MAX_LISTED = 5
 
 
 class BatchSettings(BaseModel):

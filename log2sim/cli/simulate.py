@@ -74,10 +74,11 @@ def replay(
 
     from log2sim.cli.change import ids_of
     from log2sim.datatypes import Scenario, explain_doubt, format_confidence
+    from log2sim.datatypes.agent import MAX_LISTED
     from log2sim.export.checks import doubtful_note, export_notes
     from log2sim.files.documents import check_targets
     from log2sim.simulation.expected_motion import WarningSettings
-    from log2sim.simulation.metrics.all_metrics import MAX_LISTED, check_limits, parse_limits, require_strict, summarize
+    from log2sim.simulation.metrics.all_metrics import check_limits, parse_limits, require_strict, summarize
     from log2sim.simulation.policy import load_policy
     from log2sim.simulation.runner import external_simulator
     from log2sim.simulation.runner import replay as run

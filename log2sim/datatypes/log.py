@@ -58,7 +58,8 @@ class Deferred(Generic[T]):
         instance.__dict__[self._name] = value
 
 
-QUATERNION_TOLERANCE = 1e-3
+# Rotations are stored with three decimals or more.
+ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +137,7 @@ def _view_from_dict(entry: Mapping[str, Any], where: str) -> LabelView:
         raise ScenarioError(f"{where}: region_frame must hold one index of a stamp for each of the {len(box)} regions")
     if np.any(np.diff(t_s) <= 0):
         raise ScenarioError(f"{where}: t_s does not increase at index {int(np.argmax(np.diff(t_s) <= 0)) + 1}")
-    if np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > QUATERNION_TOLERANCE):
+    if np.any(np.abs(np.linalg.norm(q, axis=1) - 1) > ROTATION_TOLERANCE):
         raise ScenarioError(f"{where}: rotation_wxyz must hold unit quaternions, scalar first")
     return LabelView(camera, t_s, position, q, frame, box)
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# Nearer to 0 or 1 no probability is believed: something may be right or wrong for a reason that no evidence shows, and networks are
+# surer than right.
+MIN_PROBABILITY, MAX_PROBABILITY = 0.01, 0.99
+
 
 def log_odds_of(probability: ArrayLike) -> NDArray[np.float64]:
     """Return the log-odds (...) in nats of probabilities (...) between 0 and 1, these two excluded."""

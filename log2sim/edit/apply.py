@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from log2sim.agents.smooth.motion_model import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.edit.edits import MIN_PATH_MPS, Add, Agents, Edit, Only, Remove, chords
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.files.plugins import nearest
 from log2sim.simulation.metrics.all_metrics import OFF_PATH_M
-from log2sim.simulation.reference import MAX_ACCEL_MPS2, MAX_CURVATURE_1PM, MAX_TWO_WHEELER_CURVATURE_1PM
+from log2sim.simulation.metrics.collisions import SAME_CONTACT_S
+from log2sim.simulation.reference import MAX_TWO_WHEELER_CURVATURE_1PM
 from log2sim.simulation.runner import replay
 
 # The limits that a replay flags; pedestrians turn on the spot.
 CURVATURE_LIMITS_1PM = {"vehicle": MAX_CURVATURE_1PM, "two_wheeler": MAX_TWO_WHEELER_CURVATURE_1PM}
 STEP_S = 0.05
-SAME_CONTACT_S = 0.5
 RELATIVE_TOLERANCE = 1 + 1e-6
 MAX_LISTED = 12  # ids in a message
 
@@ -134,7 +135,7 @@ def find_problems(source: Scenario, changed: Scenario, agents: Sequence[Agent]) 
     for agent in agents:  # acceleration and curvature beyond their limits and beyond those of the source
         before = _peaks(known[agent.id]) if agent.id in known else {}
         for what, (peak, t_s) in _peaks(agent).items():
-            limit, unit = (MAX_ACCEL_MPS2, "m/s2")
+            limit, unit = (MAX_ACCELERATION_MPS2, "m/s2")
             if what == "curvature":
                 limit, unit = CURVATURE_LIMITS_1PM.get(GROUP_OF[agent.category], np.inf), "1/m"
             if peak > max(limit, before.get(what, (0.0, 0.0))[0]) * RELATIVE_TOLERANCE:

@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, AgentTable, Scenario, explain_doubt, list_doubtful
+from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Scenario, explain_doubt, list_doubtful
 from log2sim.errors import ScenarioError
 from log2sim.geometry import Array, rectangle_iou, rectangles_overlap, wrap_angle
 
@@ -24,8 +24,6 @@ TOUCHING_IOU = 0.02
 SAME_PLACE = 0.001
 # Overlaps that are listed; a scenario with more of them has one cause.
 MAX_NOTES = 100
-# Times so near to the end of a trajectory count as on it.
-ROUNDING_S = 1e-6
 # States, and pairs that are compared, at a time, which bounds memory to some 100 MB.
 MAX_STATES = 1_000_000
 # Pairs of which areas are computed at a time, so that a caller who needs only the first does not wait for all.
@@ -131,7 +129,7 @@ def overlaps_at_entry(agents: Sequence[Agent]) -> Iterator[tuple[int, int, float
     times = np.unique(first_s)
     size = max(1, MAX_STATES // max(len(agents), 1))
     for t_s in np.split(times, range(size, len(times), size)):
-        alive = np.flatnonzero((first_s <= t_s[-1]) & (last_s >= t_s[0] - ROUNDING_S))
+        alive = np.flatnonzero((first_s <= t_s[-1]) & (last_s >= t_s[0] - MARGIN_S))
         states = np.full((4, len(t_s), len(agents)), np.nan)
         states[:, :, alive] = _states([agents[k] for k in alive.tolist()], t_s)
         for k, t in enumerate(t_s):

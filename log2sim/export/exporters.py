@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Agent, Log, MapFrame, Scenario
+from log2sim.datatypes import MARGIN_S, Agent, Log, MapFrame, Scenario
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.export.checks import require_exportable
 from log2sim.files import plugins
@@ -140,7 +140,6 @@ def _transformer(source: str, target: str) -> Any:
 
 # Half the span of difference quotients: half a step of most logs, so adjacent waypoints decide them.
 DERIVATIVE_S = 0.05
-ROUNDING_S = 1e-6
 MAX_STEPS = 100_000  # 2.8 hours at 10 Hz
 # Memory of a table of all agents: at 2.8 hours 160 of them.
 MAX_SAMPLED_BYTES = 1536 * 1024 * 1024
@@ -159,7 +158,7 @@ class SampledMotion:
     acceleration_mps2: Array
 
 
-def sample_motion(agent: Agent, t_s: Array, margin_s: float = ROUNDING_S) -> SampledMotion:
+def sample_motion(agent: Agent, t_s: Array, margin_s: float = MARGIN_S) -> SampledMotion:
     """Sample an agent at times (T,); times within `margin_s` outside its lifetime take the nearest end.
 
     The speed of waypoints is along the heading. Where an agent turns, its box center also moves laterally, by yaw rate
@@ -210,7 +209,7 @@ def sample_steps(agent: Agent, t_s: Array, step_s: float, at_least: int = 1) -> 
         return sampled
     past_s = agent.waypoints.t_s[0] - t_s[-1]
     after = past_s + (at_least - 1) * step_s if 0 < past_s < step_s else 0.0
-    return sample_motion(agent, t_s, margin_s=max(at_least * step_s / 2, after + ROUNDING_S))
+    return sample_motion(agent, t_s, margin_s=max(at_least * step_s / 2, after + MARGIN_S))
 
 
 def step_times(start_s: float, stop_s: float, step_s: float, agents: int = 1) -> Array:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from log2sim.geometry.transforms import Array
 
-# Gates of squared Mahalanobis distances, by degrees of freedom and probability: 99 % and 99.9 %.
+# Gates of squared Mahalanobis distances, by degrees of freedom and probability: 95 %, 99 % and 99.9 %.
+CHI2_2DOF_95 = 5.991
 CHI2_2DOF_99 = 9.21
 CHI2_2DOF_999 = 13.8
 CHI2_4DOF_999 = 18.5

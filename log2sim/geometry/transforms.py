@@ -37,6 +37,9 @@ Array = NDArray[np.float64]
 FLOAT32_MILLIMETER_M = 8192.0
 """From here on neighboring float32 values are 1 mm apart."""
 
+USUAL_SIGMA_M, USUAL_SIGMA_RAD = 0.02, 0.002
+"""Standard deviations of position, m, and yaw, rad, of poses of GNSS/INS with RTK or LiDAR odometry."""
+
 OFFSET_STEP_M = 1000.0
 
 
@@ -235,14 +238,11 @@ class PoseTrack:
         recorded = (t == self.t_ns[i]) | (t == self.t_ns[k])
         return poses, inside & ((span <= self.max_gap_s * NS_PER_S) | recorded)
 
-    def sigmas_at(self, t_ns: ArrayLike, usual: tuple[float, float]) -> Array:
-        """Interpolate the standard deviations (N, 2) of position, m, and yaw, rad, at stamps (N,) int64 ns.
-
-        `usual`: what they are where the track does not know them.
-        """
+    def sigmas_at(self, t_ns: ArrayLike) -> Array:
+        """Interpolate the standard deviations (N, 2) of position, m, and yaw, rad, at stamps (N,) int64 ns; usual ones where they are not known."""
         t_s = (np.atleast_1d(np.asarray(t_ns, dtype=np.int64)) - self.t_ns[0]) / NS_PER_S
         known_s = (self.t_ns - self.t_ns[0]) / NS_PER_S
-        out = np.tile(usual, (len(t_s), 1)).astype(np.float64)
+        out = np.tile((USUAL_SIGMA_M, USUAL_SIGMA_RAD), (len(t_s), 1))
         for k, sigma in enumerate((self.sigma_m, self.sigma_yaw_rad)):
             if sigma is not None:
                 out[:, k] = np.interp(t_s, known_s, sigma)

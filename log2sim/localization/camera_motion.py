@@ -30,7 +30,7 @@ from log2sim.geometry import (
     undistort,
     yaw_of,
 )
-from log2sim.localization.odometry import is_during, share_of_motion
+from log2sim.localization.odometry import MAX_SPEED_MPS, is_during, share_of_motion
 from log2sim.perception.records import RecordSource
 
 MIN_CORNER = 1e-4
@@ -119,7 +119,6 @@ MIN_FOLLOWED, MIN_ON_ROAD = 30, 12
 TOLERANCE_PX = 0.7
 STANDING_PX = 0.25
 ROTATION_ROUNDS, MIN_ROTATION_SHARE = 8, 0.5
-MAX_SPEED_MPS = 50.0
 # Yaw rates of vehicles are below 1 rad/s; a steeper turn of two images is a wrong essential matrix.
 MAX_YAW_RATE_RADPS = 1.5
 

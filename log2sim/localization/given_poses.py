@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding, Log
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, yaw_of
+from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.path import (
     MAX_DENSE_S,
     POSITION_PRIOR,
@@ -60,7 +61,7 @@ class CheckedPoses:
 
 
 # From rest a vehicle gets no farther than by this acceleration until the next pose; what is less is the last digit of a position.
-MAX_COPY_ACCELERATION_MPS2, MIN_COPY_STEP_M = 12.0, 0.1
+MIN_COPY_STEP_M = 0.1
 # One run or two may be poses that froze.
 MIN_RUNS = 3
 
@@ -75,7 +76,7 @@ def leave_out_copies(track: PoseTrack) -> tuple[PoseTrack, list[Stretch]]:
             continue
         dt_s = (track.t_ns[stop] - track.t_ns[stop - 1]) / NS_PER_S
         step_m = float(np.linalg.norm(poses[stop, :3, 3] - poses[first, :3, 3]))
-        if step_m > max(MIN_COPY_STEP_M, MAX_COPY_ACCELERATION_MPS2 * dt_s**2):
+        if step_m > max(MIN_COPY_STEP_M, MAX_ACCELERATION_MPS2 * dt_s**2):
             held.append((first, stop))
             steps_m.append(step_m)
     if len(held) < MIN_RUNS:
@@ -96,8 +97,6 @@ MAX_ACCELERATION_MPS2, MAX_YAW_ACCELERATION_RADPS2 = 12.0, 5.0
 # Smaller faults are left as they are: stamps that are off by some 10 ms at 30 m/s, GNSS without corrections, and the fits that
 # would repair them err by as much.
 MIN_STEP_M, MIN_STEP_RAD = 0.4, np.deg2rad(2.0)
-# Standard deviations of poses of GNSS/INS with RTK or LiDAR odometry.
-USUAL_SIGMA_M, USUAL_SIGMA_RAD = 0.02, 0.002
 MIN_LASTING_STEP_M, MIN_LASTING_STEP_RAD = 2.0, np.deg2rad(5.0)
 POSITION = Limits(MAX_ACCELERATION_MPS2, POSITION_PRIOR, MIN_STEP_M, MIN_LASTING_STEP_M, USUAL_SIGMA_M)
 YAW = Limits(MAX_YAW_ACCELERATION_RADPS2, YAW_PRIOR, MIN_STEP_RAD, MIN_LASTING_STEP_RAD, USUAL_SIGMA_RAD)
@@ -236,7 +235,7 @@ def join_tracks(track: PoseTrack, rows: NDArray[np.intp], *others: PoseTrack) ->
     parts = [(track, track.t_ns[rows], track.map_T_ego[rows]), *((o, o.t_ns, o.map_T_ego) for o in others)]
     t_ns = np.concatenate([t for _, t, _ in parts])
     order = np.argsort(t_ns, kind="stable")
-    sigmas = np.concatenate([part.sigmas_at(t, (USUAL_SIGMA_M, USUAL_SIGMA_RAD)) for part, t, _ in parts])[order]
+    sigmas = np.concatenate([part.sigmas_at(t) for part, t, _ in parts])[order]
     poses = np.concatenate([poses for _, _, poses in parts])[order]
     return replace(track, t_ns=t_ns[order], map_T_ego=poses, sigma_m=sigmas[:, 0], sigma_yaw_rad=sigmas[:, 1])
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, Camera, inverse, rotation_from_rpy, transform, undistort
-from log2sim.localization.camera_motion import follow_points
+from log2sim.localization.camera_motion import LEVELS, SPACING_PX, WINDOW_PX, follow_points
 from log2sim.localization.choice import during_ns
 from log2sim.localization.clocks import check_lidars, turn_mount
 from log2sim.localization.edges import (
@@ -36,7 +36,7 @@ from log2sim.plan import LABELS, Sensors
 MAX_PAIRS, MIN_PAIRS = 6, 3
 # The ego moves so far between two frames: errors of its poses are small against it, and a post is not taken for the next one.
 MIN_APART_M, MAX_APART_M, MAX_APART_S = 0.5, 1.5, 1.0
-MAX_CORNERS, CORNER_QUALITY, SPACING_PX, WINDOW_PX, LEVELS = 300, 0.01, 9, 21, 4
+MAX_CORNERS, CORNER_QUALITY = 300, 0.01
 # Slower motions are of what is far away or moves along, or of errors of the rotation.
 MIN_FLOW_RAD, MIN_MOVING = 0.01, 20
 # With the own mount the cosine is 0.99 or more. Vehicles that overtake move against it, but not in all cameras.

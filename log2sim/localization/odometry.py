@@ -25,6 +25,7 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
+from log2sim.localization.given_poses import MAX_ACCELERATION_MPS2
 from log2sim.perception.lidar.cloud import first_of_voxels
 from log2sim.perception.records import RecordSource
 
@@ -283,8 +284,8 @@ def motion_between(first: Array, second: Array) -> Array:
     return np.asarray(inverse(first) @ second)
 
 
-# Vehicles on roads brake with up to 10 m/s2; the rest is room for the error of two fits.
-MAX_ACCELERATION_MPS2, MAX_JUMP_M = 12.0, 0.5
+# Room for the error of two fits.
+MAX_JUMP_M = 0.5
 # The first motion is searched forward and backward in steps within which a fit finds its way, up to these speeds.
 SEARCH_STEP_M, MAX_SPEED_MPS, MAX_REVERSE_MPS = 1.0, 50.0, 5.0
 # A compensation by another motion than the one found is repeated from these differences over a sweep on.

@@ -16,6 +16,7 @@ from log2sim.datatypes import Log, Sweep
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.odometry import densest_lidar, is_during
 from log2sim.localization.surfaces import (
+    LEVER_M,
     Registration,
     Surfaces,
     adjoint_of,
@@ -42,7 +43,7 @@ DRIFT_SIGMA = np.array([0.05, 0.05, 0.05, 0.0025, 0.0025, 0.0025])
 # Registrations that are this many standard deviations off count half.
 CAUCHY = 3.0
 # Directions that a registration tells less well than this, at the distance of usual surfaces, are those that no surface holds.
-MAX_SIGMA_M, LEVER_M = 0.1, 20.0
+MAX_SIGMA_M = 0.1
 MAX_SLIDE_M = 0.1
 ROUNDS = 5
 

@@ -14,7 +14,6 @@ from log2sim.config import Config
 from log2sim.datatypes import Finding, Log
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform, yaw_of
 from log2sim.localization.choice import during_ns
-from log2sim.localization.given_poses import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.odometry import lidars_on_ego
 from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside_fit import (
@@ -221,7 +220,7 @@ def covariance_of_poses(track: PoseTrack, view: VehicleView) -> Array:
     The poses err for seconds, so that the mean over the ego's way errs by the root of `PARTS` less. What is turned where the ego is, at
     the middle of its sweeps, moves the site by its distance from there too.
     """
-    sigma_m, sigma_rad = track.sigmas_at(view.t_ns, (USUAL_SIGMA_M, USUAL_SIGMA_RAD)).mean(axis=0)
+    sigma_m, sigma_rad = track.sigmas_at(view.t_ns).mean(axis=0)
     site_T_ego = adjoint_of(transform(np.eye(3), view.sensor_m.mean(axis=0)))
     out = np.zeros((7, 7))
     out[POSE, POSE] = site_T_ego @ np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3) @ site_T_ego.T / PARTS

@@ -243,8 +243,6 @@ STEP = 4
 MAX_APART_M = 40.0
 # On a shorter way nothing shows that matters: errors of poses of centimeters are degrees of it.
 MIN_PATH_M = 1.0
-# A turn moves what is seen as much as a translation by its angle times this.
-PAIR_LEVER_M = 20.0
 MIN_PAIRS = 8
 
 
@@ -313,7 +311,7 @@ def choose_sweeps(
     if len(spaced) * SPACING_S > MAX_SWEEPS * MAX_SPACING_S:
         # Runs of sweeps in which the velocity varies most, one after the other.
         size, parts = MAX_SWEEPS // PARTS, list[NDArray[np.intp]]()
-        scaled = velocity * np.array([1.0, 1.0, 1.0, PAIR_LEVER_M, PAIR_LEVER_M, PAIR_LEVER_M])
+        scaled = velocity * np.array([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
         change = np.array([scaled[k : k + size].var(axis=0).sum() for k in range(len(spaced) - size + 1)])
         while len(parts) < PARTS and change.max() >= 0:
             k = int(np.argmax(change))

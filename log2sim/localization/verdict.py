@@ -33,15 +33,15 @@ from log2sim.geometry import (
     slerp,
     transform,
 )
+from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.given_poses import (
     MAX_SIGMA_M,
-    USUAL_SIGMA_M,
-    USUAL_SIGMA_RAD,
     CheckedPoses,
     Stretch,
     join_tracks,
 )
 from log2sim.localization.odometry import (
+    NEIGHBORS,
     EgoSweep,
     Odometry,
     densest_lidar,
@@ -103,7 +103,7 @@ def level_on_ground(xyz_m: Array, ground_z_m: float) -> Array | None:
 
 PAIRS = 15
 APART_S = 2.0
-VOXEL_M, NEIGHBORS = 0.25, 10
+VOXEL_M = 0.25
 # A surface is upright if its normal leaves the horizontal by less than 20 degrees, and faces a direction within 45 degrees.
 MAX_NORMAL_Z = 0.35
 MIN_FACING = np.sqrt(0.5)

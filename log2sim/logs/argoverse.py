@@ -25,6 +25,7 @@ from log2sim.errors import LogError, RecordError
 from log2sim.files.images import MAX_IMAGE_PX
 from log2sim.files.inputs import is_present, read_file, require_links_inside
 from log2sim.geometry import Array, Camera, PoseTrack, apply, inverse, shift_poses
+from log2sim.geometry.transforms import OFFSET_STEP_M
 from log2sim.logs.arrow import LIMITS, Kind, TableLimits, read_columns
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.records import (
@@ -69,7 +70,6 @@ def map_frame_of(city: str | None, offset_m: tuple[float, float, float], notes: 
 QUATERNION = ("qw", "qx", "qy", "qz")
 TRANSLATION = ("tx_m", "ty_m", "tz_m")
 TRANSFORM: Mapping[str, Kind] = dict.fromkeys((*QUATERNION, *TRANSLATION), "float")
-OFFSET_STEP_M = 1000.0
 
 
 def transforms_of(columns: Mapping[str, NDArray[Any]], path: Path) -> Array:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from log2sim.errors import LogError, MissingExtra, RecordError
 from log2sim.files.inputs import open_regular, read_bytes
+from log2sim.logs.records import MAX_KEPT_BYTES
 
 ARROW_MAGIC = b"ARROW1"
 # A block, the place of a record batch in the file: offset (int64), bytes of its message (int32, padded), bytes of its body.
@@ -326,8 +327,6 @@ def _check_sizes(rows: int, unpacked_bytes: int, limits: TableLimits) -> None:
         raise ValueError(f"unpacks to {unpacked_bytes} bytes, more than the {limits.unpacked_bytes} allowed")
 
 
-# Decoded rows are kept up to this size; see `ParquetRows`.
-MAX_KEPT_BYTES = 256 * 1024**2
 PARQUET_ROWS_AT_A_TIME = 8
 # Compressed pages are read from the file in parts of this size, not a whole column of a row group at once.
 READ_BYTES = 1024**2

@@ -20,23 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log, Stream, Sweep
+from log2sim.datatypes.log import ROTATION_TOLERANCE
 from log2sim.errors import Log2SimError, LogError, RecordError
 from log2sim.files.images import decode_image, image_size
 from log2sim.files.inputs import read_file
 from log2sim.geometry import NS_PER_S, Array, rotation_from_quaternion, transform
 from log2sim.logs.stamps import MAX_TIME_S, checked_offset_ns
 
-# Quaternions are stored with three decimals or more.
-QUATERNION_TOLERANCE = 1e-3
-
 # Farther than any place on Earth is from the origin of a map.
 MAX_POSITION_M = 1e9
 
 
 def find_not_unit(q: Array) -> NDArray[np.intp]:
-    """Find the rows of quaternions (N, 4) whose norm is not 1 within `QUATERNION_TOLERANCE`, or not finite."""
+    """Find the rows of quaternions (N, 4) whose norm is not 1 within `ROTATION_TOLERANCE`, or not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.flatnonzero(~(np.abs(np.linalg.norm(q, axis=1) - 1) <= QUATERNION_TOLERANCE))
+        return np.flatnonzero(~(np.abs(np.linalg.norm(q, axis=1) - 1) <= ROTATION_TOLERANCE))
 
 
 def checked_poses(q: Array, position: Array, where: Callable[[int], str]) -> Array:
@@ -124,7 +122,7 @@ def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]
         raise error(f"{where}: {reason or type(problem).__name__}") from problem
 
 
-# Of the sweeps that were read last: all that the stages before and after the first pass share of a log of some 100 sweeps.
+# Of the sweeps or rows that were read last: all that the stages before and after the first pass share of a log of some 100 sweeps.
 MAX_KEPT_BYTES = 256 * 1024 * 1024
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import ENDS, Agent, Scenario, Span, Trajectory
+from log2sim.datatypes import ENDS, MARGIN_S, Agent, Scenario, Span, Trajectory
 from log2sim.errors import ConfigError
 from log2sim.files.arrays import Columns
 from log2sim.files.plugins import nearest
@@ -80,8 +80,6 @@ class WarningSettings:
 # Between observations: most LiDARs turn ten times a second. Logs with fewer ticks are observed at these.
 MIN_INTERVAL_S = 0.1
 
-_MARGIN_S = 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class Known:
@@ -122,17 +120,17 @@ def known_agents(
             start, end = runs[0][0], runs[-1][1]
             seen = np.zeros(len(t_s), dtype=bool)
             for first, last in runs:
-                seen |= (t_s >= first - _MARGIN_S) & (t_s <= last + _MARGIN_S) & present[k]
+                seen |= (t_s >= first - MARGIN_S) & (t_s <= last + MARGIN_S) & present[k]
             observed[k] |= seen
-            after = t_s >= start - _MARGIN_S
+            after = t_s >= start - MARGIN_S
             piece[k, after] = number
             age = np.where(np.isfinite(start), t_s - start, np.inf)
-            count[k, after] = np.minimum(age[after] / interval_s + _MARGIN_S, len(t_s)).astype(np.intp) + 1
-            if end - start < confirmed_s - _MARGIN_S:
+            count[k, after] = np.minimum(age[after] / interval_s + MARGIN_S, len(t_s)).astype(np.intp) + 1
+            if end - start < confirmed_s - MARGIN_S:
                 continue
             since[k] = min(since[k], max(start + confirmed_s, float(t_s[0])))
             latest = np.maximum.accumulate(np.where(seen, ticks, -1))
-            there = (t_s >= start + confirmed_s - _MARGIN_S) & (latest >= 0) & (t_s <= end + kept_s + _MARGIN_S)
+            there = (t_s >= start + confirmed_s - MARGIN_S) & (latest >= 0) & (t_s <= end + kept_s + MARGIN_S)
             source[k, there] = latest[there]
     return Known(since, source, observed, count, piece)
 

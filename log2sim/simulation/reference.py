@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.agents.smooth.motion_model import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.datatypes.agent import hermite
 from log2sim.geometry import Array, cos_sin
@@ -160,8 +161,6 @@ SMOOTHING_S = 0.12  # standard deviation of the Gaussian over the velocity of po
 REFERENCE_HOLD_MPS = 0.08
 
 MIN_RUN_M, MIN_RUN_MPS = 0.3, 0.5  # a movement that is both shorter and slower is noise of a standing agent
-MAX_ACCEL_MPS2 = 10.4  # feasibility limits of Waymax (Gulino et al., 2023, section 3.3)
-MAX_CURVATURE_1PM = 0.3
 MAX_TWO_WHEELER_CURVATURE_1PM = 1.0  # not in Waymax; a bicycle turns within a meter
 MAX_DEPARTURE_M = 0.3  # larger than the errors of boxes
 
@@ -221,7 +220,7 @@ def vehicle_reference(
 
     flags = _discontinuity_flags(trajectory)
     for name, values, limit, unit in (
-        ("acceleration", course.accel_mps2, MAX_ACCEL_MPS2, "m/s2"),
+        ("acceleration", course.accel_mps2, MAX_ACCELERATION_MPS2, "m/s2"),
         ("curvature", course.curvature_1pm, max_curvature_1pm, "1/m"),
         ("distance from what can be driven", departure_m, MAX_DEPARTURE_M, "m"),
     ):

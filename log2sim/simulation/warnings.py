@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO, ENDS, STANDSTILL_MPS, Agent, Scenario
+from log2sim.datatypes.agent import MAX_LISTED
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.simulation.expected_motion import (
@@ -32,8 +33,6 @@ from log2sim.simulation.prediction.motion_table import TICK_S, Complex, table_of
 from log2sim.simulation.reference import ControllerMemory, Reference, follow_vehicles, vehicle_reference_of
 from log2sim.simulation.result import CollisionWarning, Moment, Replay, Warnings, to_scenario
 from log2sim.simulation.vehicles.vehicle import WHEELED, VehicleState, parameters_for
-
-MAX_LISTED = 5
 
 _ENDS = {"vehicle": "the vehicle's sensors", "road": "the road's sensors", "both": "the sensors of vehicle and road"}
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, rotation_from_rpy, transform
-from log2sim.synth.backdrop import Backdrop
+from log2sim.synth.backdrop import BAY_M, FLOOR_M, Backdrop
 from log2sim.synth.ground import Ground, GroundPlan
 from log2sim.synth.light import Lamp, Light, headlights
 from log2sim.synth.paint import Paint, linear_bgr
@@ -44,7 +44,6 @@ SKINS: tuple[Rgb, ...] = ((206, 162, 136), (170, 122, 92), (96, 66, 48))
 HAIRS: tuple[Rgb, ...] = ((40, 32, 26), (88, 62, 38), (150, 120, 80), (120, 118, 116))
 # Share of samples through which one sees what is behind.
 OPENNESS = {Material.MESH: MESH_OPENNESS}
-FLOOR_M, BAY_M = 3.1, 2.7
 LAMP_WHITE, LAMP_RED, PLATE = (0.72, 0.76, 0.76), (0.02, 0.02, 0.42), (0.6, 0.6, 0.6)
 VEHICLES = ("car", "truck", "bus")
 PEOPLE = ("pedestrian", "cyclist", "motorcycle")

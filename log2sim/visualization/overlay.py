@@ -20,6 +20,7 @@ from log2sim import geometry
 from log2sim.datatypes import CATEGORIES, CATEGORY, Boxes3D, Labels, Log, Sweep
 from log2sim.errors import ConfigError, RecordError
 from log2sim.files.documents import refuse_existing
+from log2sim.logs.excerpt import STAMP_TOLERANCE_NS
 from log2sim.perception.detect.detectors import MAX_AGE_S, boxes_of_labels, interpolate_pairs, window_ns
 from log2sim.perception.lidar.cloud import cloud_origin, compensation_of, sweep_to_map
 from log2sim.perception.lidar.projection import poses_around, project_boxes_in_view, view_of
@@ -28,9 +29,6 @@ from log2sim.perception.sync import synchronize
 from log2sim.visualization.plot.layers import add_lines
 from log2sim.visualization.plot.style import FONT, FRAME, INK, MUTED, PAPER, new_figure, printable_label, save_png
 from log2sim.visualization.recording import corners_in_view, require_cameras
-
-# Stamps of labels and frames of one moment differ by rounding in some logs.
-STAMP_TOLERANCE_NS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,9 @@ import shutil
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
+
+from worlds import CAR, tiny_table
 
 from benchmarks.tag_worlds import traffic
 from log2sim.batch import plan_batch, run_batch
@@ -29,22 +32,12 @@ from log2sim.logs.native.writer import write_log
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
-SCENE = {
-    "name": "short",
-    "duration_s": 0.5,
-    "ego": {"waypoints": [[0.0, 0.0, 5.0], [20.0, 0.0, 5.0]], "poses": "poses"},
-    "road": [{"line": [[-10.0, 0.0], [50.0, 0.0]], "width_m": 10.0}],
-    "agent": [
-        {"id": "car", "category": "car", "size_m": [4.4, 1.8, 1.5], "waypoints": [[16.0, 2.0, 6.0], [40.0, 2.0, 6.0]]}
-    ],
+LIDAR = {"channels": 16, "elevation_deg": [-15.0, 3.0], "azimuth_deg": [-40.0, 40.0]}
+SCENE: dict[str, Any] = {
+    "name": "short", "duration_s": 0.5, "ego": {"waypoints": [[0.0, 0.0, 5.0], [20.0, 0.0, 5.0]], "poses": "poses"},
+    "agent": [{**CAR, "waypoints": [[16.0, 2.0, 6.0], [40.0, 2.0, 6.0]]}],
     "camera": [{"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [320, 200]}],
-    "lidar": [
-        {
-            "name": "top", "position_m": [1.2, 0.0, 1.9], "channels": 16, "elevation_deg": [-15.0, 3.0], "azimuth_deg": [-40.0, 40.0],
-            "azimuth_step_deg": 0.5, "range_m": 60.0,
-        }
-    ],
-    "gnss": {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0},
+    "lidar": [{**tiny_table()["lidar"][0], **LIDAR}],
 }  # fmt: skip
 SETTINGS = ("map.lanes=false", "appearance.colors=false", "appearance.signals=false")
 SHIFTED = {"t_ns": 10**12, "x_m": 7.0, "y_m": -7.0}  # between a log and the next one
@@ -72,7 +65,7 @@ def write_logs(root: Path, count: int) -> None:
     began, unfinished, base = time.perf_counter(), root.with_name(f"{root.name}.part"), root.with_name("drive")
     for left in (unfinished, base):
         shutil.rmtree(left, ignore_errors=True)
-    log, _ = synthesize(scene_from_table(SCENE))
+    log, _ = synthesize(scene_from_table(tiny_table(**SCENE)))
     write_log(log, base)
     tables = {path.relative_to(base): path.read_text() for path in base.rglob("*.csv")}
     records = [path.relative_to(base) for path in base.rglob("*") if path.suffix in (".npz", ".jpg")]

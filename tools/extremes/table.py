@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from worlds import tiny_scene, tiny_table
 
 from log2sim import Config, Scenario, open_log
 from log2sim.datatypes import Log
@@ -23,7 +24,6 @@ from log2sim.logs.native.writer import write_log
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import Decision, Stage
 from log2sim.report import Result
-from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
 RunBy = Literal["tests", "slow tests", "tool"]
@@ -81,27 +81,11 @@ Row = dict[str, str]
 @lru_cache
 def small_log() -> Log:
     """Six ticks of a street with a car, a parked car and a pedestrian."""
-    agents = [
-        {"id": "car", "category": "car", "size_m": [4.4, 1.8, 1.5], "waypoints": [[16.0, 2.0, 4.0], [40.0, 2.0, 4.0]]},
-        {"id": "parked", "category": "car", "size_m": [4.2, 1.8, 1.5], "pose": [14.0, -4.0, 10.0]},
-        {"id": "walker", "category": "pedestrian", "waypoints": [[12.0, 5.0, 1.4], [12.0, -5.0, 1.4]]},
-    ]
-    lidar = {
-        "name": "top",
-        "position_m": [1.2, 0.0, 1.9],
-        "channels": 20,
-        "elevation_deg": [-18.0, 3.0],
-        "range_m": 60.0,
-    }
-    table = {
-        "name": "extreme", "duration_s": 0.6, "agent": agents,
-        "ego": {"waypoints": [[0.0, 0.0, 3.0], [20.0, 0.0, 3.0]], "poses": "poses"},
-        "road": [{"line": [[-10.0, 0.0], [50.0, 0.0]], "width_m": 10.0}],
-        "camera": [{"name": "front", "position_m": [1.7, 0.0, 1.5], "size_px": [320, 200], "offset_s": 0.03}],
-        "lidar": [lidar | {"azimuth_deg": [-60.0, 60.0], "azimuth_step_deg": 0.6}],
-        "gnss": {"position_sigma_m": 0.0, "angle_sigma_deg": 0.0},
+    (camera,), (lidar,) = tiny_table()["camera"], tiny_table()["lidar"]
+    sensors = {
+        "camera": [{**camera, "size_px": [320, 200]}], "lidar": [{**lidar, "channels": 20, "azimuth_step_deg": 0.6}],
     }  # fmt: skip
-    return synthesize(scene_from_table(table), seed=0)[0]
+    return synthesize(tiny_scene(name="extreme", duration_s=0.6, **sensors), seed=0)[0]
 
 
 @lru_cache

@@ -27,9 +27,9 @@ from log2sim.agents import estimate
 from log2sim.agents import judge as judging
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import SIGNS, Table, gather
-from log2sim.agents.judge import MAX_CONFIDENCE, MIN_CONFIDENCE, MIN_THERE, variance_terms
+from log2sim.agents.judge import MIN_THERE, variance_terms
 from log2sim.datatypes import CATEGORIES, GROUP_OF
-from log2sim.datatypes.log_odds import probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, probability_of
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.metrics.comparison import Selection
 from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
@@ -177,7 +177,7 @@ def probabilities(agents: Sequence[Rated], tables: tuple[Weights, Weights]) -> t
         probability_of([sum(w * a.evidence.get(n, 1.0) for n, w in table[a.lidar].items()) for a in agents])
         for table in tables
     )
-    return there, np.clip(there * state, MIN_CONFIDENCE, MAX_CONFIDENCE)
+    return there, np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY)
 
 
 def terms_of(a: Rated, kind: str, confidence: float) -> dict[str, float]:

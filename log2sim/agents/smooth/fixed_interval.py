@@ -148,8 +148,6 @@ STANDSTILL_SIGMA_MPS = 0.005
 EDGE_MPS, EDGE_S = 1.0, 0.4
 # The first and the last quarter of a span are off its middle when it is this significant and this far.
 END_SIGMAS, MIN_END_STEP_M = 2.5, 0.03
-# An end is moving when a straight line at constant speed, this long, explains this share of its scatter.
-MIN_EXPLAINED_SHARE, MIN_LINE_M, MIN_LINE_OBSERVATIONS = 0.85, 0.1, 4
 
 
 def zero_velocity_sigma(
@@ -224,28 +222,11 @@ def _end_discrepancies(t: Array, xy: Array, information: Array) -> tuple[float, 
     sums = [float(information[part].sum()) for part in parts]
     means = [information[part] @ xy[part] / s for part, s in zip(parts, sums)]
     first, last = (
-        max(
-            float(np.hypot(*(means[k] - means[1])))
-            / max(END_SIGMAS * noise_scale * np.sqrt(1 / sums[1] + 1 / sums[k]), MIN_END_STEP_M),
-            _line_length(t[parts[k]], xy[parts[k]]) / MIN_LINE_M,
-        )
+        float(np.hypot(*(means[k] - means[1])))
+        / max(END_SIGMAS * noise_scale * np.sqrt(1 / sums[1] + 1 / sums[k]), MIN_END_STEP_M)
         for k in (0, 2)
     )
     return first, last
-
-
-def _line_length(t: Array, xy: Array) -> float:
-    """Length in m of the straight line that positions follow at constant speed, 0 where they do not.
-
-    Detects driving off even where the positions are far better than their covariances say.
-    """
-    if len(t) < MIN_LINE_OBSERVATIONS:
-        return 0.0
-    time, from_mean = t - t.mean(), xy - xy.mean(axis=0)
-    slope = time @ from_mean / (time @ time)
-    explained = float((slope @ slope) * (time @ time))
-    on_line = explained > MIN_EXPLAINED_SHARE * float((from_mean**2).sum())
-    return float(np.hypot(*slope) * (t[-1] - t[0])) if on_line else 0.0
 
 
 # Jerk density in m2/s5 that follows every maneuver while outliers are searched.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from log2sim.agents.smooth.fixed_interval import smooth_interval
+from log2sim.agents.smooth.fixed_interval import MIN_WEIGHT, smooth_interval
 from log2sim.agents.smooth.motion_model import MotionModel, broken_limits, speed_sigma
 from log2sim.agents.smooth.quadratic import NoisyPositions
 from log2sim.datatypes import Finding
@@ -15,9 +15,6 @@ from log2sim.geometry import Array, wrap_angle
 
 # Below this speed the curvature of a smoothed path is noise.
 MIN_CURVATURE_SPEED_MPS = 1.5
-MIN_INLIER_WEIGHT = 0.25
-# In a longer gap the position's covariance grows at least with this jerk density, which traffic has.
-MIN_GAP_S, GAP_JERK_DENSITY = 2.0, 0.05
 # Third differences need some rows for a median; below, this standard deviation is assumed.
 MIN_ROWS_FOR_SIGMA, DEFAULT_SIGMA_M, MIN_SIGMA_M = 8, 0.2, 1e-3
 
@@ -88,7 +85,7 @@ def smooth_track(
     cross = velocity[:, 0] * acceleration[:, 1] - velocity[:, 1] * acceleration[:, 0]
     curvature = np.divide(cross, speed**3, out=np.zeros_like(speed), where=fast)
     residual, inlier = np.full(len(t), np.nan), np.zeros(len(t), dtype=bool)
-    residual[use], inlier[use] = path.residual_m, path.weight > MIN_INLIER_WEIGHT
+    residual[use], inlier[use] = path.residual_m, path.weight > MIN_WEIGHT
     broken: tuple[Finding, ...] = ()
     if not motion.holonomic:
         sigma = np.sqrt(np.trace(path.covariance[:, 4:, 4:], axis1=1, axis2=2) / 2)
@@ -102,41 +99,13 @@ def smooth_track(
         acceleration_mps2=acceleration,
         yaw_rad=path.yaw_rad,
         curvature_1pm=curvature,
-        covariance=_inflated_in_gaps(path.covariance[:, :2, :2], asked, t[inlier], path.jerk_density),
+        covariance=path.covariance[:, :2, :2],
         residual_m=residual,
         inlier=inlier,
         sigma_yaw_rad=path.sigma_yaw_rad,
         sigma_speed_mps=speed_sigma(path.yaw_rad, path.covariance[:, 2:4, 2:4]),
         broken=broken,
     )
-
-
-def _inflated_in_gaps(covariance: Array, at_s: Array, inlier_s: Array, density: tuple[float, float]) -> Array:
-    """Inflate covariances (T, 2, 2) in long gaps between inliers (m,), and before the first and after the last of them.
-
-    A low jerk density where the object was observed says little about gaps, so there it may have moved as vehicles do.
-    """
-    factor = GAP_JERK_DENSITY / max(np.sqrt(density[0] * density[1]), 1e-12)
-    if factor <= 1 or len(inlier_s) == 0:
-        return covariance
-    out = covariance.copy()
-    gaps = np.flatnonzero(np.diff(inlier_s) > MIN_GAP_S)
-    spans = list(zip(inlier_s[gaps].tolist(), inlier_s[gaps + 1].tolist(), strict=True))
-    for first, last in [(-np.inf, float(inlier_s[0])), *spans, (float(inlier_s[-1]), np.inf)]:
-        rows = np.flatnonzero((at_s > first) & (at_s < last))
-        if len(rows) == 0:
-            continue
-        before, after = covariance[max(rows[0] - 1, 0)], covariance[min(rows[-1] + 1, len(covariance) - 1)]
-        if np.isinf(first) or np.isinf(last):
-            before = after = after if np.isinf(first) else before
-            share = np.zeros((len(rows), 1, 1))
-        else:
-            share = ((at_s[rows] - first) / (last - first))[:, None, None]
-        excess = covariance[rows] - (1 - share) * before - share * after
-        # Only what the gap itself adds grows with the jerk.
-        grows = np.trace(excess, axis1=1, axis2=2) > 0
-        out[rows[grows]] += (factor - 1) * excess[grows]
-    return out
 
 
 def estimate_sigma(t: Array, xy: Array) -> float:

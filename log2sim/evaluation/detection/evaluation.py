@@ -25,7 +25,7 @@ from log2sim.evaluation.detection.protocols import (
 )
 from log2sim.evaluation.detection.truth import ImageViews, image_views, truth_of_sweeps
 from log2sim.evaluation.metrics.comparison import MIN_REGION_SHARE
-from log2sim.evaluation.metrics.correctness import reliability
+from log2sim.evaluation.metrics.correctness import RANGES_M, reliability
 from log2sim.evaluation.metrics.table import columns_text, percent, verdict_text
 from log2sim.evaluation.road import cell
 from log2sim.files.plugins import nearest
@@ -160,7 +160,6 @@ def calibration(found: SceneBoxes, matches: Matches) -> dict[str, Any]:
 
 
 Mask = NDArray[np.bool_]
-RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
 POINTS = ((MIN_POINTS, 9), (10, 19), (20, 49), (50, np.inf), (20, np.inf))  # the last one joins the two before
 
 

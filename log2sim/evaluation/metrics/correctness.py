@@ -12,10 +12,11 @@ from log2sim.datatypes import CATEGORIES, GROUPS, MIN_TRUSTED_CONFIDENCE, Agent
 from log2sim.evaluation.metrics.comparison import Comparison, Mask, StateTable
 from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_rules, judge_against_truth
 from log2sim.geometry import Array
+from log2sim.geometry.statistics import CHI2_2DOF_95
 
 BINS = 10
 # 95 % quantiles of the chi-square distribution by degrees of freedom: 1.96^2, and -2 ln 0.05.
-CHI2_95 = {1: 3.841, 2: 5.991}
+CHI2_95 = {1: 3.841, 2: CHI2_2DOF_95}
 
 
 def reliability(confidence: Array, right: Mask) -> dict[str, Any]:

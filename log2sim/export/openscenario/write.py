@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from log2sim.datatypes import EGO, Agent, Scenario
+from log2sim.datatypes import EGO, MARGIN_S, Agent, Scenario
 from log2sim.errors import ConfigError
 from log2sim.export import xml_text
 from log2sim.export.checks import require_start_as_in_scenario
@@ -126,7 +126,6 @@ HIDDEN_DEPTH_M, HIDDEN_SPACING_M = 500.0, 10.0
 MIN_DURATION_S = 0.001
 # "At or after t" in revisions with only "after".
 JUST_BEFORE_S = 1e-6
-SAME_TIME_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +270,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         ego = scenario.ego
         if ego is None or ego.category == "pedestrian":
             raise ConfigError(f"--ego {EXTERNAL}: scenario '{scenario.name}' has no agent '{EGO}' with wheels to drive")
-        if ego.waypoints.t_s[0] > SAME_TIME_S:
+        if ego.waypoints.t_s[0] > MARGIN_S:
             first_s = float(ego.waypoints.t_s[0])
             raise ConfigError(f"--ego {EXTERNAL}: the ego appears at {first_s:g} s, expected it from the start on")
     road, placement = add_road_file(scenario, folder, options.map)
@@ -289,7 +288,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
         vertices = np.column_stack([w.t_s, states[:, :3] - back, heading])
         if len(vertices) == 1:
             vertices = np.repeat(vertices, 2, axis=0) + np.outer([0, MIN_DURATION_S], [1, 0, 0, 0, 0])
-        enters, leaves = bool(w.t_s[0] > SAME_TIME_S), bool(vertices[-1, 0] < duration_s - SAME_TIME_S)
+        enters, leaves = bool(w.t_s[0] > MARGIN_S), bool(vertices[-1, 0] < duration_s - MARGIN_S)
         # Players refuse a negative initial speed; a reversing agent takes its speed from the trajectory at once.
         speed_mps, hidden_m = max(float(w.speed_mps[0]), 0.0), HIDDEN_DEPTH_M + HIDDEN_SPACING_M * k
         start = np.array([np.interp(max(vertices[0, 0], 0.0), vertices[:, 0], column) for column in vertices.T])

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EgoVehicle, ImageLabels, ImageRegions, Labels, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.datatypes.log import ROTATION_TOLERANCE
 from log2sim.errors import LogError
 from log2sim.files.arrays import Columns
 from log2sim.files.documents import parse_float, parse_int
@@ -34,7 +35,6 @@ from log2sim.logs.records import MAX_POSITION_M, read_sweep, sweep_of
 from log2sim.logs.stamps import note_damaged_rows
 
 EARTH_RADIUS_M = 6378137.0
-ROTATION_TOLERANCE = 1e-3
 MAX_TEXT_BYTES = 64 * 1024 * 1024
 OXTS_FIELDS = 30
 

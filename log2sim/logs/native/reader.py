@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim import datatypes
-from log2sim.datatypes.log import camera_of
+from log2sim.datatypes.log import ROTATION_TOLERANCE, camera_of
 from log2sim.errors import LogError
 from log2sim.files.documents import JSON_LIMIT_BYTES, check, is_plain, read_json
 from log2sim.files.inputs import inside, open_regular, read_file, require_link_inside
@@ -29,7 +29,8 @@ from log2sim.geometry import (
     shift_poses,
     transform,
 )
-from log2sim.logs.records import QUATERNION_TOLERANCE, FolderReader, checked_poses, image_stream, read_sweep
+from log2sim.geometry.transforms import OFFSET_STEP_M
+from log2sim.logs.records import FolderReader, checked_poses, image_stream, read_sweep
 from log2sim.logs.stamps import map_frame_of, note_damaged_rows, poses_from_geodetic, strictly_increasing
 
 MAX_TABLE_BYTES = 256 * 1024 * 1024
@@ -193,9 +194,6 @@ def _check_categories(table: CsvTable) -> None:
     table.refuse(~np.isin(table["category"], datatypes.CATEGORIES), "category", words)
 
 
-OFFSET_STEP_M = 1000.0
-
-
 MANIFEST = "log.json"
 
 INDEX_COLUMNS = {"t_ns": "int", "file": "str"}
@@ -342,7 +340,7 @@ class _Folder:
     def _sensor(self, k: int, entry: Mapping[str, Any]) -> Camera | datatypes.Lidar:
         where = f"{self.file}, sensors[{k}] '{entry['name']}'"
         norm = float(np.linalg.norm(entry["rotation_wxyz"]))
-        if abs(norm - 1) > QUATERNION_TOLERANCE:
+        if abs(norm - 1) > ROTATION_TOLERANCE:
             raise LogError(f"{where}: rotation_wxyz has norm {norm:.6g}, expected a unit quaternion (scalar first)")
         mount_T_sensor = transform(rotation_from_quaternion(entry["rotation_wxyz"]), entry["translation_m"])
         if entry["kind"] == "lidar":

@@ -19,6 +19,7 @@ from log2sim.errors import LogError
 from log2sim.files.images import MAX_IMAGE_PX
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.excerpt import digest_of
+from log2sim.logs.kitti.labels import EARTH_RADIUS_M
 from log2sim.logs.nuscenes.scene import (
     DATA,
     SCENES,
@@ -45,7 +46,6 @@ MAP_ORIGIN_DEG = {
     "singapore-hollandvillage": (1.2993652317780957, 103.78217697143555),
     "singapore-queenstown": (1.2782562240223188, 103.76741409301758),
 }
-EARTH_RADIUS_M = 6378137.0
 # A smaller range of heights means that the log has none: a drive on real ground has more.
 MAX_FLAT_M = 0.001
 

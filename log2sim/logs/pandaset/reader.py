@@ -28,6 +28,7 @@ from log2sim.logs import records
 from log2sim.logs.checks import Span, describe_gap
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.pandaset.unpickle import MAX_TABLE_BYTES, Columns, read_pickled_table
+from log2sim.logs.records import MAX_KEPT_BYTES
 from log2sim.logs.stamps import (
     MAX_TIME_S,
     compute_scan_offset_ns,
@@ -43,7 +44,6 @@ from log2sim.logs.stamps import (
 # Value of the column "d" by LiDAR.
 LIDARS: Mapping[str, int] = {"pandar64": 0, "pandargt": 1}
 COLUMNS = ("x", "y", "z", "t", "d", "i")
-MAX_KEPT_BYTES = 256 * 1024**2
 READING_THREADS = 4
 
 

@@ -22,12 +22,13 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from log2sim.config import Section
 from log2sim.datatypes import Sweep
+from log2sim.datatypes.log import ROTATION_TOLERANCE
 from log2sim.errors import ConfigError, MissingExtra, RecordError
 from log2sim.files.documents import first_problem
 from log2sim.files.inputs import is_present, read_text
 from log2sim.geometry import DISTORTION_LENGTHS, NS_PER_S
 from log2sim.logs.checks import Span, describe_gap
-from log2sim.logs.records import MAX_SWEEP_POINTS, QUATERNION_TOLERANCE, sweep_of
+from log2sim.logs.records import MAX_SWEEP_POINTS, sweep_of
 from log2sim.logs.ros.bag import ENCODINGS, STAMP, Bag, Topic, stamp_of
 from log2sim.logs.ros.containers import one_line
 from log2sim.logs.stamps import strictly_increasing
@@ -123,7 +124,7 @@ class StaticTransform(Section):
     @model_validator(mode="after")
     def _check_norm(self) -> StaticTransform:
         norm = sum(v * v for v in self.rotation_wxyz) ** 0.5
-        if abs(norm - 1) > QUATERNION_TOLERANCE:
+        if abs(norm - 1) > ROTATION_TOLERANCE:
             raise ValueError(f"rotation_wxyz of '{self.child}' has norm {norm:.6g}, expected a unit quaternion")
         return self
 

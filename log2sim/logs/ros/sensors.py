@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Stream, Sweep
+from log2sim.datatypes.log import ROTATION_TOLERANCE
 from log2sim.errors import RecordError
 from log2sim.files.images import MAX_IMAGE_PX, decode_image, image_size
 from log2sim.geometry import NS_PER_S, Array, Camera, Mount, inverse, transform
@@ -20,7 +21,6 @@ from log2sim.logs.ros.messages import CameraTopic, LidarTopic, Stamped, decode
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 BROWN, FISHEYE = ("plumb_bob", "rational_polynomial", "radtan", ""), ("equidistant", "fisheye", "kannala_brandt4")
-ROTATION_TOLERANCE = 1e-3
 
 
 class CalibrationProblem(ValueError):

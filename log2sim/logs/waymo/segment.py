@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from log2sim.datatypes.log import ROTATION_TOLERANCE
 from log2sim.geometry import NS_PER_S, Array, nearest_rotation
 from log2sim.logs.stamps import MAX_TIME_S
 
@@ -25,7 +26,6 @@ FRONT_CAMERA = 1
 
 # Of calibrations; larger ones are damaged.
 MAX_SIDE_PX, MAX_BEAMS = 100_000, 4096
-ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

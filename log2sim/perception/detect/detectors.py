@@ -20,6 +20,7 @@ from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT, require_members
 from log2sim.geometry import NS_PER_S, period_of, rectangles_overlap, wrap_angle
+from log2sim.logs.excerpt import STAMP_TOLERANCE_NS
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
 
 __all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
@@ -264,8 +265,6 @@ def interpolate_pairs(before: Boxes3D, after: Boxes3D, t_ns: int) -> Boxes3D:
 
 # Smaller boxes are left out, as detectors do not find them.
 MIN_SIDE_PX = 6.0
-# Stamps of labels and frames of one moment differ by rounding in some logs.
-STAMP_TOLERANCE_NS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)

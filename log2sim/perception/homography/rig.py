@@ -314,7 +314,7 @@ def tilt_of_ticks(rows: HeightRows, plane: Array) -> tuple[NDArray[np.int64], Ar
 
 # Standard deviations before anything is fitted. A box ends within some pixels of its object. Overhangs of cars are
 # 0.7 to 1 m, which is as much as 0.1 m in height where a camera 1.6 m high sees them 12 m away.
-BELOW_SIGMA_PX, LIFT_SIGMA_M = 4.0, 0.1
+LIFT_SIGMA_M = 0.1
 # Mounts that are not calibrated to each other at the same time differ by some tenths of a degree.
 MOUNT_SIGMA_RAD = np.deg2rad(0.5)
 # Gates on the squared error while it is fitted, then until nothing changes.
@@ -400,7 +400,7 @@ def _step(
         normal[np.ix_(place, place)] += block.T @ block
         right[place] += block.T @ error[own].ravel()
     of_camera = np.array([LIFT_SIGMA_M, *[MOUNT_SIGMA_RAD] * 3]) ** -2.0
-    prior = np.concatenate([[BELOW_SIGMA_PX**-2.0], np.tile(of_camera, count)])
+    prior = np.concatenate([[FOOT_SIGMA_PX**-2.0], np.tile(of_camera, count)])
     value = np.array([state.below_px, *(v for n in rig.cameras for v in (state.lift_m[n], *state.feet[n]))])
     covariance = np.asarray(np.linalg.inv(normal + np.diag(prior)), dtype=np.float64)
     return np.asarray(-covariance @ (right + prior * value)), covariance

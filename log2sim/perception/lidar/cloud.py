@@ -16,11 +16,9 @@ from log2sim.geometry import NS_PER_S, Array
 CELL_M = 1.0
 REACH_M = 100.0
 ROUNDS = 6
-# A cell whose lowest point is higher than this above the smooth surface contains an object; ditches and falling edges of
-# slopes may be deeper.
-ACCEPT_ABOVE_M = 0.2
-ACCEPT_BELOW_M = 0.4
-ON_GROUND_M = 0.2
+# Of what lies on the ground, curbs included. A cell whose lowest point is higher above the smooth surface contains an object; ditches
+# and falling edges of slopes may be deeper.
+ON_GROUND_M, ACCEPT_BELOW_M = 0.2, 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +93,7 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
     lowest = np.where(filled, lowest, 0.0)
     residual = np.where(filled, lowest - surface, 0.0)
     for widened in (2.0, 1.0):
-        on_ground = (residual < widened * ACCEPT_ABOVE_M) & (residual > -widened * ACCEPT_BELOW_M)
+        on_ground = (residual < widened * ON_GROUND_M) & (residual > -widened * ACCEPT_BELOW_M)
         weight = (filled & on_ground).astype(np.float64)
         total, blurred = _blur(weight), _blur(weight * residual)
         surface = surface + np.divide(blurred, total, out=np.zeros_like(total), where=total > 1e-6)
@@ -266,8 +264,8 @@ MAX_POSE_BINS = 4096
 AT_REST_M = 0.01
 AT_REST_RAD = AT_REST_M / 30.0
 AT_REST_PROBES = 5
-# Heights above ground of what a vehicle could hit: above the curb, below signs and bridges.
-MIN_OBSTACLE_HEIGHT_M, MAX_OBSTACLE_HEIGHT_M = 0.2, 4.2
+# Height above ground of what a vehicle could hit: below signs and bridges.
+MAX_OBSTACLE_HEIGHT_M = 4.2
 GROUND_REACH_M = 45.0
 GROUND_SAMPLE = 2000
 # Fewer points in a box may be of the road or of a neighbor.
@@ -313,9 +311,7 @@ class Cloud:
     @cached_property
     def obstacles(self) -> NDArray[np.intp]:
         """Indices (n,) of the points above the ground and below what hangs over the road."""
-        return np.flatnonzero(
-            ~self.ground & (self.height > MIN_OBSTACLE_HEIGHT_M) & (self.height < MAX_OBSTACLE_HEIGHT_M)
-        )
+        return np.flatnonzero(~self.ground & (self.height > ON_GROUND_M) & (self.height < MAX_OBSTACLE_HEIGHT_M))
 
     @cached_property
     def columns(self) -> NDArray[np.float32]:
@@ -598,7 +594,6 @@ CELL_STEPS = round(CELL_RAD / STEP_RAD)
 COLUMNS = STEPS_PER_TURN // CELL_STEPS + 1
 # Cells from straight down to straight up, more than there are.
 CELLS_PER_COLUMN = 1024
-MAX_REACH_M = 70.0
 
 
 def sample_rays(cloud: Cloud) -> Rays:
@@ -619,7 +614,7 @@ def sample_rays(cloud: Cloud) -> Rays:
             np.concatenate([part.velocity_mps for part in parts]),
         )
     azimuth, range_m, slope = cloud.azimuth_index.unsorted
-    point = np.flatnonzero((range_m < MAX_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
+    point = np.flatnonzero((range_m < OBSTACLE_REACH_M) & (cloud.height < MAX_OBSTACLE_HEIGHT_M))
     # The slope of a ray differs from its angle where it is steep: near the sensor, where rays are many.
     slope = np.clip(slope.take(point) / np.float32(CELL_RAD), -CELLS_PER_COLUMN // 2, CELLS_PER_COLUMN // 2 - 1)
     column = _sensor_of(cloud, point) * COLUMNS + azimuth.take(point) // CELL_STEPS

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, TYPICAL_SIZE_M
 from log2sim.geometry import NS_PER_S, Array, apply, box_iou, undistort
-from log2sim.perception.boxes import azimuth_steps, oriented_covariance, rotate, subsample, upper_median
+from log2sim.perception.boxes import (
+    MIN_SIDE_DISTANCE_M,
+    azimuth_steps,
+    oriented_covariance,
+    rotate,
+    subsample,
+    upper_median,
+)
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.projection import ProjectedPoints, View
 
@@ -29,7 +36,7 @@ MIN_IMAGE_IOU = 0.12
 # cluster counts as extending beyond the box.
 MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
 # Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost.
-SIDE_DEPTH_M, MIN_SIDE_DISTANCE_M, MAX_MISSED_RAYS = 0.2, 0.3, 1.5
+SIDE_DEPTH_M, MAX_MISSED_RAYS = 0.2, 1.5
 # Boxes with a higher IoU are duplicates and share points. A cluster is rejected when a larger share of its points already
 # belongs to another box.
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5

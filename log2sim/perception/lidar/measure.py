@@ -33,7 +33,7 @@ from log2sim.datatypes import (
     end_of,
     seen_from,
 )
-from log2sim.datatypes.log_odds import log_odds_of, probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
 from log2sim.geometry import NS_PER_S, Array, Camera, box_iou
 from log2sim.perception.boxes import (
     TOP_QUANTILE,
@@ -184,8 +184,6 @@ def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
 MIN_IOU = 0.3
 # The category of the image counts where the boxes overlap by this.
 MIN_CATEGORY_IOU = 0.5
-# Scores nearer to 0 or 1 are not believed.
-MIN_SCORE, MAX_SCORE = 0.01, 0.99
 # Recall of a detector in images for objects of at least this height in px, and the height at which it finds none.
 IMAGE_RECALL, IMAGE_RECALL_PX, NO_IMAGE_RECALL_PX = 0.6, 40.0, 12.0
 # Recall of a detector in sweeps for objects with many points, within its range, by group; half of it is reached at so many
@@ -282,7 +280,7 @@ def if_missed(score: Array, recall: Array) -> Array:
 
 def logit(p: Array) -> Array:
     """Return the log-odds (M,) of scores, limited to those that are believed."""
-    return log_odds_of(np.clip(p, MIN_SCORE, MAX_SCORE))
+    return log_odds_of(np.clip(p, MIN_PROBABILITY, MAX_PROBABILITY))
 
 
 # A box that ends nearer to the image border may be cut by it.

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import EGO, STANDSTILL_MPS, Trajectory
+from log2sim.datatypes.agent import MAX_LISTED
 from log2sim.errors import CheckFailed, ConfigError
 from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, fit_windows, wrap_angle
@@ -367,9 +368,6 @@ def _box_tracks(
     size = np.array([a.size_m for a in agents], dtype=np.float64).reshape(-1, 3)
     x, y, z, yaw, speed = columns
     return BoxTracks(x, y, z, yaw, speed, size)
-
-
-MAX_LISTED = 5
 
 
 def summarize(replay: Replay, *, limit: int | None = MAX_LISTED) -> str:

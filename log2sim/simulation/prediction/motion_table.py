@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from log2sim.agents.smooth.motion_model import MAX_CURVATURE_1PM, MAX_LATERAL_MPS2
 from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Scenario
 from log2sim.geometry import Array
 
@@ -94,8 +95,6 @@ USUAL_ERROR_M = 0.3
 USUAL_ERRORS = 2.0  # how many errors of the past `USUAL_ERROR_M` counts as
 # Of slower agents the velocity does not tell the course: smoothed speeds err by 0.15 m/s, which is 17 degrees here.
 MIN_COURSE_MPS = 0.5
-MAX_LATERAL_MPS2 = 8.8  # tires on dry asphalt hold about 0.9 g
-MAX_CURVATURE_1PM = 0.3  # beyond it a vehicle's motion is infeasible for Waymax (Gulino et al., 2023)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from log2sim.datatypes import CATEGORIES, EGO, GROUP_OF, STANDSTILL_MPS, Scenari
 from log2sim.errors import ConfigError
 from log2sim.files.documents import rounded, short_repr
 from log2sim.geometry import Array
+from log2sim.geometry.statistics import CHI2_2DOF_95
 from log2sim.simulation.prediction.motion_table import (
     MIN_COURSE_MPS,
     PROOF_S,
@@ -345,7 +346,6 @@ def predict_table(
 
 
 MOTIONS = ("moving", "standing")  # whether an agent is faster than `STANDSTILL_MPS` when it is predicted
-CHI2_95 = 5.991  # 95 % quantile of chi-squared with two degrees of freedom
 
 
 def measure_predictions(predictions: Predictions) -> list[dict[str, Any]]:
@@ -403,7 +403,7 @@ def _figures(
         squared = ((off[known] / sigma[known]) ** 2).sum(axis=1)
         upto = seen[there, : h + 1]
         ade_m, fde_m = distance[there, : h + 1][upto].mean(), distance[there, h].mean()
-        nees, within = (squared.mean() / 2, (squared < CHI2_95).mean()) if known.any() else (None, None)
+        nees, within = (squared.mean() / 2, (squared < CHI2_2DOF_95).mean()) if known.any() else (None, None)
         agents = len(np.unique(predictions.row[rows[there]]))
         figures = {"ade_m": ade_m, "fde_m": fde_m, "nees": nees, "within_95": within}
         out.append({

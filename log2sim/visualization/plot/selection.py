@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Scenario
+from log2sim.datatypes import MARGIN_S, Scenario
 from log2sim.errors import ConfigError
 from log2sim.files.plugins import nearest
 
@@ -120,9 +120,6 @@ def _listed(suffixes: tuple[str, ...]) -> str:
     return ", ".join(suffixes[:-1]) + f" or {suffixes[-1]}"
 
 
-SAME_TIME_S = 1e-6
-
-
 @dataclass(frozen=True)
 class TimeRange:
     """A range of a scenario's time."""
@@ -138,7 +135,7 @@ class TimeRange:
     def holds(self, t_s: Any) -> NDArray[np.bool_]:
         """Mark the times within."""
         t = np.asarray(t_s, dtype=np.float64)
-        return (t >= self.start_s - SAME_TIME_S) & (t <= self.stop_s + SAME_TIME_S)
+        return (t >= self.start_s - MARGIN_S) & (t <= self.stop_s + MARGIN_S)
 
 
 def choose_span(scenario: Scenario, options: PlotOptions) -> TimeRange:
@@ -195,7 +192,7 @@ def cut_scenario(scenario: Scenario, span: TimeRange) -> Scenario:
         if agent.is_permanent:
             agents.append(agent)
         elif first <= last:  # its waypoints within the range, and interpolated ones at the ends
-            inside = w.t_s[(w.t_s > first + SAME_TIME_S) & (w.t_s < last - SAME_TIME_S)]
+            inside = w.t_s[(w.t_s > first + MARGIN_S) & (w.t_s < last - MARGIN_S)]
             t_s = np.concatenate([[first], inside, [last] if last > first else []])
             taken = w.take(np.searchsorted((w.t_s[1:] + w.t_s[:-1]) / 2, t_s))  # the nearest ones
             states = agent.at(t_s)
