@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Detections, Measurements
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, Detections, Measurements
 from log2sim.geometry import (
     Camera,
     apply,
@@ -31,10 +31,9 @@ from log2sim.perception.homography.estimate import (
     EstimationOptions,
     estimate_homography,
     fit_camera,
-    place_obstacle,
-    spanned_height_m,
 )
 from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.place import CONTACT, place_obstacle, spanned_height_m
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
 PROBES_M = np.array([[x, y] for x in (8.0, 15.0, 25.0, 40.0) for y in (-0.3 * x, 0.0, 0.3 * x)])
@@ -305,16 +304,76 @@ def foot_pixel(camera: Camera, x: float, y: float) -> np.ndarray:
     return uv[0]
 
 
-@pytest.mark.parametrize("camera", [make_camera()[0], a_camera_with_lens()], ids=["pinhole", "lens"])
-@pytest.mark.parametrize("foot", [(10.0, 0.2), (25.0, -6.0), (40.0, 11.0)])
-def test_an_obstacle_stands_behind_its_foot_by_half_its_depth(camera: Camera, foot: tuple[float, float]) -> None:
-    u, v = foot_pixel(camera, *foot)
-    placed = place_obstacle(make_camera()[1], camera, np.array([u - 40, v - 60, u + 40, v]), "car", CAMERA_M)
-    assert placed is not None
-    ray = np.array(foot) - CAMERA_M
-    length, width, _ = TYPICAL_SIZE_M["car"]
-    expected = foot + ray / np.hypot(*ray) * (length + width) / 4
-    np.testing.assert_allclose(placed[0], expected, atol=1e-4)
+def box_of(camera: Camera, category: str, xy: np.ndarray, yaw_rad: float, size_m: np.ndarray) -> np.ndarray:
+    """The box (4,) around the image of a cuboid whose body is 0.25 m above the ground and which touches that in its contact area."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    shares = np.array([[a, b] for a in (-0.5, 0.5) for b in (-0.5, 0.5)])
+    outline, feet = (
+        shares * size_m[:2] * share @ np.array([[c, s], [-s, c]]) + xy for share in (1.0, CONTACT[GROUP_OF[category]])
+    )
+    corners = [[*p, z] for z in (0.25, size_m[2]) for p in outline] + [[*p, 0.0] for p in feet]
+    uv = project(camera, apply(inverse(camera.mount_T_cam), corners))[0]
+    return np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+
+
+@pytest.mark.parametrize(
+    ("category", "pitch_deg", "height_m"),
+    [(c, 4.0, 1.6) for c in ("car", "bus", "cyclist", "pedestrian")]
+    + [(c, 25.0, 6.0) for c in ("car", "cyclist", "pedestrian")],
+)
+@pytest.mark.parametrize(
+    "seen", [(True, True, True, True), (False, True, True, True), (True, False, True, True)], ids=str
+)
+def test_obstacles_of_all_sizes_and_yaws_are_where_they_are_placed_within_what_is_told(
+    category: str, pitch_deg: float, height_m: float, seen: tuple[bool, bool, bool, bool]
+) -> None:
+    rng = np.random.default_rng(1)
+    camera, h = make_camera(pitch_deg, height_m)
+    typical, smallest, largest = (np.array(t[category]) for t in (TYPICAL_SIZE_M, MIN_SIZE_M, MAX_SIZE_M))
+    squared, errors = [], []
+    while len(squared) < 150:
+        size = np.clip(typical + typical * np.log(largest / smallest) / 4 * rng.normal(size=3), smallest, largest)
+        reach, bearing = rng.uniform(12.0, 25.0), rng.uniform(-0.25, 0.25)
+        xy = CAMERA_M + reach * np.array([np.cos(bearing), np.sin(bearing)])
+        box = box_of(camera, category, xy, rng.uniform(0, 2 * np.pi), size) + rng.normal(0, FOOT_SIGMA_PX, 4)
+        # What is cut off is anywhere inside.
+        cut = rng.uniform(0.1, 0.5, 4) * np.tile(box[2:] - box[:2], 2) * [1, 1, -1, -1]
+        placed = place_obstacle(
+            h,
+            camera,
+            box + np.where(seen, 0.0, cut),
+            category,
+            camera.mount_T_cam,
+            edge_sigma_px=np.where(seen, FOOT_SIGMA_PX, np.inf),
+        )
+        assert placed is not None
+        errors.append(placed[0] - xy)
+        squared.append(errors[-1] @ np.linalg.solve(placed[1], errors[-1]) / 2)
+    assert 0.1 < np.mean(squared) < 1.4
+    sigma = np.std(errors, axis=0)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < np.maximum(0.6 * sigma, 0.1))
+
+
+def test_a_lens_does_not_move_an_obstacle() -> None:
+    (plain, h), size = make_camera(), np.array(TYPICAL_SIZE_M["car"])
+    lens, xy = a_camera_with_lens(), np.array([25.0, -6.0])
+    placed = [place_obstacle(h, c, box_of(c, "car", xy, 0.5, size), "car", c.mount_T_cam) for c in (plain, lens)]
+    assert placed[0] is not None
+    assert placed[1] is not None
+    # The corners of a box in a bent image are not those of the straight one.
+    np.testing.assert_allclose(placed[0][0], placed[1][0], atol=0.1)
+
+
+def test_edges_that_do_not_tell_a_distance_place_nothing() -> None:
+    camera, h = make_camera()
+    box = box_of(camera, "car", np.array([20.0, 2.0]), 0.3, np.array(TYPICAL_SIZE_M["car"]))
+    for seen in ((True, True, True, False), (False, True, False, True)):
+        assert (
+            place_obstacle(
+                h, camera, box, "car", camera.mount_T_cam, edge_sigma_px=np.where(seen, FOOT_SIGMA_PX, np.inf)
+            )
+            is None
+        )
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.0, 1.3])
@@ -331,44 +390,27 @@ def test_a_post_spans_its_height_times_the_error_of_its_distance(scale: float) -
     assert spanned_height_m(farther @ h, camera, box, base_T_cam) == pytest.approx(1.7 * scale, rel=0.01)
 
 
-def test_the_covariance_of_a_located_obstacle_lies_along_the_ray_and_grows() -> None:
+def test_places_are_the_less_sure_the_farther_and_the_less_sure_the_homography_is() -> None:
     camera, h = make_camera()
     sigma = []
-    for x in (10.0, 20.0, 40.0):
-        foot = np.add(CAMERA_M, [x, 0.0])
-        u, v = foot_pixel(camera, *foot)
-        placed = place_obstacle(h, camera, np.array([u - 20, v - 30, u + 20, v]), "pedestrian", CAMERA_M)
+    for x, covariance in ((10.0, 0.0), (20.0, 0.0), (40.0, 0.0), (40.0, 1e-14)):
+        box = box_of(camera, "pedestrian", np.add(CAMERA_M, [x, 0.0]), 0.0, np.array(TYPICAL_SIZE_M["pedestrian"]))
+        placed = place_obstacle(h, camera, box, "pedestrian", camera.mount_T_cam, covariance * np.eye(9))
         assert placed is not None
         variance, axes = np.linalg.eigh(placed[1])
-        assert abs(axes[0, 1]) > 0.999
-        sigma.append(np.sqrt(variance))
-        # Flat ground seen from height h: a pixel is about (x^2 + h^2) / h / f deep and x / f wide.
-        deep = FOOT_SIGMA_PX * (x**2 + 1.6**2) / 1.6 / 1000
-        assert sigma[-1][1] == pytest.approx(np.hypot(deep, 0.2), rel=0.03)
-        assert sigma[-1][0] == pytest.approx(np.hypot(FOOT_SIGMA_PX * x / 1000, 0.2), rel=0.03)
-    assert sigma[0][1] < sigma[1][1] < sigma[2][1]
-
-
-def test_an_unsure_homography_makes_places_unsure() -> None:
-    camera, ground_H_image = make_camera()
-    foot = foot_pixel(camera, 20.0, 3.0)
-    box_px, covariance = np.array([foot[0] - 40, foot[1] - 70, foot[0] + 40, foot[1]]), 1e-14 * np.eye(9)
-    sure = place_obstacle(ground_H_image, camera, box_px, "car", np.zeros(2))
-    tick_sigmas = place_obstacle(ground_H_image, camera, box_px, "car", np.zeros(2), covariance)
-    assert sure is not None
-    assert tick_sigmas is not None
-    draws = ground_H_image + 1e-7 * np.random.default_rng(0).normal(size=(4000, 3, 3))
-    places = np.array([apply_homography(h, foot[None])[0][0] for h in draws])
-    np.testing.assert_allclose(
-        tick_sigmas[1] - sure[1], np.cov(places.T), rtol=0.15, atol=0.02 * np.cov(places.T).max()
-    )
+        assert abs(axes[0, 1]) > 0.999  # along the ray
+        sigma.append(np.sqrt(variance[1]))
+        # Flat ground seen from height h: a pixel is about (x^2 + h^2) / h / f deep; the height of the person helps.
+        deep = np.hypot(FOOT_SIGMA_PX * (x**2 + 1.6**2) / 1.6 / 1000, 0.2)
+        assert sigma[-1] < deep * 1.05 or covariance
+    assert sigma == sorted(sigma)
 
 
 def test_obstacles_at_the_horizon_and_far_away_are_not_located() -> None:
     camera, h = make_camera()
 
     def at(u: float, v: float) -> object:
-        return place_obstacle(h, camera, np.array([u - 5, v - 10, u + 5, v]), "car", CAMERA_M)
+        return place_obstacle(h, camera, np.array([u - 5, v - 10, u + 5, v]), "car", camera.mount_T_cam)
 
     assert at(640.0, 200.0) is None
     assert at(640.0, 291.0) is None  # a hand's breadth below the horizon, kilometers away

@@ -361,8 +361,9 @@ def continued_log_odds(waypoints: Sequence[Waypoints], own: Array) -> Array:
 
 # Slower vehicles do not show the direction of traffic, nor do those that may drive in reverse.
 MIN_FLOW_SPEED_MPS, MIN_FLOW_LOG_ODDS = 1.5, 3.0
-# The LiDAR network and the outline see the same points, so that together they know less than the sum.
-POINTS_SHARE = 0.7
+# Weights of the log-odds of the LiDAR network and of the outline where both tell: they see the same points. Fitted to 1,100 standing
+# vehicles in simulated logs; halves of these give 0.68 to 0.71 and 0.30 to 0.37.
+NETWORK_WEIGHT, OUTLINE_WEIGHT = 0.7, 0.33
 # A vehicle without a yaw is laid along a street that it rather belongs to than not.
 MIN_STREET_SHARE = 0.5
 # Less likely headings are doubted: of those that are, at least one in three is wrong.
@@ -389,7 +390,8 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
         odds = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad)))
         if GROUP_OF[c.agent.category] == "vehicle":
             outline = outline_log_odds(c.track, w, t_s, c.agent.size_m)
-            odds = POINTS_SHARE * (odds + outline) if odds and outline else odds + outline
+            both = bool(odds and outline)
+            odds = NETWORK_WEIGHT * odds + OUTLINE_WEIGHT * outline if both else odds + outline
         alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0]))
     own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
     paths = []  # x, y and heading at the waypoints at which each shows the direction of traffic

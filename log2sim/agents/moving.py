@@ -56,6 +56,9 @@ def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
 
 # Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand.
 FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
+# More than boxes say against it (`MAX_HEADING_SCORE` in all sweeps), so that what drives fast points ahead. Of tracks that seem to drive one
+# in fifty mixes up several objects, or stands (simulated logs with LiDAR).
+MAX_COURSE_LOG_ODDS = 7.0
 # A way shorter than so many standard deviations of its ends may be noise.
 CERTAIN_SIGMAS = 4.0
 
@@ -77,7 +80,7 @@ def course_log_odds(w: Waypoints, length_m: float) -> float:
         speed_mps = np.maximum(sign * w.speed_mps, 0.0)
         distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
         if time_s > 0:
-            one_way = min(forward_log_odds(distance_m / time_s), MAX_FORWARD_LOG_ODDS)
+            one_way = min(forward_log_odds(distance_m / time_s), MAX_COURSE_LOG_ODDS)
             odds += sign * one_way * min(distance_m / certain_m, 1.0)
     return odds
 

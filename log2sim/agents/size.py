@@ -216,7 +216,13 @@ def static_geometry(track: Track) -> TrackGeometry:
     origin = np.append(np.median(m.center_m[:, :2], axis=0), 0.0)
     cloud = persistent_points([m.points_of(k) - origin for k in range(len(m))])
     if len(cloud) < MIN_STATIC_POINTS:
-        return _geometry_without_points(track)
+        # The mean by the covariances; errors of one object are alike.
+        geometry, n = _geometry_without_points(track), len(m)
+        information = np.linalg.inv(geometry.covariance)
+        covariance = np.linalg.inv(information.sum(axis=0))
+        mean = covariance @ np.einsum("nij,nj->i", information, geometry.xy_m)
+        covariance = covariance * n / independent(n)
+        return replace(geometry, xy_m=np.tile(mean, (n, 1)), covariance=np.tile(covariance, (n, 1, 1)))
     yaw, ends = static_ends(track, cloud[:, :2], origin[:2])
     known = typical_box_size(m)
     height, z = _height(track)

@@ -1,6 +1,7 @@
 """Weights of the evidence (`agents/evidence.py`), with and without a LiDAR, and of systematic errors.
 
-Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs FOLDER --logs 120 --seed 11`: 4615 candidates of 120 simulated logs.
+Printed by `tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs FOLDER --logs 120 --seed 11`: 4615 candidates of 120
+simulated logs; those without a LiDAR on those of `--logs 110 --seed 12`, after obstacles were placed by all edges of their boxes.
 `THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right
 where something is; `VARIANCES` weigh the terms of variances.
 """
@@ -30,14 +31,15 @@ THERE = {
         "pedestrian": -0.817,
     },
     False: {
-        "bias": 2.16,
-        "image": 0.181,
-        "scatter": -0.411,
-        "sigma": -0.822,
-        "odd_height": -1.82,
-        "other_category": -0.988,
-        "moving": -1.14,
-        "pedestrian": 0.33,
+        "bias": 1.95,
+        "image": 0.312,
+        "scatter": -0.533,
+        "sigma": -0.718,
+        "odd_height": -1.86,
+        "other_category": -2.12,
+        "moving": -0.818,
+        "two_wheeler": 0.145,
+        "pedestrian": 0.499,
     },
 }
 RIGHT = {
@@ -60,15 +62,16 @@ RIGHT = {
         "pedestrian": 0.259,
     },
     False: {
-        "bias": -0.338,
-        "brief": -0.263,
-        "scatter": -0.232,
-        "odd_height": -1.47,
-        "heading": 0.193,
-        "sigma_speed": -1.03,
-        "moving": -0.25,
-        "two_wheeler": 0.339,
-        "pedestrian": 1.44,
+        "bias": 0.337,
+        "brief": -0.736,
+        "scatter": -0.181,
+        "sigma": -0.0638,
+        "odd_height": -1.9,
+        "heading": 0.148,
+        "other_category": -1.59,
+        "sigma_speed": -0.608,
+        "moving": -0.205,
+        "pedestrian": 1.94,
     },
 }
 VARIANCES = {

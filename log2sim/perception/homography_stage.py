@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.config import TopdownConfig
 from log2sim.datatypes import TYPICAL_SIZE_M, Log, Measurements, Obstacles
-from log2sim.geometry import Array, Camera, ground_homography, inverse, line_stamps_ns
+from log2sim.geometry import Array, Camera, ground_homography, inverse, line_stamps_ns, rotation_from_rpy
 from log2sim.perception.first_pass import Observations, base_poses
 from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes, undistorted_pixels
 from log2sim.perception.homography.estimate import (
@@ -20,10 +20,9 @@ from log2sim.perception.homography.estimate import (
     STREAM_METHODS,
     EstimationOptions,
     fit_camera,
-    place_obstacle,
-    spanned_height_m,
 )
 from log2sim.perception.homography.fit import HomographyFit, refused_fit
+from log2sim.perception.homography.place import place_obstacle, spanned_height_m
 from log2sim.perception.homography.rig import SAMPLES, Rig, RigFit, fit_rig
 from log2sim.perception.homography.slope import fit_slope, slope_homography
 from log2sim.perception.lidar.measure import BORDER_PX
@@ -31,6 +30,12 @@ from log2sim.plan import HomographyScope, Plan
 
 # A camera lower than this sees the ground under too flat an angle, m.
 MIN_CAMERA_HEIGHT_M = 0.2
+# Standard deviation of the angle between the wheels' plane under a vehicle and the ground that it sees: springs, and roads of
+# changing grade. In two recorded drives that look flat it is 0.5 degrees.
+TILT_SIGMA_RAD = np.deg2rad(0.5)
+# Standard deviation of an edge of a box that something nearer covers, as a share of the side of the box: detectors complete what is hidden, or
+# end the box where it begins.
+HIDDEN_SHARE = 0.25
 # Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
 # is empty.
 MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25
@@ -138,15 +143,26 @@ def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
     """Make the homography of flat ground under the ego from the calibration; None for a camera near the ground."""
     if camera.mount_T_cam[2, 3] - log.ground_z_ego_m < MIN_CAMERA_HEIGHT_M:
         return None
-    try:
-        h = ground_homography(camera, camera.mount_T_cam, log.ground_z_ego_m)
-    except np.linalg.LinAlgError:
-        return None
-    if np.linalg.cond(h) > MAX_CONDITION:
-        return None
-    h /= np.linalg.norm(h[2])
+    # As it is, and tilted by a standard deviation about either axis of the ground.
+    tilts = [np.eye(3), rotation_from_rpy(TILT_SIGMA_RAD, 0.0, 0.0), rotation_from_rpy(0.0, TILT_SIGMA_RAD, 0.0)]
+    up = np.array([0.0, 0.0, camera.mount_T_cam[2, 3]])
+    found = []
+    for tilt in tilts:
+        pose = camera.mount_T_cam.copy()
+        pose[:3, :3] = tilt @ pose[:3, :3]
+        pose[:3, 3] = tilt @ (pose[:3, 3] - up) + up
+        try:
+            h = ground_homography(camera, pose, log.ground_z_ego_m)
+        except np.linalg.LinAlgError:
+            return None
+        if np.linalg.cond(h) > MAX_CONDITION:
+            return None
+        found.append(h / np.linalg.norm(h[2]))
+    h = found[0]
+    by_tilt = np.array([f - h for f in found[1:]]).reshape(2, 9)
     s = np.linalg.svd(h, compute_uv=False)
-    return HomographyFit(True, "", h, refused_fit("", 0).inliers, float("nan"), float(s[0] / s[-1]))
+    fit = HomographyFit(True, "", h, refused_fit("", 0).inliers, float("nan"), float(s[0] / s[-1]))
+    return replace(fit, covariance=by_tilt.T @ by_tilt)
 
 
 def place_by_homography(
@@ -160,7 +176,7 @@ def place_by_homography(
         if len(missing):
             columns = {k: v.copy() if isinstance(v, np.ndarray) else v for k, v in columns.items()}
         poses: dict[tuple[str, int], tuple[Array, Array]] = {}
-        for k in missing:
+        for k in missing.tolist():
             name, box_px, category = str(m.camera[k]), m.box_px[k], str(m.category[k])
             fit = homographies[name].fit if name in homographies and name in log.cameras else None
             h = None if fit is None else fit.at_tick(tick)
@@ -179,7 +195,7 @@ def place_by_homography(
                 if bent is not None:
                     h, by_slope = bent
                     uncertainty = np.outer(by_slope, by_slope) + (0.0 if uncertainty is None else uncertainty)
-            placed = place_obstacle(h, camera, box_px, category, base_T_cam[:2, 3], uncertainty)
+            placed = place_obstacle(h, camera, box_px, category, base_T_cam, uncertainty, edge_sigmas(m, k, camera))
             if placed is None:
                 continue
             if obstacles is not None:
@@ -196,6 +212,22 @@ def place_by_homography(
             columns["height_px_m"][k] = spanned_height_m(h, camera, box_px, base_T_cam)
         out.append(Measurements(**columns) if len(missing) else m)
     return out
+
+
+def edge_sigmas(m: Measurements, k: int, camera: Camera) -> Array:
+    """Return the standard deviations (4,), px, of the edges of a box: left, top, right, bottom.
+
+    Infinite where the box ends with the image. The box of what is nearer reaches further down; where it holds the middle of an edge the
+    obstacle goes on behind it.
+    """
+    box = m.box_px[k]
+    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    others = m.box_px[(m.camera == m.camera[k]) & (m.t_ns == m.t_ns[k]) & (m.box_px[:, 3] > box[3])]
+    middles = np.array([[box[0], y], [x, box[1]], [box[2], y], [x, box[3]]])
+    covered = np.any(np.all((others[:, None, :2] < middles) & (others[:, None, 2:] > middles), axis=2), axis=0)
+    sigma = np.hypot(FOOT_SIGMA_PX, np.where(covered, HIDDEN_SHARE * np.tile(box[2:] - box[:2], 2), 0.0))
+    last = np.array([camera.width_px, camera.height_px]) - 1 - BORDER_PX
+    return np.where(np.append(box[:2] < BORDER_PX, box[2:] > last), np.inf, sigma)
 
 
 def count_rays(

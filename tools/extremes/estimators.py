@@ -14,8 +14,9 @@ from log2sim.agents.smooth.smoother import smooth_track
 from log2sim.datatypes import Detections, Measurements
 from log2sim.geometry import NS_PER_S, Array, Camera, apply_homography, inverse, transform
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography, fit_camera, place_obstacle
+from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography, fit_camera
 from log2sim.perception.homography.fit import HomographyFit
+from log2sim.perception.homography.place import place_obstacle
 from log2sim.tracking.tracker import track
 
 METHODS = ("time-aware", "min-frame", "per-frame")
@@ -145,7 +146,8 @@ def horizon() -> Outcome:
     v = 360.0 - 1000.0 * np.tan(np.radians(4.0))
     places, below = apply_homography(h, np.array([[640.0, v - d] for d in (-0.01, 0.01, 1.0, 100.0)]))
     placed = [
-        place_obstacle(h, camera, np.array([600.0, 200.0, 680.0, b]), "car", np.zeros(2)) for b in (v - 1, v + 0.01)
+        place_obstacle(h, camera, np.array([600.0, 200.0, 680.0, b]), "car", camera.mount_T_cam)
+        for b in (v - 1, v + 0.01)
     ]
     ok = below.tolist() == [True, False, False, False] and np.isnan(places[1:]).all() and places[0, 0] > 1e4
     return Outcome(bool(ok) and placed == [None, None], f"{places[0, 0]:.3g} m away")

@@ -23,7 +23,7 @@ from log2sim.perception.homography.correspondences import (
     foot_points,
     undistorted_pixels,
 )
-from log2sim.perception.homography.estimate import MAX_RANGE_M
+from log2sim.perception.homography.place import MAX_RANGE_M
 from log2sim.perception.homography_stage import CameraHomography, place_by_homography
 from log2sim.perception.sync import Schedule
 

@@ -7,14 +7,12 @@ from functools import partial
 
 import numpy as np
 
-from log2sim.datatypes import TYPICAL_SIZE_M
-from log2sim.geometry import Array, Camera, apply_homography, homography_jacobian
+from log2sim.geometry import Array, apply_homography
 from log2sim.perception.homography.correspondences import (
     SIZE_SIGMA_SHARE,
     Correspondences,
     fit_frames,
     ransac_skimage,
-    undistorted_pixels,
 )
 from log2sim.perception.homography.fit import (
     RANSAC_SCHEDULE,
@@ -22,7 +20,6 @@ from log2sim.perception.homography.fit import (
     HomographyFit,
     PitchRoll,
     RansacSchedule,
-    ground_covariances,
     ransac,
     refused_fit,
     validated_fit,
@@ -282,54 +279,3 @@ def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: 
         pitch_deg = float(np.degrees(np.arctan((uv[:, 1, 0] - center[1]) / K[1, 1]).std()))
         roll_deg = float(np.degrees(np.arctan2(dv, du).std()))
     return errors.decide(source, (pitch_deg, roll_deg), moves=pitches)
-
-
-# Beyond this range one pixel of a camera at car height is several meters.
-MAX_RANGE_M = 60.0
-
-
-def place_obstacle(
-    ground_H_image: Array,
-    camera: Camera,
-    box_px: Array,
-    category: str,
-    camera_xy: Array,
-    homography_covariance: Array | None = None,
-) -> tuple[Array, Array] | None:
-    """Place an obstacle by the middle of the lower edge of its box.
-
-    `ground_H_image`: (3, 3), of `homography_covariance` (9, 9), None for 0. `box_px`: (4,). `category`: its typical size is
-    used. `camera_xy`: (2,): position of the camera in the frame of the ground positions, m.
-
-    Returns its center (2,), m, on the ground and the covariance (2, 2); None above the horizon and beyond `MAX_RANGE_M`.
-    """
-    uv = undistorted_pixels(camera, np.array([[(box_px[0] + box_px[2]) / 2, box_px[3]]]))
-    xy, below = apply_homography(ground_H_image, uv)
-    if not below[0] or np.hypot(*(xy[0] - camera_xy)) > MAX_RANGE_M:
-        return None
-    direction = (xy[0] - camera_xy) / np.hypot(*(xy[0] - camera_xy))
-    length, width, _ = TYPICAL_SIZE_M[category]
-    # The foot is on the nearest side. Half of the depth behind it depends on the heading, which is unknown: from half the
-    # width to half the length.
-    depth, depth_sigma = (length + width) / 4, (length - width) / 4
-    slope = homography_jacobian(ground_H_image, uv)[0]
-    covariance = FOOT_SIGMA_PX**2 * slope @ slope.T + np.eye(2) * FOOT_SIGMA_M**2
-    covariance = covariance + depth_sigma**2 * np.outer(direction, direction)
-    if homography_covariance is not None:
-        covariance = covariance + ground_covariances(ground_H_image, homography_covariance, uv)[0]
-    return xy[0] + direction * depth, covariance
-
-
-def spanned_height_m(ground_H_image: Array, camera: Camera, box_px: Array, base_T_cam: Array) -> float:
-    """Return the height that a box (4,) spans above its foot, m; NaN where it is seen straight from above.
-
-    The pose of the camera (4, 4) is that in the frame of the ground positions.
-    """
-    middle = (box_px[0] + box_px[2]) / 2
-    uv = undistorted_pixels(camera, np.array([[middle, box_px[1]], [middle, box_px[3]]]))
-    rays = np.column_stack([uv, np.ones(2)]) @ np.linalg.inv(camera.K).T @ base_T_cam[:3, :3].T
-    across = np.hypot(rays[:, 0], rays[:, 1])
-    if not across.all():
-        return float("nan")
-    foot_xy = apply_homography(ground_H_image, uv[1:])[0][0]
-    return float(-np.diff(rays[:, 2] / across)[0] * np.hypot(*(foot_xy - base_T_cam[:2, 3])))
