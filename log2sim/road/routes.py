@@ -21,6 +21,8 @@ MIN_PATH_M = 2.0
 MIN_STEP_M = 0.01
 # Greatest distance of points between waypoints.
 WAYPOINT_STEP_M = 0.5
+# Between waypoints farther apart in time nobody knows where an agent went: the trajectory is a guess that can overshoot.
+MAX_GAP_S = 60.0
 # Points between two waypoints, which bounds what a jump in a trajectory costs.
 MAX_STEPS = 200
 # Standard deviation of the smoothing of observed paths along them: a curve of 6 m becomes 8 cm tighter, and no car turns in
@@ -77,7 +79,7 @@ def directed_paths(agent: Agent) -> list[Array]:
     """Return the stretches (N, 3) of an agent's path between its reversals; none for one that stands."""
     w = agent.waypoints
     steps = np.hypot(np.diff(w.x_m), np.diff(w.y_m))
-    unknown = agent.trajectory.discontinuous
+    unknown = agent.trajectory.discontinuous | (np.diff(w.t_s) > MAX_GAP_S)
     parts = np.where(unknown, 1, np.clip(np.ceil(steps / WAYPOINT_STEP_M), 1, MAX_STEPS)).astype(int)
     pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(w.t_s, w.t_s[1:], parts)]
     state = agent.trajectory.at(np.concatenate([*pieces, w.t_s[-1:]]))

@@ -15,8 +15,9 @@ from benchmarks.table import markdown
 from log2sim.agents.smooth import MotionModel, smooth_track
 from log2sim.datatypes import Agent, Scenario, Waypoints
 from log2sim.geometry import wrap_angle
+from log2sim.geometry.statistics import CHI2_2DOF_95
 from log2sim.simulation.prediction.motion_table import MotionTable, table_of
-from log2sim.simulation.prediction.prediction import CHI2_95, METHODS, leads_of, predict_table
+from log2sim.simulation.prediction.prediction import METHODS, leads_of, predict_table
 from log2sim.synth.actors import RoundedPath
 
 Array = NDArray[np.float64]
@@ -205,7 +206,7 @@ def main(seeds: int = 4, past: bool = False) -> None:
         cells = []
         for lead in LEADS_S:
             distance, squared = (np.concatenate(c) for c in zip(*sums[source, method, lead]))
-            cells.append(f"{distance.mean():.2f} / {squared.mean() / 2:.2f} / {(squared < CHI2_95).mean():.2f}")
+            cells.append(f"{distance.mean():.2f} / {squared.mean() / 2:.2f} / {(squared < CHI2_2DOF_95).mean():.2f}")
         rows.append([source, method, *cells])
     print(markdown(["states", "method", *(f"FDE m / NEES / in 95 %, {s} s" for s in LEADS_S)], rows))
     print(f"{count} agent-ticks, {len(METHODS)} methods: {1e4 * spent / count:.2f} s for 10,000")
