@@ -282,7 +282,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
-            odds = log_odds_of_line(member, traced.painted_m(begin, end))
+            odds = log_odds_of_line(member, traced.painted_m(begin, end), dashes=stretch.dashes)
             out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
     return _without_remnants(out)
 
