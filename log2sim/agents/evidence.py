@@ -293,18 +293,26 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     visits = [(tick, k) for k, ticks in enumerate(_recorded(boxes, clouds)) for tick in _some(ticks, SIDE_TICKS)]
     for cloud, tick, k in _with_clouds(visits, clouds):
         half, points = boxes.size_m[k] / 2, _points_at(boxes, k, tick, cloud, SIDE_M)
-        local = np.column_stack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]), points[:, 2]])
-        within = np.abs(local) < half + SIDE_ERROR_M / 2
+        local = np.vstack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]).T, points[:, 2]])
+        within = np.abs(local) < (half + SIDE_ERROR_M / 2)[:, None]
         for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
-            depth, across = sign * local[:, axis] - half[axis], [a for a in range(3) if a != axis]
-            own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[:, across].all(axis=1)
-            if own.sum() < MIN_SIDE_POINTS:
+            depth, across = sign * local[axis] - half[axis], [a for a in range(3) if a != axis]
+            own = (
+                (depth > SIDE_ERROR_M / 2 - SIDE_M)
+                & (depth <= SIDE_ERROR_M / 2)
+                & within[across[0]]
+                & within[across[1]]
+            )
+            count = np.count_nonzero(own)
+            if count < MIN_SIDE_POINTS:
                 continue
-            ordered = np.sort(local[own][:, across], axis=0)
-            low, high = ordered[len(ordered) // 10], ordered[-1 - len(ordered) // 10]  # but for stray points
-            level = ((local[:, across] > low - SIDE_ERROR_M) & (local[:, across] < high + SIDE_ERROR_M)).all(axis=1)
-            inside[k, side] += (own & level).sum()
-            beyond[k, side] += ((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level).sum()
+            level = np.ones(len(points), dtype=bool)
+            for column in local[across]:
+                ordered = np.sort(column[own])
+                low, high = ordered[count // 10], ordered[-1 - count // 10]  # but for stray points
+                level &= (column > low - SIDE_ERROR_M) & (column < high + SIDE_ERROR_M)
+            inside[k, side] += np.count_nonzero(own & level)
+            beyond[k, side] += np.count_nonzero((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level)
     share = np.minimum(beyond / np.maximum(inside, 1), 1)
     return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
 

@@ -173,7 +173,8 @@ def extents_of_clusters(xy_m: Array, count: NDArray[np.intp], yaw_rad: Array) ->
     The ends are quantiles, so that a few stray points do not stretch a box, but at most `MAX_TRIM_M` inside the third outermost
     point: the far ends of a long object close by hold few of its points.
     """
-    local = np.ascontiguousarray(rotate(xy_m, -np.repeat(yaw_rad, count)).T)
+    (x, y), (c, s) = xy_m.T, (np.repeat(of(-yaw_rad), count) for of in (np.cos, np.sin))
+    local = np.stack([x * c - y * s, x * s + y * c])
     sort_clusters(local, count)
     start, third = np.cumsum(count) - count, np.minimum(2, (count - 1) // 2)
     low = np.minimum(quantile_of_clusters(local, count, TRIM), local[:, start + third] + MAX_TRIM_M)

@@ -78,19 +78,17 @@ def points_of_boxes(
     extent = high.max(axis=0) - corner
     cell_m = np.maximum(CELL_M, extent / MAX_CELLS)
     shape = np.ceil(extent / cell_m).astype(np.intp) + 1
-    cells = []
-    for axis in range(2):
-        at, outside = (xyz[:, axis] - kind(corner[axis])) * kind(1 / cell_m[axis]), kind(shape[axis] - 1)
-        cells.append(
-            np.where((at >= 0) & (at < outside), at, outside).astype(np.uint16)
-        )  # outside, too, where it is NaN
-    code = cells[0] * np.uint16(shape[1]) + cells[1]
+    with np.errstate(invalid="ignore"):
+        at = [((xyz[:, axis] - kind(corner[axis])) * kind(1 / cell_m[axis])).astype(np.int32) for axis in range(2)]
+    # Of what is below the corner or NaN, the sign makes a large number: outside, too.
+    row, column = (np.minimum(v.view(np.uint32), np.uint32(n - 1)).astype(np.uint16) for v, n in zip(at, shape))
+    code = row * np.uint16(shape[1]) + column
     # One run of cells for each box and each of its rows.
     first, last = (np.clip((v - corner) // cell_m, 0, shape - 2).astype(np.intp) for v in (low, high))
     rows = last[:, 0] - first[:, 0] + 1
     box = np.repeat(np.arange(len(low)), rows)
-    row = (first[box, 0] + ramp(rows)) * shape[1]
-    begin, end, count = row + first[box, 1], row + last[box, 1] + 1, int(shape.prod())
+    start = (first[box, 0] + ramp(rows)) * shape[1]
+    begin, end, count = start + first[box, 1], start + last[box, 1] + 1, int(shape.prod())
     touched = np.cumsum(np.bincount(begin, minlength=count) - np.bincount(end, minlength=count)) > 0
     counted = touched.take(code)
     near = np.flatnonzero(counted if usable is None else counted & usable)

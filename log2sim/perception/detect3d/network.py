@@ -112,11 +112,12 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     i, j = x.astype(np.intp), y.astype(np.intp)
     cell = i * w + j
     count = np.bincount(cell, minlength=h * w)
-    used = np.flatnonzero(count)
+    used = np.flatnonzero(count > 0)
+    logarithm = np.log1p(np.arange(count.max() + 1, dtype=np.float32))
     # One column for each cell with points, which are a tenth of all.
     number = np.empty(h * w, np.intp)
     number[used] = np.arange(len(used))
-    column, points = number.take(cell), count.take(used).astype(np.float32)
+    column, points = number.take(cell), count.take(used)
     values = np.empty((CHANNELS, len(used)), np.float32)
     # In double precision NumPy takes a twentieth of the time.
     highest, lowest, exact = np.full(len(used), -np.inf), np.full(len(used), np.inf), z.astype(np.float64)
@@ -126,13 +127,13 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     for channel, of_points in ((1, exact), (10, x - i.astype(np.float32)), (11, y - j.astype(np.float32))):
         values[channel] = np.bincount(column, of_points, minlength=len(used)) / points
     values[:3] /= 2
-    values[3] = np.log1p(points) / 3
+    values[3] = logarithm.take(points) / 3
     values[10:12] -= np.float32(0.5)
-    for edge in np.array(SLICE_EDGES_M[1:-1], np.float32):
-        column += (z > edge) * len(used)
-    values[4:10] = np.log1p(np.bincount(column, minlength=6 * len(used)).astype(np.float32)).reshape(6, -1) / 2
-    for channel in range(CHANNELS):
-        out[channel, used] = values[channel]
+    # Which slice, in bytes that are added up in a tenth of the time.
+    level = sum(((z > edge).view(np.uint8) for edge in np.array(SLICE_EDGES_M[1:-1], np.float32)), np.uint8(0))
+    column += np.multiply(level, len(used), dtype=np.intp)
+    values[4:10] = logarithm.take(np.bincount(column, minlength=6 * len(used))).reshape(6, -1) / 2
+    out[:, used] = values
     return out.reshape(CHANNELS, h, w)
 
 

@@ -521,19 +521,20 @@ def assemble_cloud(
         if mapped is None or len(mapped[0]) == 0:
             continue
         stamp = stamp or sweep.stamp_ns
-        # Halfway through the sweep: a sensor at 30 m/s is 3 m away from there at its begin or end.
-        middle_ns = round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
-        sensor, known = log.map_T_sensor(name, sweep.stamp_ns + middle_ns)
+        # Halfway through the sweep, since a sensor at 30 m/s is 3 m away from there at its begin or end, and at both of these.
+        middle_ns = sweep.stamp_ns + round(float(mapped[1].mean(dtype=np.float64)) * NS_PER_S)
+        t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
+        ends_s = np.array([t_s.min(), t_s.max()], dtype=np.float64)
+        at_ns = np.append(stamp + np.round(ends_s * NS_PER_S).astype(np.int64), middle_ns)
+        poses, known = log.map_T_sensor(name, at_ns)
+        # Without known poses it stands at the origin.
+        position = poses[2, :3, 3] - origin if known[2] else np.zeros(3)
+        first, last = poses[:2, :3, 3] - origin if known[:2].all() else np.zeros((2, 3))
         # Values of one coordinate side by side, as what follows goes through them.
         local = [(mapped[0][:, axis] - origin[axis]).astype(np.float32) for axis in range(3)]
         near = np.flatnonzero(np.logical_and.reduce([np.abs(column) <= max_range_m for column in local]))
-        t_s = mapped[1] + np.float32((sweep.stamp_ns - stamp) / NS_PER_S)
-        position = sensor[0, :3, 3] - origin if known[0] else np.zeros(3)
         parts.append((np.stack([column.take(near) for column in local]), t_s.take(near), position))
-        # The line through its places at the first and the last time; without known poses it stands at the origin.
-        ends_s = np.array([t_s.min(), t_s.max()], dtype=np.float64)
-        poses, known = log.map_T_sensor(name, stamp + np.round(ends_s * NS_PER_S).astype(np.int64))
-        first, last = poses[:, :3, 3] - origin if known.all() else np.zeros((2, 3))
+        # The line through its places at the first and the last time.
         velocity = (last - first) / (ends_s[1] - ends_s[0]) if ends_s[1] > ends_s[0] else np.zeros(3)
         sensors.append(CloudSensor(len(near), first - ends_s[0] * velocity, velocity, end_of(log.lidars[name])))
     if not parts:
@@ -558,7 +559,8 @@ def obstacles_of(cloud: Cloud) -> Obstacles:
     x, y, _ = cloud.obstacle_columns
     near = np.flatnonzero(np.hypot(x, y) < OBSTACLE_REACH_M)
     index = cloud.obstacles[near[first_of_voxels(cloud.obstacle_columns.take(near, axis=1), OBSTACLE_VOXEL_M)]]
-    kept = cloud.stamp_ns, cloud.origin, cloud.xyz[index], cloud.t_s[index], cloud.sensor, sample_rays(cloud)
+    points = cloud.xyz.take(index, axis=0), cloud.t_s.take(index)
+    kept = cloud.stamp_ns, cloud.origin, *points, cloud.sensor, sample_rays(cloud)
     if not cloud.parts:
         return Obstacles(*kept)
     first = np.cumsum([len(part.xyz) for part in cloud.parts])

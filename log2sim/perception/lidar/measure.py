@@ -356,9 +356,9 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
         index, count = np.concatenate(parts), np.array([len(points) for points in parts])
         edges = np.concatenate([[0], np.cumsum(count)])
         xyz = view.xyz.take(index, axis=0).astype(np.float64)
-        xy, start, of_sensor = xyz[:, :2] - view.sensor[:2], edges[:-1], xyz - view.sensor
+        start, of_sensor = edges[:-1], xyz - view.sensor
         typical = np.array([TYPICAL_SIZE_M[str(category)] for category in columns["category"][of]])
-        yaw, low, high = fit_extents_of_clusters(xy, count, typical, columns["box_yaw_rad"][of])
+        yaw, low, high = fit_extents_of_clusters(of_sensor[:, :2], count, typical, columns["box_yaw_rad"][of])
         columns["yaw_rad"][of], columns["low_m"][of], columns["high_m"][of] = yaw, low, high
         heights = np.stack([xyz[:, 2], xyz[:, 2] - view.height[index]])
         sort_clusters(heights, count)
@@ -368,10 +368,11 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
         mean_ns = np.round(np.add.reduceat(t_s, start) / count * NS_PER_S).astype(np.int64)
         columns["t_ns"][of] = view.stamp_ns + mean_ns
         columns["sensor_m"][of] = view.sensor + view.origin
-        timed = np.column_stack([xyz + view.origin, t_s - np.repeat(mean_ns, count) / NS_PER_S])
         columns["ends_visible"][of] = view.azimuth_index.ends_visible(parts)
         shown = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count, MAX_KEPT_POINTS)
-        for row, points in zip(of.tolist(), np.split(timed[shown], np.searchsorted(shown, edges[1:-1]))):
+        late_s = t_s[shown] - np.repeat(mean_ns, count)[shown] / NS_PER_S
+        timed = np.column_stack([xyz.take(shown, axis=0) + view.origin, late_s])
+        for row, points in zip(of.tolist(), np.split(timed, np.searchsorted(shown, edges[1:-1]))):
             columns["cluster"][row] = points
     for i in kept:
         columns["points"][rows[i]] = len(members[i])
@@ -470,13 +471,14 @@ def _members(boxes: Boxes3D, cloud: Cloud) -> list[NDArray[np.intp]]:
         sides = np.stack([of_sensor[0] * c + of_sensor[1] * s, of_sensor[1] * c - of_sensor[0] * s])
         own = np.arange(len(index)) < len(members[k])
         for _ in range(2):  # along the flank, then round the corner
-            others = np.flatnonzero(~own)
-            added = others[continued_sides(sides[:, own], sides.take(others, axis=1), np.inf, ROW_GAP_M)]
-            own[added] = True
+            seed, others = np.flatnonzero(own), np.flatnonzero(~own)
+            added = continued_sides(sides.take(seed, axis=1), sides.take(others, axis=1), np.inf, ROW_GAP_M)
+            own[others[added]] = True
             if not len(added):
                 break
         # Sides that go on past the longest and widest vehicle are a wall's.
-        if (np.sort(np.ptp(sides[:, own], axis=1)) <= MAX_SIZE_M[boxes.category[k]][1::-1]).all():
+        sides_m = np.sort(np.ptp(sides.take(np.flatnonzero(own), axis=1), axis=1))
+        if (sides_m <= MAX_SIZE_M[boxes.category[k]][1::-1]).all():
             members[k] = np.sort(index[own])
             free[members[k]] = False
     return [cloud.obstacles[index] for index in members]
