@@ -25,7 +25,7 @@ POSITION_SIGMA_M = 0.05  # of the end of a piece across its direction
 MAX_SIGMAS = 3.5
 MAX_WIDTH_RATIO, MAX_CONTRAST_RATIO = 2.2, 3.5
 SHORT_END_M, MAX_END_TURN_RAD = 1.0, np.deg2rad(6)
-BASE_M = 6.0  # the direction of a chain's end is that of its last part
+BASE_M, LONG_BASE_M = 6.0, 15.0  # the direction of a chain's end is that of its last part
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +88,26 @@ def _beside(pieces: Pieces, end: int, inner: int) -> bool:
 
 
 def dashed_chains(pieces: Pieces, chains: list[Chain]) -> list[Chain]:
-    """Join chains across the gaps of dashed lines."""
-    return _join(pieces, chains, MAX_GAP_M, MIN_RADIUS_OF_GAPS_M)
+    """Join chains across the gaps of dashed lines, short gaps first."""
+    # Directions become surer the longer the chains, so the longest gaps are tried again.
+    known = dict[Chain, list[list[float]]]()
+    for gap_m in (4.0, MAX_GAP_M, MAX_GAP_M):
+        chains = _join(pieces, chains, gap_m, MIN_RADIUS_OF_GAPS_M, LONG_BASE_M, known)
+    return chains
 
 
-def _join(pieces: Pieces, chains: list[Chain], max_gap_m: float, min_radius_m: float) -> list[Chain]:
-    """Join ends that continue each other best, each end with one other at most."""
+def _join(
+    pieces: Pieces,
+    chains: list[Chain],
+    max_gap_m: float,
+    min_radius_m: float,
+    base_m: float = BASE_M,
+    known: dict[Chain, list[list[float]]] | None = None,
+) -> list[Chain]:
+    """Join ends that continue each other best, each end with one other at most; `known` keeps the ends of chains that stay."""
     if len(chains) < 2:
         return chains
-    ends = _ends_of(pieces, chains)
+    ends = _ends_of(pieces, chains, base_m, {} if known is None else known)
     first, second, cost = _candidates(ends, max_gap_m, min_radius_m)
     partner: dict[int, int] = {}
     joined = DisjointSet(range(len(chains)))
@@ -123,22 +134,24 @@ def _join(pieces: Pieces, chains: list[Chain], max_gap_m: float, min_radius_m: f
     return out
 
 
-def _ends_of(pieces: Pieces, chains: list[Chain]) -> _Ends:
+def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float, known: dict[Chain, list[list[float]]]) -> _Ends:
     contrasts = np.where(np.isfinite(pieces.color), pieces.color, np.nan_to_num(pieces.reflected))
     if all(len(chain.members) == 1 for chain in chains):
         return _ends_of_single(pieces, chains, contrasts)
-    rows = list[list[float]]()
     for chain in chains:
-        corners = chain.corners(pieces)
+        if chain in known:
+            continue
+        corners, rows = chain.corners(pieces), list[list[float]]()
         length = float(np.linalg.norm(corners[-1] - corners[0]))
         width, contrast = median(pieces.width_m[chain.members]), median(contrasts[chain.members])
         for ordered in (corners[::-1], corners):
             tip = ordered[-1]
-            near = ordered[np.linalg.norm(ordered - tip, axis=1) <= BASE_M]
-            dx, dy = tip - (near[0] if len(near) > 1 else ordered[-2])
-            sigma = POSITION_SIGMA_M * 2 / max(float(np.hypot(dx, dy)), 0.3)
-            rows.append([*tip, float(np.arctan2(dy, dx)), sigma, width, contrast, length])
-    t = np.array(rows)
+            near = ordered[np.linalg.norm(ordered - tip, axis=1) <= base_m]
+            angle, base = _direction(near if len(near) > 1 else ordered[-2:])
+            sigma = POSITION_SIGMA_M * 2 / max(base, 0.3)
+            rows.append([*tip, angle, sigma, width, contrast, length])
+        known[chain] = rows
+    t = np.array([row for chain in chains for row in known[chain]])
     return _Ends(t[:, :2], t[:, 2], t[:, 3], t[:, 4], t[:, 5], t[:, 6])
 
 
@@ -155,6 +168,20 @@ def _ends_of_single(pieces: Pieces, chains: list[Chain], contrasts: Array) -> _E
     sigma = POSITION_SIGMA_M * 2 / np.maximum(length, 0.3)
     both = (np.repeat(values, 2) for values in (sigma, pieces.width_m[member], contrasts[member], length))
     return _Ends(ends.reshape(-1, 2), outward.ravel(), *both)
+
+
+def _direction(points: Array) -> tuple[float, float]:
+    """Tangent at the last of some points, rad, and the length that they span; of an arc where there are enough."""
+    base = float(np.linalg.norm(points[-1] - points[0]))
+    chord = points[-1] - points[0]
+    angle = float(np.arctan2(chord[1], chord[0]))
+    if len(points) < 6 or base < 4.0:
+        return angle, base
+    c, s = np.cos(angle), np.sin(angle)
+    local = points - points[-1]
+    along, across = local[:, 0] * c + local[:, 1] * s, local[:, 1] * c - local[:, 0] * s
+    slope = np.polyfit(along, across, 2)[1]
+    return angle + float(np.arctan(slope)), base / 2
 
 
 def _candidates(
@@ -255,7 +282,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
-            odds = log_odds_of_line(member, traced.painted_m(begin, end))
+            odds = log_odds_of_line(member, traced.painted_m(begin, end), dashes=stretch.dashes)
             out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
     return _without_remnants(out)
 

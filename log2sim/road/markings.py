@@ -41,6 +41,7 @@ BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (s
 STOP_LENGTH_M = (1.5, 20.0)
 LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
+ALONE = -1.0  # log-odds of a stop line beside which no lane line is seen
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
 MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
 # A plain stroke fills its rectangle, also where it is blurred; an arrow of as many widths length half of it.
@@ -87,7 +88,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
-        odds = log_odds_of_line(own, sum(lengths), alone=False)
+        odds = log_odds_of_line(own, sum(lengths), dashes=len(chosen), alone=False)
         if not np.isfinite(own.color).any() and len(chosen) < SURE_BARS:
             odds += FEW_BARS
         corners = []
@@ -153,7 +154,7 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
                 cross = chord[0] * tangent[1] - chord[1] * tangent[0]
                 angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
-            stops.append(line)
+            stops.append(replace(line, log_odds=line.log_odds + (ALONE if angle is None else 0.0)))
         else:
             others.append(line)
     return stops, others

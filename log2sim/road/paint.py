@@ -206,6 +206,8 @@ def _masked_mean(values: Layer, mask: NDArray[Any]) -> Array:
 PRIOR = -3.0
 PER_METER = 0.8  # of paint in line, which texture seldom continues
 MAX_BY_LENGTH = 5.5
+PER_METER_MORE, MAX_BY_MORE = 0.03, 1.5  # of longer lines
+DASHES = 1.5  # three or more dashes of one length at one distance
 UNEVEN = -1.5  # a step beside which a little stands out
 NOT_BRIGHTEST, MIN_OUTSHINING = -2.5, 0.4  # no brighter than much of the ground around; share of its contrast
 # Glare fades to its sides; paint ends. Lines of 0.3 m or less look alike to a camera.
@@ -218,11 +220,13 @@ ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
 MIN_REFLECTING = 2  # pieces
 
 
-def log_odds_of_line(pieces: Pieces, painted_m: float, *, alone: bool = True) -> float:
+def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True) -> float:
     """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
     lidar = by_lidar(pieces)
     if np.isfinite(pieces.color).any():
-        return PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + _by_shape(pieces, alone=alone) + lidar
+        odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
+        odds += DASHES * min(max(dashes - 2, 0), 2) / 2
+        return odds + _by_shape(pieces, alone=alone) + lidar
     # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen.
     return min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
 
