@@ -14,7 +14,6 @@ from log2sim.config import MapConfig
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.localization.odometry import PROBED_SWEEPS
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import give_pictures, work_ahead
@@ -100,6 +99,8 @@ MAX_APART_S = 0.15
 BLIND_M = 6.0
 # Rings of a LiDAR are up to this far apart on ground that its pictures still show finely.
 MAX_AWAY_M = 2.0
+# Of a LiDAR, to see how many points it gives.
+PROBED_SWEEPS = 3
 Progress = Callable[[int, int], None]
 
 

@@ -20,9 +20,7 @@ from log2sim.road.routes import (
     LANE_M,
     MAX_LANE_M,
     MAX_TURN_RAD,
-    MIN_LANE_M,
     MIN_PATH_M,
-    PARALLEL_RAD,
     DrivenPath,
     Route,
     collect_paths,
@@ -43,18 +41,21 @@ from log2sim.road.sections import (
     join_conflicts,
     lay_out,
 )
-from log2sim.road.strokes import CHORD_ERROR_M
 
 # Stations at which the distance to the next line is taken.
 STRIP_STEP_M = 1.0
+# Of a lane: from the narrowest of roadworks (2.2 m) to the widest of ramps.
+MIN_WIDTH_M, MAX_WIDTH_M = 2.2, 5.0
 # Lines nearer than this belong together: double lines, a curb beside an edge line.
 SAME_LINE_M = 1.0
+# Edges of a lane differ less in heading, also where it widens.
+PARALLEL_RAD = float(np.deg2rad(8.0))
 # Shorter strips are between arrows, letters and pieces of crosswalks: a dash and its gap are 9 m (RMS 1993) to 12 m long.
 MIN_STRIP_M = 8.0
 # Between two pieces of a strip whose lines are worn: the longest gap between dashes of motorways (12 m) and some more.
 MAX_STRIP_GAP_M = 15.0
-# How far the second piece may lie aside of where the first leads: less than any next lane.
-MAX_ASIDE_M = 0.5
+# How far the second piece may lie aside of where the first leads, and how much wider it may be: less than any next lane.
+MAX_ASIDE_M, MAX_WIDENING_M = 0.5, 0.8
 # What may be the edge of a lane.
 RoadLine = Marking | RoadBorder
 
@@ -128,7 +129,7 @@ class _Sides:
         nearest = {sign: np.full(len(s), np.inf) for sign in (1, -1)}
         which = {sign: np.full(len(s), -1) for sign in (1, -1)}
         for j, other in enumerate(lines):
-            if j == k or not line.is_near(other, MAX_LANE_M):
+            if j == k or not line.is_near(other, MAX_WIDTH_M):
                 continue
             for turned in (0.0, np.pi):
                 at = other.project(points, heading + turned)
@@ -140,7 +141,7 @@ class _Sides:
                     nearest[sign] = np.where(near, sign * aside, nearest[sign])
                     which[sign] = np.where(near, j, which[sign])
         for sign in (1, -1):
-            which[sign][(nearest[sign] < MIN_LANE_M) | (nearest[sign] > MAX_LANE_M)] = -1
+            which[sign][(nearest[sign] < MIN_WIDTH_M) | (nearest[sign] > MAX_WIDTH_M)] = -1
         return cls(s, which[1], which[-1], nearest[1])
 
 
@@ -154,7 +155,7 @@ def _once(strips: Sequence[LaneStrip]) -> list[LaneStrip]:
         for other in kept:
             for turned in (0.0, np.pi):
                 at = other.line.project(middle[:, :2], heading + turned)
-                held |= at.inside & (np.abs(at.aside_m) < MIN_LANE_M / 2) & (np.abs(at.turn_rad) < np.pi / 2)
+                held |= at.inside & (np.abs(at.aside_m) < MIN_WIDTH_M / 2) & (np.abs(at.turn_rad) < np.pi / 2)
         if held.mean() < 0.5:
             kept.append(strip)
     return kept
@@ -189,7 +190,7 @@ def _gap(one: LaneStrip, two: LaneStrip) -> float | None:
     along, aside = (u - x) * c + (v - y) * s, (v - y) * c - (u - x) * s
     bend = float(wrap_angle(two.line.heading_rad[0] - heading))
     fits = abs(aside - along * bend / 2) <= MAX_ASIDE_M and abs(bend) <= PARALLEL_RAD
-    fits &= -STRIP_STEP_M <= along <= MAX_STRIP_GAP_M
+    fits &= -STRIP_STEP_M <= along <= MAX_STRIP_GAP_M and abs(one.width_m[-1] - two.width_m[0]) <= MAX_WIDENING_M
     return float(along) if fits else None
 
 
@@ -208,6 +209,8 @@ def _joined(one: LaneStrip, two: LaneStrip) -> LaneStrip:
     return LaneStrip(line, width, s, longer.left, longer.right, confidence)
 
 
+# How far interpolation may be from a point that is left out: below the centimeter to which lanes are exact.
+TOLERANCE_M = 0.004
 # Longest chord, so that heights and widths are sampled too.
 MAX_STEP_M = 20.0
 
@@ -224,7 +227,7 @@ def thin(lane: MapLane) -> MapLane:
         share = (way / way[-1])[:, None]
         off = np.abs(columns[a : b + 1] - (columns[a] + share * (columns[b] - columns[a]))).max(axis=1)
         k = a + int(off.argmax())
-        if off.max() <= CHORD_ERROR_M:
+        if off.max() <= TOLERANCE_M:
             if way[-1] <= MAX_STEP_M:
                 continue
             k = a + int(np.searchsorted(way, way[-1] / 2))
@@ -359,6 +362,8 @@ def direct_strips(
 
 # That there is a lane where one vehicle surely drove: others overtake, turn into yards or pass obstacles.
 PATH_PROBABILITY = 0.6
+# A point nearer than this to where a lane begins, or behind it, is left out.
+MIN_AHEAD_M = 0.05
 # Paths alone never prove a lane.
 MAX_CONFIDENCE = 0.95
 
@@ -490,7 +495,7 @@ def _linked_lanes(routes: Sequence[Route], paths: Sequence[DrivenPath]) -> list[
         points, lane, heading = lanes[b].points_m.copy(), lanes[b], Polyline(lanes[b].points_m).heading_rad[0]
         points[0] = lanes[a].points_m[-1]
         ahead = (points[1:, :2] - points[0, :2]) @ [np.cos(heading), np.sin(heading)]
-        kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > 0))])
+        kept = np.concatenate([[0], 1 + np.flatnonzero(np.maximum.accumulate(ahead > MIN_AHEAD_M))])
         if len(kept) > 1:
             lanes[b] = replace(lane, points_m=points[kept], width_m=lane.width_m[kept])
     return [thin(lane) for lane in lanes]

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.paint import Pieces, log_odds_of_line
+from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, fit_curve, stretches_of, trace
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
@@ -223,9 +224,14 @@ def _alike_chains(values: Array, a: NDArray[np.int64], b: NDArray[np.int64], rat
 MIN_LINE_M = 1.0
 # Contrast of yellowness: paint is 0.5 to 1.2 in daylight, gray and white are below 0.1.
 MIN_YELLOW = 0.2
-# Lanes are 2 m wide at least. Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
-BESIDE_M, REMNANT_SHARE, REMNANT = (0.45, 1.7), 0.65, -6.0
+REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
+# Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
+BESIDE_M, MAX_BESIDE, CROWDED = (0.45, 1.7), 1, -5.0
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
+MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
+# Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
+REMNANT_SHARE, REMNANT = 0.65, -6.0
+MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
 
 
@@ -261,7 +267,7 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
     lidar = bool(np.count_nonzero(seen) > 1)
     if lidar:
         error = float(np.median(pieces.reflected_sigma[seen])) / float(np.sqrt(np.count_nonzero(seen)))
-        lidar = float(np.median(pieces.reflected[seen])) > 3 * error
+        lidar = float(np.median(pieces.reflected[seen])) > max(3 * error, MIN_REFLECTED)
     return tuple(name for name, shows in (("camera", camera), ("lidar", lidar)) if shows)
 
 
@@ -284,7 +290,27 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
             odds = log_odds_of_line(member, traced.painted_m(begin, end), dashes=stretch.dashes)
             out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
-    return _without_remnants(out)
+    return _in_context(drop_repeats(out))
+
+
+def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
+    """Leave out lines that lie on stronger ones."""
+    order = sorted(lines, key=lambda one: (-one.log_odds, -one.length_m))
+    dense = [_dense(line.xy) for line in order]
+    if not dense:
+        return []
+    owner = np.repeat(np.arange(len(dense)), [len(points) for points in dense])
+    tree = cKDTree(np.concatenate(dense))
+    kept = np.zeros(len(dense), dtype=bool)
+    for k, points in enumerate(dense):
+        near = tree.query_ball_point(points, np.nextafter(REPEAT_M, 0), return_sorted=False)
+        count = np.array([len(found) for found in near])
+        # Which of the points of this line are near one of a stronger line that was kept.
+        covered = np.bincount(
+            np.repeat(np.arange(len(points)), count), kept[owner[np.concatenate(near).astype(np.intp)]]
+        )
+        kept[k] = np.mean(covered > 0) <= 0.5
+    return [line for line, keep in zip(order, kept) if keep]
 
 
 def _dense(xy: Array) -> Array:
@@ -292,8 +318,8 @@ def _dense(xy: Array) -> Array:
     return curve.at(np.arange(0, curve.s[-1] + 0.05, 0.1))
 
 
-def _without_remnants(lines: list[PaintedLine]) -> list[PaintedLine]:
-    """Lower the log-odds of lines that run beside much brighter ones."""
+def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
+    """Lower the log-odds of lines that form combs or grids, or run beside much brighter ones."""
     if len(lines) < 2:
         return lines
     dense = [_dense(line.xy)[::5] for line in lines]
@@ -309,16 +335,24 @@ def _without_remnants(lines: list[PaintedLine]) -> list[PaintedLine]:
     offset = points[b] - points[a]
     distance = np.abs(offset[:, 1] * np.cos(heading[a]) - offset[:, 0] * np.sin(heading[a]))
     parallel = (turn < PARALLEL_RAD) & (distance > BESIDE_M[0])
+    crossing = (turn > np.pi / 4) & (np.linalg.norm(offset, axis=1) < 0.5)
     length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
     contrast = np.array([float(np.median(np.nan_to_num(line.pieces.color))) for line in lines])
     # Pairs of lines, not a table of all: a long log has thousands.
     i, j, count = _counted(owner[a[parallel]], owner[b[parallel]])
     beside = count > BESIDE_PER_M * length[i]
     i, j = i[beside], j[beside]
+    crowded = np.bincount(i[_alike(lines, contrast, i, j)], minlength=len(lines)) > MAX_BESIDE
+    added = np.where(crowded, CROWDED, 0.0)
+    # Combs do not tell against what they cross, unless that is a comb, too.
+    k, other, _ = _counted(owner[a[crossing]], owner[b[crossing]])
+    told = _alike(lines, contrast, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
+    crossings = np.bincount(k[told], minlength=len(lines))
+    added += np.where((crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length), CROWDED, 0.0)
     brighter = odds[j] > odds[i] - 1
     brightest = np.full(len(lines), -np.inf)
     np.maximum.at(brightest, i[brighter], contrast[j[brighter]])
-    added = np.where(contrast < REMNANT_SHARE * brightest, REMNANT, 0.0)
+    added += np.where(np.isfinite(brightest) & (contrast < REMNANT_SHARE * brightest), REMNANT, 0.0)
     return [replace(line, log_odds=line.log_odds + more) for line, more in zip(lines, added.tolist())]
 
 
@@ -327,3 +361,11 @@ def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray
     most = int(second.max(initial=0)) + 1
     pair, count = np.unique(first * most + second, return_counts=True)
     return pair // most, pair % most, count
+
+
+def _alike(lines: list[PaintedLine], contrast: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
+    """Mask (P,) of pairs of lines that look alike, and the other as likely as the one: what combs and grids are made of."""
+    width, odds = np.array([line.width_m for line in lines]), np.array([line.log_odds for line in lines])
+    same = np.maximum(width[one], width[other]) <= 2 * np.minimum(width[one], width[other])
+    same &= np.maximum(contrast[one], contrast[other]) <= 2 * np.minimum(contrast[one], contrast[other])
+    return np.asarray(same & (odds[other] > odds[one] - 2))

@@ -38,7 +38,7 @@ MIN_BARS = 3
 SURE_BARS, FEW_BARS = 6, -3.0  # fewer are often side by side by chance in LiDAR intensities of grass
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
-STOP_LENGTH_M = (1.5, 20.0)
+STOP_WIDTH_M, STOP_LENGTH_M = (0.22, 0.85), (1.5, 20.0)
 LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
 ALONE = -1.0  # log-odds of a stop line beside which no lane line is seen
@@ -141,7 +141,7 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
     lanes = [one for one in lines if one.width_m <= MAX_LANE_LINE_WIDTH_M and one.length_m >= 3.0]
     stops, others = [], []
     for line in lines:
-        wide = BAR_WIDTH_M[0] <= line.width_m <= BAR_WIDTH_M[1]
+        wide = STOP_WIDTH_M[0] <= line.width_m <= STOP_WIDTH_M[1]
         fits = wide and STOP_LENGTH_M[0] <= line.length_m <= STOP_LENGTH_M[1] and line.dashes < 3
         middle, chord = line.xy.mean(axis=0), line.xy[-1] - line.xy[0]
         nearest, angle = LANE_LINE_WITHIN_M, None  # of the lane lines; the angle to it in [0, pi / 2]
@@ -234,7 +234,7 @@ MIN_SEEN = 0.5
 ROAD_TOLERANCE = 1.5  # sigmas that a road may differ from where lane lines are
 # Log-odds: a meter of seam, patch or wear is much more frequent than that of a border, long ones are not.
 PRIOR, PER_METER, MAX_BY_LENGTH, PER_SIGMA = -3.0, 0.15, 4.5, 0.7
-MIN_BORDER_M = 5.0
+MIN_BORDER_M, MIN_BORDER_CONFIDENCE = 5.0, 0.5
 NEAR_LINE_M = 12.0  # borders farther from all lane lines are those of something else
 
 
@@ -387,7 +387,7 @@ def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[A
     sigmas = float(_surface_step(np.array(by_color), np.array(by_lidar), np.array(len(steps[1]) > 3)))
     curb = CURB_M[0] <= by_height * HEIGHT_SIGMA_M <= CURB_M[1]
     odds = PRIOR + min(PER_METER * length, MAX_BY_LENGTH) + PER_SIGMA * min(sigmas - MIN_STEP, CLEAR_STEP) + 2.0 * curb
-    if probability(odds) < MIN_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
+    if probability(odds) < MIN_BORDER_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
         return None
     shown = (("camera", by_color > 1), ("lidar", by_lidar > 1 or curb))
     sources = tuple(name for name, shows in shown if shows)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import COARSE_M, Layer, RidgePoints, Samples, sample
+from log2sim.road.ridges import Layer, RidgePoints, Samples, sample
 
 AROUND_M = 0.25
 
@@ -208,25 +208,44 @@ PER_METER = 0.8  # of paint in line, which texture seldom continues
 MAX_BY_LENGTH = 5.5
 PER_METER_MORE, MAX_BY_MORE = 0.03, 1.5  # of longer lines
 DASHES = 1.5  # three or more dashes of one length at one distance
+# Sun between two shadows and wet glare are ridges to a camera, too: more than that it alone does not say.
+MAX_BY_CAMERA = 3.0
 UNEVEN = -1.5  # a step beside which a little stands out
 NOT_BRIGHTEST, MIN_OUTSHINING = -2.5, 0.4  # no brighter than much of the ground around; share of its contrast
 # Glare fades to its sides; paint ends. Lines of 0.3 m or less look alike to a camera.
 FADING, FADING_FROM_M, FADING_WIDTH_M = -5.0, 0.1, 0.3
 FADING_SHARE = 0.25  # of the width; 0.39 of a Gaussian's
+WIDTH_VARIES = -2.0
+WIDTH_UNUSUAL = -4.0
 # Contrast of logarithms of LiDAR intensity of paint and of other ridges: mean, sigma.
 PAINT_REFLECTS, OTHER_REFLECTS = (0.8, 0.35), (0.0, 0.12)
+# Dashes along lanes are up to 0.3 m wide (VwV-StVO: broad lines of 0.25 m and 0.3 m).
+MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
 MAX_BY_LIDAR, MAX_BY_LIDAR_ALONE = 6.0, 3.0
 ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
 MIN_REFLECTING = 2  # pieces
+MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
 
 def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True) -> float:
     """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
+    odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
+    odds += DASHES * min(max(dashes - 2, 0), 2) / 2
+    by_camera = bool(np.isfinite(pieces.color).any())
+    if by_camera:
+        odds += _by_shape(pieces, alone=alone)
+    width = median(pieces.width_m)
+    by_width = 0.0 if MIN_WIDTH_M <= width <= MAX_WIDTH_M else WIDTH_UNUSUAL
+    if len(pieces) >= 3:
+        varies = median(np.abs(pieces.width_m - width)) / width
+        by_width += WIDTH_VARIES * float(np.clip((varies - 0.2) / 0.3, 0, 1))
+    odds += by_width
+    if alone and dashes > 1 and width > MAX_DASH_WIDTH_M:
+        odds += WIDE_DASHES
+    odds = min(odds, MAX_BY_CAMERA)
     lidar = by_lidar(pieces)
-    if np.isfinite(pieces.color).any():
-        odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
-        odds += DASHES * min(max(dashes - 2, 0), 2) / 2
-        return odds + _by_shape(pieces, alone=alone) + lidar
+    if by_camera:
+        return odds + lidar
     # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen.
     return min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
 
@@ -279,6 +298,7 @@ MAX_TURN_RAD = np.deg2rad(20)  # the directions of ridge points are 15 deg apart
 MIN_POINTS = 5
 MIN_PIECE_M = 0.4
 MIN_COVERED = 0.6  # share of a piece's length that has ridge points
+CELL_M = 0.1  # distance of ridge points along a line
 PROFILES_AT_ONCE = 4000  # bound of memory
 
 
@@ -292,12 +312,12 @@ def find_pieces(ground: GroundMap, points: RidgePoints) -> Pieces:
     return pieces.take(np.isfinite(pieces.width_m) & (pieces.width_m > 0))
 
 
-def fit_lines(points: RidgePoints, cell_m: float = COARSE_M) -> Array:
+def fit_lines(points: RidgePoints, cell_m: float = CELL_M) -> Array:
     """Fit lines to ridge points, the strongest first, each point to one: x, y, direction, length (N, 4).
 
     Points are `cell_m` apart along a line; all lengths are in proportion to that.
     """
-    scale = cell_m / COARSE_M
+    scale = cell_m / CELL_M
     if not len(points.xy_map):
         return np.zeros((0, 4))
     tree = cKDTree(points.xy_map)
@@ -324,7 +344,7 @@ def _fit_line(points: RidgePoints, seed: int, near: NDArray[Any], scale: float) 
     turn = np.abs((points.direction[near] - points.direction[seed] + np.pi / 2) % np.pi - np.pi / 2)
     angle, center = float(points.direction[seed]), np.zeros(2)
     chosen = turn < MAX_TURN_RAD
-    across_m, cell_m = ACROSS_M * scale, COARSE_M * scale
+    across_m, cell_m = ACROSS_M * scale, CELL_M * scale
     for width in (2 * across_m, across_m):
         along, across = _turned(xy - center, angle)
         member = chosen & (np.abs(across) < width)

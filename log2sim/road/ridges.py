@@ -148,6 +148,7 @@ MIN_SIGMAS = 4.0  # of the same filter's response to the texture around
 BLOCK_M = 4.0  # texture is measured within
 # Of a normal distribution that share is within so many sigmas; what stands on part of a block does not count.
 TEXTURE_QUANTILE, TEXTURE_SIGMAS = 0.35, 0.454
+MIN_SEEN = 0.7  # share of a cell
 MIN_HIT = 0.5  # of the cells around by LiDAR, where no camera saw the ground: single rings are lines themselves
 MAX_POINTS = 400_000  # bound of memory: 40 km of lines
 HIGH_PASS_M = 1.5
@@ -173,7 +174,7 @@ def find_ridges(ground: GroundMap) -> RidgePoints:
     for tile in iterate_tiles(ground, factor, round(MARGIN_M / cell)):
         response, direction, noise = _respond(_join(tile, cell), cell)
         # What is so bright is looked at however rough its surroundings are; intensities of grass are as bright.
-        noise = np.where(tile.seen > 0, np.minimum(noise, CLEAR_CONTRAST / MIN_SIGMAS), noise)
+        noise = np.where(tile.seen > MIN_SEEN, np.minimum(noise, CLEAR_CONTRAST / MIN_SIGMAS), noise)
         found.append(_crests(response / noise, direction, tile) + np.array([tile.origin[1], tile.origin[0], 0, 0]))
     points = np.concatenate(found)
     if len(points) > MAX_POINTS:
@@ -320,7 +321,7 @@ def _block_sigma(plain: Layer, cell_m: float) -> Layer:
 def _crests(strength: Layer, direction: NDArray[np.uint8], tile: CoarseTile) -> Array:
     """Keep cells that respond most across their direction: column, row, direction, strength (N, 4)."""
     known = np.zeros(strength.shape, bool)
-    known[tile.core] = (tile.seen[tile.core] > 0) | (cv2.blur(tile.hit, (7, 7))[tile.core] > MIN_HIT)
+    known[tile.core] = (tile.seen[tile.core] > MIN_SEEN) | (cv2.blur(tile.hit, (7, 7))[tile.core] > MIN_HIT)
     rows, columns = np.nonzero((strength > MIN_SIGMAS) & known)
     angle = direction[rows, columns].astype(np.float64) * (np.pi / DIRECTIONS)
     dx, dy = -np.sin(angle), -np.cos(angle)  # to the left of the direction; rows count downwards

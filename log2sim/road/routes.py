@@ -124,10 +124,8 @@ def _monotone_stretches(progress: Array) -> Iterator[tuple[int, int, int]]:
 
 # A vehicle closer than this to a route is on it: half of the narrowest usual lane, 3.0 m (RAA 2008, urban roads).
 ENTER_M = 1.5
-# Of a lane: from the narrowest of roadworks to the widest of ramps; wider strips are two lanes or a parking lane more.
-MIN_LANE_M, MAX_LANE_M = 2.2, 5.0
-# It is on it until it is farther away than the narrowest lane is wide; a lane beside cannot be nearer.
-STAY_M = MIN_LANE_M
+# It is on it until it is farther away than the narrowest lane of roadworks is wide; a lane beside cannot be nearer.
+STAY_M = 2.2
 # Larger differences of heading are crossings of a route.
 MAX_TURN_RAD = float(np.deg2rad(30.0))
 # Stations of two neighboring samples that differ by more belong to two passes of the same route.
@@ -208,7 +206,9 @@ def _runs(route_of: NDArray[np.intp], s: Array) -> tuple[Run, ...]:
 
 # Stations at which distances are taken.
 STEP_M = 2.0
-# Lanes of one road, and edges of a lane, differ less in heading; ramps leave at 3 to 5 degrees and are apart soon.
+# Between the middles of neighboring lanes: from the narrowest of roadworks to the widest.
+MIN_APART_M, MAX_APART_M = 2.2, 5.0
+# Lanes of one road differ less in heading; ramps leave at 3 to 5 degrees and are apart soon.
 PARALLEL_RAD = float(np.deg2rad(8.0))
 # Lines that pass each other at a small angle are that near for less than this.
 MIN_LENGTH_M = 8.0
@@ -234,12 +234,14 @@ def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
         points, heading = line.at(s)[:, :2], line.heading_at(s)
         candidates = []
         for j, other in enumerate(lines):
-            if i == j or not line.is_near(other, MAX_LANE_M):
+            if i == j or not line.is_near(other, MAX_APART_M):
                 continue
             for same in (True, False):
                 at = other.project(points, heading if same else heading + np.pi)
                 apart = np.abs(at.aside_m)
-                good = at.inside & (np.abs(at.turn_rad) <= PARALLEL_RAD) & (apart >= MIN_LANE_M) & (apart <= MAX_LANE_M)
+                good = (
+                    at.inside & (np.abs(at.turn_rad) <= PARALLEL_RAD) & (apart >= MIN_APART_M) & (apart <= MAX_APART_M)
+                )
                 aside = -at.aside_m if same else at.aside_m
                 candidates.append((j, same, np.where(good, at.s_m, np.nan), np.where(good, aside, np.nan)))
         for sign in (1, -1):
@@ -250,7 +252,7 @@ def find_beside(lines: Sequence[Polyline]) -> list[Beside]:
 def _stations(line: Polyline, lines: Sequence[Polyline]) -> Array:
     """Return stations about `STEP_M` apart on a polyline, and those next to the ends of others."""
     s = np.linspace(0.0, line.length_m, max(int(np.ceil(line.length_m / STEP_M)), 1) + 1)
-    low, high = (bound + sign * MAX_LANE_M for bound, sign in zip(line.bounds_m, (-1, 1)))
+    low, high = (bound + sign * MAX_APART_M for bound, sign in zip(line.bounds_m, (-1, 1)))
     ends = [(other.points_m[k, :2], other.heading_rad[k]) for other in lines if other is not line for k in (0, -1)]
     ends = [end for end in ends if np.all(end[0] >= low) and np.all(end[0] <= high)]
     if not ends:
@@ -284,6 +286,8 @@ def _nearest(route: int, s: Array, candidates: list[tuple[int, bool, Array, Arra
 LANE_M = 3.5
 # Free space beside the vehicle that a lane is made for, both sides together.
 CLEARANCE_M = 0.8
+# Wider strips are two lanes or a parking lane more.
+MAX_LANE_M = 5.0
 # A path that leaves a route within this distance of its end goes on where the other vehicle was last seen.
 JOIN_M = 5.0
 # Over this length a path that lengthens a route comes to its own offset from it: 2.5 degrees at most, as a driver steers.
@@ -292,6 +296,8 @@ BLEND_M = 20.0
 GAP_M = 8.0
 # Center lines stay this close to every path on them, so that all lie within half of a lane of `LANE_M`.
 KEEP_M = 1.6
+# Stations at which offsets of paths are compared.
+GRID_M = 2.0
 # Standard deviation of the smoothing along the lane of the mean offset, which jumps by up to a meter where a vehicle appears.
 SMOOTH_M = 8.0
 # A path that comes back to a place after this distance, which is less than the smallest roundabout, is there a second time.
@@ -454,7 +460,7 @@ def _ease(u: Array) -> Array:
 
 def _center(route: Route, k: int, paths: Sequence[DrivenPath], matches: Sequence[Match]) -> Route:
     """Move a route to the median of the paths on it."""
-    grid = np.linspace(0.0, route.line.length_m, max(int(np.ceil(route.line.length_m / STEP_M)), 1) + 1)
+    grid = np.linspace(0.0, route.line.length_m, max(int(np.ceil(route.line.length_m / GRID_M)), 1) + 1)
     asides = []
     width = float(route.width_m.max())
     for path, found in zip(paths, matches):
@@ -473,7 +479,7 @@ def _center(route: Route, k: int, paths: Sequence[DrivenPath], matches: Sequence
     middle, low, high = np.nanmedian(held, axis=0), np.nanmin(held, axis=0), np.nanmax(held, axis=0)
     near = np.clip(middle, high - KEEP_M, np.maximum(low + KEEP_M, high - KEEP_M))
     middle = np.where(high - low > 2 * KEEP_M, (high + low) / 2, near)
-    shift = gaussian_filter1d(middle, SMOOTH_M / STEP_M, mode="nearest")
+    shift = gaussian_filter1d(middle, SMOOTH_M / GRID_M, mode="nearest")
     moved = route.line.offset(route.line.s_m, np.interp(route.line.s_m, grid, shift))
     return replace(route, line=Polyline.through(moved)) if np.any(shift) else route
 

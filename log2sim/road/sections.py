@@ -14,6 +14,8 @@ from log2sim.road.routes import JOIN_M, JUMP_M, LANE_M, MAX_LANE_M, STAY_M, Besi
 
 # A path that is turned less against a route follows it: within its lane a vehicle turns by a degree or two.
 ALIGNED_RAD = float(np.deg2rad(2.0))
+# How far before it leaves a route a path may begin to turn.
+MAX_TURNOFF_M = 20.0
 # Routes that differ less in heading run side by side; a path from one to the other changes lanes.
 CHANGE_RAD = float(np.deg2rad(10.0))
 # Between where two lanes touch and where a junction begins: vehicles there overlap no lane but their own.
@@ -87,6 +89,8 @@ def _transition(routes: Sequence[Route], path: DrivenPath, match: Match, one: Ru
     leave, arrive = one.last - one.first, two.first - one.first
     # The last row before and the first one after that are aligned with the route, else the ones farthest away.
     before, after = np.arange(leave + 1), np.arange(arrive, len(s))
+    before = before[s[before] >= s[leave] - MAX_TURNOFF_M]
+    after = after[s[after] <= s[arrive] + MAX_TURNOFF_M]
     straight = before[np.abs(a.turn_rad[before]) <= ALIGNED_RAD]
     aligned = after[np.abs(b.turn_rad[after]) <= ALIGNED_RAD]
     begin = straight[-1] if len(straight) else before[0]

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from scipy.optimize import linear_sum_assignment
 
 from log2sim.datatypes import Log, Scenario, Signal
-from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, undistort
+from log2sim.geometry import NS_PER_S, Array, undistort
 from log2sim.perception.frames import LightBox
 
 STATES = ("red", "red_yellow", "yellow", "green", "off")
@@ -181,8 +181,8 @@ def changes_of(t_s: Array, course: NDArray[np.intp]) -> tuple[Array, list[str]]:
 SIDE_M, SIDE_SIGMA = 1.03, 0.22
 # Errors of boxes: in pixels, and as a share of their height, and of the direction of the camera, which poses share for seconds.
 PIXEL_SIGMA, SHARE_SIGMA, ANGLE_SIGMA_RAD = 1.5, 0.12, 0.003
-# Sizes that differ more are of different lights.
-MAX_SIZE_RATIO = 2.0
+# Chi-squared with 2 degrees of freedom beyond which a box is of another light, at 0.001; sizes that differ more are of others, too.
+GATE, MAX_SIZE_RATIO = 13.8, 2.0
 # Of a distance by LiDAR points: half of the depth of a housing, and what hangs beside it.
 RANGE_SIGMA_M = 0.4
 # Boxes often hold a part of a housing, whose middle is off by so much, or the board around it.
@@ -238,8 +238,8 @@ def place_lights(log: Log, boxes: Sequence[LightBox]) -> list[Housing]:
         covariances = np.array([housing.covariance for housing in housings]).reshape(-1, 3, 3)
         cost = np.array([_misfits(positions, covariances, s) for s in sights]).reshape(len(sights), len(housings))
         taken = set()
-        for row, column in zip(*linear_sum_assignment(np.minimum(cost, 10 * CHI2_2DOF_999))):
-            if cost[row, column] <= CHI2_2DOF_999:
+        for row, column in zip(*linear_sum_assignment(np.minimum(cost, 10 * GATE))):
+            if cost[row, column] <= GATE:
                 _update(housings[column], sights[row])
                 taken.add(row)
         for sight in (sight for k, sight in enumerate(sights) if k not in taken):

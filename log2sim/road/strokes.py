@@ -20,8 +20,9 @@ KNOT_M = 0.5
 CURVATURE_RATE_PER_M2 = 1.0e-3
 POINT_SIGMA_M = 0.03  # of the end of a piece, across it
 MAX_STEP_M = 2.0  # between points that are given out
-# How far interpolation may be from a point that is left out: below the centimeter to which lines and lanes are exact.
 CHORD_ERROR_M = 0.004
+ROBUST_SIGMAS = 2.5
+ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,8 @@ def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:
     """Fit a curve to points (N, 2) in order along it, N >= 2.
 
     The sum of squared distances, in sigmas, plus that of the curvature's rate of change, in `CURVATURE_RATE_PER_M2`, along
-    the line (its third derivative by length) is the least. Bands of seven diagonals: the cost grows as the length.
+    the line (its third derivative by length) is the least; points far off count less (Huber). Bands of seven diagonals:
+    the cost grows as the length.
     """
     s = np.concatenate([[0.0], np.cumsum(np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6))])
     # The ends of pieces may overlap: points are ordered along the polyline of the middles of neighbors, which goes forward where
@@ -74,7 +76,14 @@ def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:
     # What few points leave open is straight: the curve is fitted as its distance from the chord.
     chord = points[0] + np.linspace(0, 1, knots)[:, None] * (points[-1] - points[0])
     offset = points - (points[0] + (place / (knots - 1))[:, None] * (points[-1] - points[0]))
-    return Curve(chord + _solve(offset, place, weight, knots, spacing))
+    xy = chord
+    for _ in range(ROUNDS):
+        xy = chord + _solve(offset, place, weight, knots, spacing)
+        low = np.minimum(place.astype(int), knots - 2)
+        part = (place - low)[:, None]
+        distance = np.linalg.norm(points - (xy[low] * (1 - part) + xy[low + 1] * part), axis=1)
+        weight = 1 / sigma_m**2 / np.maximum(distance / (ROBUST_SIGMAS * sigma_m), 1)
+    return Curve(xy)
 
 
 def _solve(points: Array, place: Array, weight: Array, knots: int, spacing: float) -> Array:

@@ -14,18 +14,14 @@ from scipy.spatial import cKDTree
 from log2sim.datatypes import Log, Sweep
 from log2sim.files.arrays import Columns
 from log2sim.geometry import Array
-from log2sim.perception.lidar.cloud import (
-    GROUND_REACH_M,
-    MAX_OBSTACLE_HEIGHT_M,
-    cloud_origin,
-    estimate_ground,
-    sweep_to_map,
-)
+from log2sim.perception.lidar.cloud import MAX_OBSTACLE_HEIGHT_M, cloud_origin, estimate_ground, sweep_to_map
 from log2sim.road.ground_map import Raster
 from log2sim.road.road_users import Boxes, covered
 
 # With 29 bytes each, 350 MB.
 MAX_POINTS = 12_000_000
+# Farther away rings are meters apart and points hit the road at less than 3 degrees.
+REACH_M = 45.0
 # Curbs and banks are within this of the smooth ground of a single sweep; so are tires, which lower points of other sweeps replace.
 NEAR_GROUND_M = 0.4
 # What is higher hides the ground behind it.
@@ -81,7 +77,7 @@ def take_sweep(
     origin = np.array([sensor[0], sensor[1], cloud_origin(log, sweep.stamp_ns)[1]])
     local = (xyz - origin).astype(np.float32)
     ground = estimate_ground(local, np.zeros(2), 0.0)
-    within = np.flatnonzero(np.hypot(local[:, 0], local[:, 1]) < GROUND_REACH_M)
+    within = np.flatnonzero(np.hypot(local[:, 0], local[:, 1]) < REACH_M)
     local = local[within]
     height = local[:, 2] - ground.at(local[:, :2])
     hiding: Array = np.zeros((0, 3))
