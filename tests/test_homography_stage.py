@@ -24,7 +24,9 @@ from log2sim.geometry import (
 )
 from log2sim.perception.first_pass import Observations, base_poses
 from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes
+from log2sim.perception.homography.fit import ground_covariances
 from log2sim.perception.homography_stage import (
+    TILT_SIGMA_RAD,
     CameraHomography,
     calibrated_homography,
     fit_homographies,
@@ -133,6 +135,19 @@ def test_an_obstacle_without_points_is_placed_where_its_foot_is(far, yaw, catego
     # The rows of the first pass are left as they were.
     assert m.source.tolist() == [""]
     assert np.isnan(m.center_m).all()
+
+
+def test_a_camera_far_from_the_origin_of_the_map_is_as_sure_of_the_ground():
+    near = tilted(0.08)
+    pose = near.mount_T_cam.copy()
+    pose[:2, 3] += [800.0, -300.0]
+    far = replace(near, mount_T_cam=pose)
+    fits = [calibrated_homography(log_with(c), c) for c in (near, far)]
+    uv = project(near, apply(inverse(near.mount_T_cam), [[20.0, 1.0, 0.0]]))[0]
+    one, other = (ground_covariances(fit.ground_H_image, fit.covariance, uv)[0] for fit in fits)
+    np.testing.assert_allclose(one, other, rtol=1e-4)
+    range_m, height_m = 20.0 - near.mount_T_cam[0, 3], near.mount_T_cam[2, 3]
+    assert np.sqrt(one[0, 0]) == pytest.approx(TILT_SIGMA_RAD * range_m**2 / height_m, rel=0.1)
 
 
 def test_the_covariance_turns_with_the_ego():

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import REAR_AXLE_SHARE, AgentCandidate, Timeline, candidate_of, spans_of
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M, independent, independent_along, moving_geometry
-from log2sim.agents.smooth.motion_model import MAX_CURVATURE_1PM as ROAD_CURVATURE_1PM
 from log2sim.agents.smooth.motion_model import SIGNIFICANT_SIGMAS, UNKNOWN_YAW_RAD, MotionModel
 from log2sim.agents.smooth.smoother import SmoothedTrack, signed_speed, smooth_track
 from log2sim.agents.static import BoxState, left_free, track_with_lidar
@@ -29,6 +28,7 @@ from log2sim.datatypes import (
     Track,
     Waypoints,
 )
+from log2sim.datatypes.categories import MAX_CURVATURE_1PM as ROAD_CURVATURE_1PM
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import align_to
@@ -56,7 +56,7 @@ def heading_log_odds(m: BoxEvidence, yaw_rad: Array | float) -> float:
 
 # Log-odds that an object moves forward: of slow ones, one in five reverses, at 3 m/s one in a thousand.
 FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
-# More than boxes say against it (`MAX_HEADING_SCORE` in all sweeps), so that what drives fast points ahead. Of tracks that seem to drive one
+# More than boxes say against it (`MAX_PROBABILITY` in all sweeps), so that what drives fast points ahead. Of tracks that seem to drive one
 # in fifty mixes up several objects, or stands (simulated logs with LiDAR).
 MAX_COURSE_LOG_ODDS = 7.0
 # A way shorter than so many standard deviations of its ends may be noise.

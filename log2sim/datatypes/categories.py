@@ -76,3 +76,8 @@ RELATED_GROUPS = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
 # Standard deviation of the speed of an object of which no more than the group is known. A bicycle without a rider stands, but for
 # those whose rider the detector missed.
 FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0, "bicycle": 1.0}
+# Beyond these a vehicle's motion is infeasible for Waymax (Gulino et al., 2023).
+MAX_ACCELERATION_MPS2 = 10.4
+MAX_CURVATURE_1PM = 0.3
+# Tires on dry asphalt hold about 0.9 g laterally.
+MAX_LATERAL_MPS2 = 8.8

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from log2sim.agents.smooth.motion_model import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
+from log2sim.datatypes.categories import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM
 from log2sim.edit.edits import MIN_PATH_MPS, Add, Agents, Edit, Only, Remove, chords
 from log2sim.errors import CheckFailed, ConfigError, ScenarioError
 from log2sim.files.plugins import nearest

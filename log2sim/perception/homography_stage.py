@@ -143,14 +143,13 @@ def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
     """Make the homography of flat ground under the ego from the calibration; None for a camera near the ground."""
     if camera.mount_T_cam[2, 3] - log.ground_z_ego_m < MIN_CAMERA_HEIGHT_M:
         return None
-    # As it is, and tilted by a standard deviation about either axis of the ground.
+    # As it is, and tilted by a standard deviation about either axis of the ground below the camera, whose place may be far from the
+    # origin of the map.
     tilts = [np.eye(3), rotation_from_rpy(TILT_SIGMA_RAD, 0.0, 0.0), rotation_from_rpy(0.0, TILT_SIGMA_RAD, 0.0)]
-    up = np.array([0.0, 0.0, camera.mount_T_cam[2, 3]])
     found = []
     for tilt in tilts:
         pose = camera.mount_T_cam.copy()
         pose[:3, :3] = tilt @ pose[:3, :3]
-        pose[:3, 3] = tilt @ (pose[:3, 3] - up) + up
         try:
             h = ground_homography(camera, pose, log.ground_z_ego_m)
         except np.linalg.LinAlgError:

@@ -15,9 +15,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.smooth.motion_model import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM
 from log2sim.datatypes import Agent, Trajectory
 from log2sim.datatypes.agent import hermite
+from log2sim.datatypes.categories import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM
 from log2sim.geometry import Array, cos_sin
 from log2sim.simulation.feasible_trajectory import (
     KNOT_S,

@@ -9,13 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding
+from log2sim.datatypes.categories import MAX_ACCELERATION_MPS2, MAX_CURVATURE_1PM, MAX_LATERAL_MPS2
 from log2sim.geometry import Array, wrap_angle
 
-# Beyond these a vehicle's motion is infeasible for Waymax (Gulino et al., 2023).
-MAX_ACCELERATION_MPS2 = 10.4
-MAX_CURVATURE_1PM = 0.3
-# Tires on dry asphalt hold about 0.9 g laterally.
-MAX_LATERAL_MPS2 = 8.8
 # Brakes need some 0.2 s to build up their full deceleration.
 MAX_JERK_MPS3 = 50.0
 # A limit counts as broken where the motion is beyond it by as many of its own standard deviations.

@@ -82,9 +82,11 @@ def place_obstacle(
     above_m = -range_m * float(rays[:2, 2].sum() / np.hypot(rays[:2, 0], rays[:2, 1]).sum())
     # Seen from above, the upper edge is that of the far side.
     if seen[TOP] and spanned_m > 0 and above_m < typical[2] + size_sigma[2]:
-        share = np.hypot(size_sigma[2] / typical[2], np.hypot(edge_px[TOP], edge_px[BOTTOM]) / (box_px[3] - box_px[1]))
+        relative = np.hypot(
+            size_sigma[2] / typical[2], np.hypot(edge_px[TOP], edge_px[BOTTOM]) / (box_px[3] - box_px[1])
+        )
         by_height_m = range_m * typical[2] / spanned_m
-        rows.append((-ahead, -by_height_m, (share * by_height_m) ** 2, contact))
+        rows.append((-ahead, -by_height_m, (relative * by_height_m) ** 2, contact))
     normals, offsets, variances, parts = (np.array(column) for column in zip(*rows, strict=True))
     body = np.array([[np.cos(YAWS_RAD), np.sin(YAWS_RAD)], [-np.sin(YAWS_RAD), np.cos(YAWS_RAD)]])
     reach = np.abs(np.einsum("iky,nk->yni", body, normals)) / 2 * parts  # of an edge by length and width (Y, n, 2)
@@ -97,11 +99,11 @@ def place_obstacle(
     off = residual - center @ normals.T
     squared = np.einsum("yn,ynm,ym->y", off, weight, off)
     log = -(squared + np.linalg.slogdet(noise)[1] + np.linalg.slogdet(information)[1]) / 2
-    share = np.exp(log - log.max())
-    share /= share.sum()
-    mean = share @ center
+    weights = np.exp(log - log.max())
+    weights /= weights.sum()
+    mean = weights @ center
     apart = center - mean
-    total = np.einsum("y,yij->ij", share, covariance) + np.einsum("y,yi,yj->ij", share, apart, apart)
+    total = np.einsum("y,yij->ij", weights, covariance) + np.einsum("y,yi,yj->ij", weights, apart, apart)
     # Errors of edges that do not fit to each other are larger than they say (Birge, 1932).
     if len(rows) > 2:
         total *= max(1.0, float(squared.min()) / (len(rows) - 2))

@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.smooth.motion_model import MAX_CURVATURE_1PM, MAX_LATERAL_MPS2
 from log2sim.datatypes import MARGIN_S, Agent, AgentTable, Scenario
+from log2sim.datatypes.categories import MAX_CURVATURE_1PM, MAX_LATERAL_MPS2
 from log2sim.geometry import Array
 
 TICK_S = 0.1  # interval of ticks: the rate of most LiDARs, at which a driver's reaction takes ten ticks
