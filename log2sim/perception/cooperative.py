@@ -75,12 +75,23 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
 
 # Fewer points are too far apart to say where a side ends: in random scenes they made boxes worse.
 MIN_REFINED_POINTS = 20
+# Corners of bodies are rounded, and the last ray on a side falls short of its end: in 30 random scenes outermost points were so
+# much less apart than a vehicle is long, with a standard deviation of 0.06 m.
+ROUNDED_M = 0.15
+# Networks guess the length of a vehicle better: where points say otherwise, a part of it was not seen.
+MAX_LENGTH_SHARE = 0.25
+# Sides that are seen under a flatter angle have too few points.
+MIN_FACING = 0.2
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
 
 
 def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
-    """Move and turn boxes (M,) to the sides that points of a viewpoint show; they grow to hold them."""
+    """Move and turn boxes (M,) to the sides that points of a viewpoint show; they grow to hold them.
+
+    A vehicle of which a flank is seen, and rays pass both ends of what is seen, is as long as that: a network's guess would be
+    wrong for all viewpoints alike.
+    """
     mine = np.flatnonzero(boxes.points >= MIN_REFINED_POINTS)
     rows = measure([], boxes.take(mine), view)
     size, yaw, center = boxes.size_m.copy(), boxes.yaw_rad.copy(), boxes.center_m.copy()
@@ -88,7 +99,26 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     turned = np.cos(rows.yaw_rad - yaw[mine]) < 0
     yaw[mine] = rows.yaw_rad + np.where(turned, np.pi, 0.0)
     center[mine, :2] = rows.center_m[:, :2]
-    size[mine, :2] = np.fmax(size[mine, :2], rows.high_m - rows.low_m)
+    shown_m = rows.high_m - rows.low_m
+    size[mine, :2] = np.fmax(size[mine, :2], shown_m)
+    length, sensor = shown_m[:, 0] + ROUNDED_M, rotate(rows.sensor_m[:, :2] - center[mine, :2], -yaw[mine])
+    beyond = np.abs(sensor) - size[mine, :2] / 2
+    is_whole = (
+        (_groups(boxes.take(mine)) == "vehicle")
+        & rows.ends_visible.all(axis=1)
+        & (beyond[:, 1] > MIN_FACING * np.hypot(*sensor.T))
+        & (np.abs(length / boxes.size_m[mine, 0] - 1) <= MAX_LENGTH_SHARE)
+    )
+    # The end that is seen stays; from beside, both are as far from their middle.
+    turn = np.where(turned, -1.0, 1.0)
+    toward = np.where(
+        beyond[:, 0] > 0,
+        np.sign(sensor[:, 0]) * (size[mine, 0] - length) / 2,
+        sensor[:, 0] + turn * (rows.low_m + rows.high_m)[:, 0] / 2,
+    )
+    axis = np.column_stack([np.cos(yaw[mine]), np.sin(yaw[mine])])
+    center[mine, :2] += np.where(is_whole, toward, 0.0)[:, None] * axis
+    size[mine, 0] = np.where(is_whole, length, size[mine, 0])
     return replace(boxes, center_m=center, size_m=size, yaw_rad=yaw)
 
 
