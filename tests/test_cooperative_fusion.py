@@ -16,11 +16,13 @@ from log2sim.datatypes import Boxes3D, Measurements
 from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
 from log2sim.perception.cooperative import (
+    ROUNDED_M,
     SeenBoxes,
     align_parts,
     match_by_covariance,
     merge_by_covariance,
     moving_boxes,
+    refine_boxes,
     refine_by_views,
     take_off_offset,
 )
@@ -249,6 +251,37 @@ def test_sides_of_boxes_in_the_points_of_both_ends_are_where_those_who_see_them_
     # Where nobody sees points, and without viewpoints, boxes stay.
     assert refined.take(np.array([1])).center_m.tolist() == guessed.take(np.array([1])).center_m.tolist()
     assert refine_by_views(guessed, ()) is guessed
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi, 0.7])
+@pytest.mark.parametrize("sensor", [[0.5, -12.0, 2.0], [12.0, -9.0, 2.0], [-12.0, 9.0, 2.0]])
+def test_a_flank_that_is_seen_from_end_to_end_says_how_long_a_vehicle_is(yaw, sensor) -> None:
+    # What the sensor sees of a car of 4.5 m with rounded corners, and a wall behind it all around; the network takes it for 5.2 m.
+    outline = outline_points(0.0, 0.0, length=4.5 - ROUNDED_M, step=0.05)
+    towards = np.sign(sensor[:2])
+    seen_by = outline[
+        (outline[:, 1] * towards[1] > 0.85) | ((outline[:, 0] * towards[0] > 2.1) & (abs(sensor[0]) > 2.5))
+    ]
+    angle = np.deg2rad(np.arange(0, 360, 0.2))
+    wall = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle)])
+    wall = np.concatenate([np.column_stack([wall, np.full(len(wall), z)]) for z in np.arange(-4.0, 3.0, 0.5)])
+
+    def length_of(points, category="car", guess=5.2):
+        guessed = boxes_at((0.2, 0.0, 0.8, guess, 1.8, 1.5, 0.0 if yaw < 1 else np.pi), category=category)
+        c, s = np.cos(yaw % np.pi), np.sin(yaw % np.pi)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+        guessed = replace(guessed, center_m=guessed.center_m @ turn, yaw_rad=guessed.yaw_rad + yaw % np.pi)
+        of = (CloudSensor(len(points), np.array(sensor) @ turn, np.zeros(3), "vehicle"),)
+        cloud = cloud_at(points @ turn, sensor=np.array(sensor) @ turn, ground=np.zeros(len(points), bool), sensors=of)
+        found = refine_boxes(guessed, cloud)
+        return found.size_m[0, 0], float((found.center_m @ turn.T)[0, 0])
+
+    length, x = length_of(np.concatenate([seen_by, wall]))
+    assert length == pytest.approx(4.5, abs=0.1)
+    assert x == pytest.approx(0.0, abs=0.12)
+    # With nothing behind it, it may go on; nor is it believed that a bus of 12 m ends there.
+    assert length_of(seen_by)[0] == pytest.approx(5.2)
+    assert length_of(np.concatenate([seen_by, wall]), "bus", 12.0)[0] == pytest.approx(12.0)
 
 
 def test_points_of_a_moving_car_are_put_to_one_time() -> None:
