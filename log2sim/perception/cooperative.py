@@ -76,12 +76,12 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
 # Fewer points are too far apart to say where a side ends: in random scenes they made boxes worse.
 MIN_REFINED_POINTS = 20
 # Corners of bodies are rounded, and the last ray on a side falls short of its end: in 30 random scenes outermost points were so
-# much less apart than a vehicle is long, with a standard deviation of 0.06 m.
+# much less apart than a vehicle is long, and that by 0.06 m more or less.
 ROUNDED_M = 0.15
 # Networks guess the length of a vehicle better: where points say otherwise, a part of it was not seen.
 MAX_LENGTH_SHARE = 0.25
-# Sides that are seen under a flatter angle have too few points; of a dark body few rays come back, and chance says from where:
-# in random scenes lengths were a meter too short with 100 points, and right from 150 on.
+# Sides that are seen under a flatter angle have too few points; of some bodies few rays come back, and chance says from where:
+# in random scenes two lengths were a meter too short with some 100 points, and those with 150 and more mostly right.
 MIN_FACING, MIN_WHOLE_POINTS = 0.2, 150
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
