@@ -28,7 +28,7 @@ from log2sim.logs.ros.messages import read_settings
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "samples/cookbook").glob("*.md"))}
 README = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
-GROUP = typer.main.get_command(entry.app)
+GROUP = typer.main.get_group(entry.app)
 
 
 def test_documents_name_tools_that_exist() -> None:
