@@ -191,11 +191,14 @@ WHOLE_SIDE_QUANTILE = 0.7
 MIN_STATIC_POINTS = 5
 # Standard deviation of a side observed from end to end: stray points lengthen it, gaps between rays shorten it.
 WHOLE_SIDE_SIGMA_M = 0.15
-# How far the sizes that a 3D detector estimates are off, as a share of how much those of their category differ; chance that of a
-# side which seems to be seen from end to end an end is missing, such as a low hood; degrees of freedom of the distribution of
-# sizes, as there are small cars and long ones. On 110 simulated logs .13 to .18, .35 (vehicles with few points .65) and 2 to 5;
-# .35 to .5, .2 to .5 and 2 to 30 change the share of wrong sizes there by less than .004.
-BOX_SPREAD, PARTIAL_SHARE, SIZE_FREEDOM = 0.5, 0.35, 4.0
+# Scale of the sizes about the expected ones, as a share of what the limits of their category make of it; degrees of freedom: there
+# are small cars and long ones, and detectors find neither; chance that an end of a side is missing which seems to be seen from end
+# to end, such as a low hood. On 110 simulated logs .1 to 1.1 (lengths of cars .5), 4 to 10, and .3 (.65 where points are few);
+# spreads of .35 to .7, freedoms of 2 to 30 and chances of .2 to .5 change the share of wrong sizes by less than .01 there.
+SIZE_SPREAD, SIZE_FREEDOM, PARTIAL_SHARE = 0.5, 4.0, 0.35
+# Relative error of the length of a car by that of its width, which is seen more often. Of the cars there it is 1.9; half of it is
+# left beside the errors of observed widths.
+LENGTH_PER_WIDTH = 1.0
 POSSIBLE_SIDES = 96  # lengths between the smallest and the largest that are compared: 1 to 2 % apart
 # Directive 96/53/EC, Annex I: 2.55 m, refrigerated vehicles 2.6 m; the United States allow 102 inches. What is beyond are mirrors.
 MAX_ROAD_WIDTH_M = 2.6
@@ -310,7 +313,7 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
     is_vehicle = GROUP_OF[category] == "vehicle"
     largest = np.minimum(limit, [np.inf, MAX_ROAD_WIDTH_M]) if is_vehicle else limit
     expected = np.minimum(typical if known is None else known[:2], largest)
-    spread = np.log(limit / smallest) / boxes.LIMIT_SIGMAS * (1.0 if known is None else BOX_SPREAD)
+    spread = SIZE_SPREAD * np.log(limit / smallest) / boxes.LIMIT_SIGMAS
     low, high = boxes.corner_correction(ends.low, ends.high, ends.real, expected[1], gap_m=ends.gap_m)
     seen, whole = high - low, np.all(ends.real, axis=2)
     variance = WHOLE_SIDE_SIGMA_M**2 + (boxes.UNIFORM_SIGMA * ends.gap_m).sum(axis=2) ** 2
@@ -318,11 +321,15 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
     # What is shorter than a part that was seen at other times was not seen from end to end.
     used = whole & (seen + 2 * np.sqrt(variance) >= least)
     size = expected.copy()
-    for axis in np.flatnonzero(used.any(axis=0)):
+    for axis in np.flatnonzero(used.any(axis=0))[::-1]:  # the width first
         sides, error = seen[used[:, axis], axis], variance[used[:, axis], axis]
         observed = weighted_quantile(sides, 1.0 / error, WHOLE_SIDE_QUANTILE)
         error_of_all = error.min() / independent(len(sides))
-        size[axis] = _posterior_side(expected[axis], spread[axis], observed, error_of_all, (smallest[axis], largest[axis]))
+        size[axis] = _posterior_side(
+            expected[axis], spread[axis], observed, error_of_all, (smallest[axis], largest[axis])
+        )
+        if axis == 1 and category == "car":
+            expected[0] = size[0] = min(expected[0] * (size[1] / expected[1]) ** LENGTH_PER_WIDTH, largest[0])
     # What lies between two rays is no evidence.
     between = np.where(ends.real == boxes.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
     sides = np.maximum(expected, least)
@@ -339,7 +346,9 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
     return np.clip(np.maximum(size, least), smallest, largest), is_likely
 
 
-def _posterior_side(expected_m: float, spread: float, observed_m: float, variance_m2: float, limits_m: tuple[float, float]) -> float:
+def _posterior_side(
+    expected_m: float, spread: float, observed_m: float, variance_m2: float, limits_m: tuple[float, float]
+) -> float:
     """Return the median of the length of a side after it was observed, m.
 
     The logarithm of the length is distributed about that of `expected_m` by Student's t with a scale of `spread`. With a chance of
