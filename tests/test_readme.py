@@ -160,7 +160,7 @@ def fresh_environment(tmp_path: Path) -> dict[str, str]:
     home.mkdir()
     variables |= {"HOME": str(home), "PATH": f"{sys.base_prefix}/bin:/usr/local/bin:/usr/bin:/bin", "LANG": "C.UTF-8"}
     # Python compiles what is imported, which is a small part of what is installed; other tests run on the other cores.
-    variables |= {"PIP_COMPILE": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    variables |= {"PIP_COMPILE": "0", "OMP_NUM_THREADS": "1"}
     settings = Path.home() / ".config/pip/pip.conf"
     if settings.is_file():
         variables.setdefault("PIP_CONFIG_FILE", str(settings))
