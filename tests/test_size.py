@@ -24,10 +24,9 @@ def measured(states, size=CAR, category="car", *, sensors=None, noise_m=0.01, en
     rows = []
     for k, (x, y, yaw) in enumerate(states):
         sensor = np.array((0.0, 0.0, 1.9) if sensors is None else sensors[k])
-        toward = np.rad2deg(np.arctan2(y - sensor[1], x - sensor[0]))
         xyz, owner = scan(
             [standing(x - sensor[0], y - sensor[1], np.rad2deg(yaw), size)],
-            azimuth_deg=(toward - 60, toward + 60), steps=(300, 32), noise_m=noise_m, seed=k,
+            azimuth_deg=(-180, 180), steps=(900, 32), noise_m=noise_m, seed=k,
         )  # fmt: skip
         cluster = xyz[(owner == 0) & (xyz[:, 2] > 0.2)] + [*sensor[:2], 0.0]
         row = measured_row(cluster, sensor, category, ends_visible=ends_visible, t_ns=T0_NS + k * STEP_NS)
