@@ -24,6 +24,9 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
 # Many tests start processes, which would compile the package each for itself.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+# One process a run and one thread for linear algebra unless a test asks for more: tests run side by side, small matrices
+# are slower with threads, and tests count what happens in their process. NumPy reads it when it is first imported.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -71,8 +74,6 @@ def own_cache(shared_folder: Path) -> Iterator[Path]:
     folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LOG2SIM_CACHE", str(folder))
-        # One process a run unless a test asks for more: tests run side by side, and count what happens in their process.
-        patch.setenv("OMP_NUM_THREADS", "1")
         yield folder
 
 

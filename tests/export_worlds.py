@@ -70,7 +70,7 @@ def peer(name: str) -> Callable[..., str]:
         pytest.skip(f"the environment '{name}' is not there: tools/peers.sh makes it")
 
     def run(*arguments: object) -> str:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         ran = subprocess.run([str(python), *map(str, arguments)], capture_output=True, text=True, env=environment)
         assert ran.returncode == 0, ran.stderr[-4000:]
         return ran.stdout

@@ -185,18 +185,26 @@ def test_the_workers_of_a_scheduler_find_situations_drive_a_policy_and_replay(tm
     for seed in range(4):
         traffic(seed, count=8, duration_s=12.0).scenario.save(tmp_path / "found" / f"{seed}" / "scenario.json")
     (tmp_path / "mine.py").write_text(
-        "from log2sim.simulation.policy import Controls\n\n\ndef full(seen):\n    return Controls(2.5, 0.0)\n"
+        "from log2sim.simulation.policy import Controls\n\n\ndef full(seen):\n"
+        "    if seen.t_s < 0.1 and seen.ego.speed_mps > 26.0:\n        raise ValueError('mine')\n"
+        "    return Controls(2.5, 0.0)\n"
     )
     ran = run("find", tmp_path / "found", "cut_in", "--scheduler", scheduler)
     assert ran.code == 0, ran.err
     about = []
     for name, workers in (("there", ("--scheduler", scheduler)), ("here", ("--jobs", 1))):
-        policy = f"{tmp_path / 'mine.py'}:full"
-        ran = run("test", policy, tmp_path / "found", "cut_in", "-o", tmp_path / name, "--runs", 40, "--worst", 0, *workers)  # fmt: skip
+        policy, worst = f"{tmp_path / 'mine.py'}:full", int(name == "here")
+        ran = run("test", policy, tmp_path / "found", "cut_in", "-o", tmp_path / name, "--runs", 40, "--worst", worst, *workers)  # fmt: skip
         assert ran.code == 0, ran.err
         about.append(json.loads((tmp_path / name / "test.json").read_text()))
-    assert about[0]["failures"] > 0
     assert about[0] == about[1]
+    assert about[0]["runs"] == 40
+    assert about[0]["failures"] > about[0]["errors"] > 0
+    p = about[0]["probability"]
+    assert 0 <= p["low"] <= p["probability"] <= p["high"] <= 1
+    (shown,) = (tmp_path / "here").glob("run-*/replay.json")
+    assert shown.with_name("view.html").exists()
+    assert shown.parent.name in (tmp_path / "here" / "report.html").read_text()
     ran = run("batch", tmp_path / "found", "-o", tmp_path / "replays", "--format", "scenario", "--scheduler", scheduler)
     assert ran.code == 0, ran.err
     assert len(list((tmp_path / "replays").glob("logs/*/replay.json"))) == 4

@@ -159,7 +159,7 @@ def test_help_and_version() -> None:
     assert all(f"  {name} " in shown.out for name in COMMANDS)
     for name in COMMANDS:
         result = CliRunner().invoke(entry.app, [name, "-h"])
-        assert result.exit_code == 0
+        assert result.exit_code == 0, (name, result.output)
         assert f"log2sim {name}" in result.output or f" {name} " in result.output
         if name in ("reconstruct", "replay", "edit", "plot", "view", "evaluate", "bench", "synth"):
             assert "--out" in result.output

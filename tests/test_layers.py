@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import os
 import re
 import subprocess
 import sys
@@ -68,6 +69,19 @@ def test_start_up_loads_nothing_heavy(statement: str) -> None:
     code = f"{statement}\nimport sys\nsys.stderr.write(','.join(m for m in {heavy} if m in sys.modules))"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stderr == ""
+
+
+@pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_commands_multiply_matrices_in_one_thread_unless_the_user_wants_more(
+    given: dict[str, str], expected: str
+) -> None:
+    code = """import os, sys; sys.argv = ["log2sim", "--version"]
+from log2sim import cli
+try: cli.main()
+finally: sys.stderr.write(os.environ["OPENBLAS_NUM_THREADS"])"""
+    others = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=others | given)
+    assert ran.stderr == expected
 
 
 def test_every_command_is_a_listed_function() -> None:

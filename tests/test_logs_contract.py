@@ -476,7 +476,7 @@ def test_records_that_are_read_at_once_are_those_that_are_read_one_by_one(
     name: str, path: Path, log: Log, share: str
 ) -> None:
     fresh = open_log(path, format=name)
-    asked = [(s, i) for s, stream in fresh.streams.items() for i in range(len(stream.t_ns))] * 2
+    asked = [(s, i) for s, stream in fresh.streams.items() for i in range(0, len(stream.t_ns), 2)]
     for stream in fresh.streams.values():  # a process that is forked has the files open that this one opened
         stream.read(0)
 
@@ -484,9 +484,9 @@ def test_records_that_are_read_at_once_are_those_that_are_read_one_by_one(
         return content(fresh.streams[record[0]].read(record[1]))
 
     with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(read, asked) if share == "threads" else map_in_processes(read, asked, 3))
+        found = list(pool.map(read, 2 * asked) if share == "threads" else map_in_processes(read, 2 * asked, 3))
     expected = [content(log.streams[s].read(i)) for s, i in asked]
-    assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(found, 2 * expected, strict=True))
 
 
 def content(record: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.road_users import RoadUsers, draw_outlines
 from log2sim.road.surface import MAX_POINTS, take_sweep
 
-SETTINGS = MapConfig(cell_m=0.05)
+SETTINGS = MapConfig(cell_m=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +46,15 @@ def test_cells_and_positions_are_inverse(ground: GroundMap) -> None:
     rows, columns = ground.raster.cells_of([[1.234, -2.345]])
     np.testing.assert_allclose(ground.raster.xy_of(rows, columns), [[1.234, -2.345]], atol=1e-9)
     x0, _, _, y1 = ground.extent_m
-    np.testing.assert_allclose(ground.raster.xy_of(0, 0), [x0 + 0.025, y1 - 0.025])
-    np.testing.assert_allclose(np.array(ground.extent_m) / 0.05, np.rint(np.array(ground.extent_m) / 0.05), atol=1e-6)
+    np.testing.assert_allclose(ground.raster.xy_of(0, 0), [x0 + 0.05, y1 - 0.05])
+    np.testing.assert_allclose(np.array(ground.extent_m) / 0.1, np.rint(np.array(ground.extent_m) / 0.1), atol=1e-6)
 
 
 def test_heights_are_those_of_the_road_and_of_the_curb(ground: GroundMap) -> None:
     xy = positions(ground)
     known = np.isfinite(ground.height_m) & near_path(xy, 12.0) & (np.abs(xy[..., 1] - 6.0) > 0.3)
     error = ground.height_m[known] - height_at(xy[known])
-    assert known.sum() > 50_000
+    assert known.sum() > 12_500
     assert abs(np.median(error)) < 0.01
     assert np.percentile(np.abs(error), 95) < 0.03
 
@@ -65,7 +65,7 @@ def test_paint_stands_out_in_intensity_at_any_range_and_on_any_scale(ground: Gro
     for low, high in ((0, 6), (6, 12), (12, 20)):
         ring = known & near_path(xy, high) & ~near_path(xy, low)
         paint, road = (ground.intensity[ring & (is_paint(xy) == kind)] for kind in (True, False))
-        assert min(len(paint), len(road)) > 2000
+        assert min(len(paint), len(road)) > 500
         assert np.percentile(paint, 10) > np.percentile(road, 90)
 
 
@@ -74,7 +74,7 @@ def test_colors_lie_where_the_paint_is_on_a_slope(ground: GroundMap) -> None:
     seen = (ground.alpha > 200) & clear_of_edges(xy, 0.06) & near_path(xy, 8.0) & (np.abs(xy[..., 1]) < 5)
     value = ground.color_bgr[..., 1][seen]
     wrong = (value > 120) != is_paint(xy[seen])
-    assert seen.sum() > 20_000
+    assert seen.sum() > 5_000
     assert wrong.mean() < 0.002
 
 
@@ -86,7 +86,7 @@ def test_cameras_alone_lie_on_the_ground_under_the_ego() -> None:
     assert not np.isfinite(ground.intensity).any()
     assert any("no height" in note for note in ground.notes)
     seen = (ground.alpha > 200) & clear_of_edges(xy, 0.15) & near_path(xy, 3.0) & (xy[..., 0] < 9)
-    assert seen.sum() > 5000
+    assert seen.sum() > 1250
     assert ((ground.color_bgr[..., 1][seen] > 120) != is_paint(xy[seen])).mean() < 0.02
 
 

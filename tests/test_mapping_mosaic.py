@@ -40,8 +40,8 @@ def shoot(
     gain: float = 1.0,
     ground_of: Callable[[Array], Array] = checker,
 ) -> np.ndarray:
-    """Render the ground by casting 3 x 3 rays a pixel; a second way that knows no homography."""
-    fine = (np.arange(3) - 1) / 3
+    """Render the ground by casting 2 x 2 rays a pixel; a second way that knows no homography."""
+    fine = (-0.25, 0.25)
     total = np.zeros((camera.height_px, camera.width_px))
     v, u = np.mgrid[: camera.height_px, : camera.width_px].astype(float)
     for du in fine:
@@ -53,7 +53,7 @@ def shoot(
             down = rays[:, 2] < -1e-9
             distance = np.where(down, (ground_z_m - map_T_cam[2, 3]) / np.where(down, rays[:, 2], 1.0), 0.0)
             ground = map_T_cam[:2, 3] + distance[:, None] * rays[:, :2]
-            total += np.where(down, ground_of(ground) * gain, 255.0).reshape(u.shape) / 9
+            total += np.where(down, ground_of(ground) * gain, 255.0).reshape(u.shape) / 4
     return np.repeat(np.rint(total).astype(np.uint8)[..., None], 3, axis=2)
 
 

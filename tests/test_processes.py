@@ -108,7 +108,8 @@ def test_frames_are_skipped_alike(monkeypatch: pytest.MonkeyPatch) -> None:
         return [(10.0, 10.0, 60.0, 50.0, 0.9, "car")] if image[::7].mean() % 1 < 0.3 else []
 
     monkeypatch.setattr(first_pass, "PART_TICKS", 1)
-    alone, shared = (observe_log(start(log, Config(), detector=find, cache=False, jobs=jobs)) for jobs in (1, 2))
+    config = Config.load(calibration={"check": False}, **AGENTS_ALONE)
+    alone, shared = (observe_log(start(log, config, detector=find, cache=False, jobs=jobs)) for jobs in (1, 2))
     assert content(alone) == content(shared)
     assert sum(alone.frames_skipped.values()) > 0
 

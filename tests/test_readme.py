@@ -28,7 +28,7 @@ from log2sim.logs.ros.messages import read_settings
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "samples/cookbook").glob("*.md"))}
 README = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
-GROUP = typer.main.get_command(entry.app)
+GROUP = typer.main.get_group(entry.app)
 
 
 def test_documents_name_tools_that_exist() -> None:
@@ -160,7 +160,7 @@ def fresh_environment(tmp_path: Path) -> dict[str, str]:
     home.mkdir()
     variables |= {"HOME": str(home), "PATH": f"{sys.base_prefix}/bin:/usr/local/bin:/usr/bin:/bin", "LANG": "C.UTF-8"}
     # Python compiles what is imported, which is a small part of what is installed; other tests run on the other cores.
-    variables |= {"PIP_COMPILE": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    variables |= {"PIP_COMPILE": "0", "OMP_NUM_THREADS": "1"}
     settings = Path.home() / ".config/pip/pip.conf"
     if settings.is_file():
         variables.setdefault("PIP_CONFIG_FILE", str(settings))

@@ -115,7 +115,7 @@ def hard_braking():
 
 
 def test_limits_are_of_all_agents_or_of_the_ego_that_a_policy_drives():
-    followed = replay(hard_braking())
+    followed = replay(hard_braking(), dt_s=0.02)
     assert check_strict(followed) == []
     limits = parse_limits(["lon_decel_max_mps2=4.5", "min_ttc_s = 3"])
     broken = check_limits(followed, limits)
@@ -123,7 +123,7 @@ def test_limits_are_of_all_agents_or_of_the_ego_that_a_policy_drives():
     assert "lon_decel_max_mps2 4.9" in broken[0] or "lon_decel_max_mps2 5" in broken[0]
     assert "min_ttc_s 2.5" in broken[1]
     assert "at least 3" in broken[1]
-    own = replay(hard_braking(), ego=lambda seen: Controls(-3.0, 0.0))
+    own = replay(hard_braking(), ego=lambda seen: Controls(-3.0, 0.0), dt_s=0.02)
     assert check_limits(own, limits) == []
     with pytest.raises(CheckFailed, match="lon_decel_max_mps2"):
         require_strict(followed, limits)

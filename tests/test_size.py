@@ -114,7 +114,8 @@ def test_sizes_that_are_seen_whole_are_kept_and_not_typical_ones(size):
 def test_a_size_that_is_not_seen_is_the_typical_one():
     behind = [(0.0, 0.0, 0.9)] * 12
     shape = static_geometry(measured([(12, 0, 0.0)] * 12, sensors=behind))
-    assert shape.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.1)
+    # Corners are sharp in this world, so that the car seems 3 % wider than the typical one, and is taken to be as much longer.
+    assert shape.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.15)
     assert apart(shape.yaw_rad, 0.0) < np.deg2rad(3)
     assert np.sqrt(shape.covariance[0, 0, 0]) > 3 * np.sqrt(shape.covariance[0, 1, 1])
 
@@ -197,6 +198,32 @@ def test_a_long_car_seen_whole_once_is_long_all_along():
     shape = moving_geometry(measured(states, size), np.full(len(states), np.pi))
     assert shape.size_m[0] == pytest.approx(5.4, abs=0.25)
     assert np.hypot(*(shape.xy_m - np.array(states)[:, :2]).T).max() < 0.35
+
+
+@pytest.mark.parametrize(
+    ("size", "box", "seen_share"),
+    [
+        ((5.4, 1.9, 1.6), (5.2, 1.9, 1.6), 0.6),
+        ((5.4, 1.9, 1.6), (4.6, 1.8, 1.6), 1.0),
+        ((3.4, 1.65, 1.5), (4.4, 1.85, 1.5), 1.0),
+    ],
+)
+def test_a_low_hood_that_no_ray_meets_does_not_make_a_long_car_short(size, box, seen_share):
+    states = oncoming(start_m=15.0)
+    track, yaw = measured(states, size), np.full(len(states), np.pi)
+    rear_m = np.array(states)[:, 0] + size[0] / 2
+    rows = []
+    for k, (x, y, _) in enumerate(states):
+        cluster = track.measurements.cluster[k]
+        behind = cluster[cluster[:, 0] > rear_m[k] - seen_share * size[0]]
+        row = measured_row(behind, ends_visible=(True, True), t_ns=T0_NS + k * STEP_NS)
+        rows.append(
+            replace(
+                row, box_size_m=np.array([box]), box_yaw_rad=np.array([np.pi]), box_center_m=np.array([[x, y, 0.8]])
+            )
+        )
+    shape = moving_geometry(replace(track, measurements=Measurements.join(rows)), yaw)
+    assert shape.size_m[0] == pytest.approx(size[0], abs=0.35)
 
 
 def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():

@@ -61,7 +61,7 @@ def test_bash_completes(words: str, expected: list[str]) -> None:
 def braked_at(wall_m: float, decel: float = 3.0, speed: float = 10.0):
     """An ego at constant speed in the scenario, which a policy brakes, with a parked car ahead."""
     scenario = scenario_of(line("ego", 0.0, speed=speed, duration_s=8.0), parked("wall", wall_m, 0.0))
-    return replay(scenario, ego=lambda seen: Controls(-decel, 0.0))
+    return replay(scenario, ego=lambda seen: Controls(-decel, 0.0), dt_s=0.02)
 
 
 def test_the_figures_of_a_braking_ego_are_those_of_the_closed_form() -> None:

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.slow
 def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
-    log, scene, true = confidence_logs.make_log(1, 8)
+    log, scene, true = confidence_logs.make_log(1, 0)
     detector = confidence_logs.SimulatedDetector(log, scene, true, 3)
     camera, stamp = log.cameras["camera"], int(log.streams["camera"].t_ns[3])
     frame = Frame(camera, stamp, lambda: np.zeros((camera.height_px, camera.width_px, 3), np.uint8))
@@ -24,7 +24,7 @@ def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
     np.testing.assert_array_equal(one.box_px, two.box_px)
     assert len(one)
     assert one.score.min() >= confidence_logs.MIN_SCORE
-    cases = pickle.loads(pickle.dumps(confidence_logs.cases_of(1, 8)))
+    cases = pickle.loads(pickle.dumps(confidence_logs.cases_of(1, 0)))
     agents = [agent for case in cases for agent in fit_confidence.agents_of(case, "one")]
     assert [sum(a.lidar == lidar for a in agents) > 3 for lidar in (True, False)] == [True, True]
     assert all(0 <= a.right <= a.there <= 1 and a.ticks > 0 for a in agents)

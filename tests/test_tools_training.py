@@ -28,12 +28,14 @@ def torch() -> Any:
     return torch
 
 
-def test_a_toy_learns_to_find_riders(tmp_path: Path) -> None:
+def test_a_toy_learns_to_find_riders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half a minute from nothing: centers of riders on fresh scenes are found first; chance finds one in hundreds."""
     import train_lidar
 
-    rounds = [train_lidar.Round(5, 100, 200)]
-    train_lidar.generate("roadside", tmp_path / "data", 100, 5)
+    monkeypatch.setattr(train_lidar, "PER_SHARD", 60)
+    monkeypatch.setitem(train_lidar.CELLS, "roadside", 128)
+    rounds = [train_lidar.Round(5, 60, 240)]
+    train_lidar.generate("roadside", tmp_path / "data", 60, 5)
     train_lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
     train_lidar.finish("roadside", tmp_path, rounds, examples=8)
     card = json.loads((tmp_path / "roadside.json").read_text())
@@ -199,7 +201,7 @@ def test_a_toy_learns_to_name_colors(tmp_path: Path, monkeypatch: pytest.MonkeyP
     import train_colors
 
     monkeypatch.setattr(train_colors, "TRACKS", 60)
-    train_colors.main(tmp_path, worlds=300, steps=120)
+    train_colors.main(tmp_path, worlds=150, steps=100)
     card = json.loads((tmp_path / "colors.json").read_text())
     assert card["simulated"]["top1"] > 0.25
     assert (tmp_path / "colors.onnx").stat().st_size < 160_000

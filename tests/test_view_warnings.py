@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
-from browser import CHROMIUM, DRIVER, Browser, browsing
+from browser import Browser
 from replay_maneuvers import scenario_of
 from test_replay_warnings import crossing_walker, seen, town_ego
 
@@ -42,24 +42,15 @@ def test_the_document_tells_of_warnings_and_of_ends() -> None:
     assert event["brief"].startswith("p: warning at ")
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, str]]:
-    if CHROMIUM is None or DRIVER is None:
-        pytest.skip("no Chromium with a driver")
-    folder, world = tmp_path_factory.mktemp("page"), scene()
-    write_page(world, folder / "w.html", replay=warned(world))
-    with browsing(folder / "profile") as browser:
-        yield browser, f"file://{folder}/w.html"
-
-
-def test_the_page_lists_marks_and_draws_a_warning(page: tuple[Browser, str]) -> None:
-    browser, address = page
-    browser.open(address)
+def test_the_page_lists_marks_and_draws_a_warning(chromium: Browser, tmp_path: Path) -> None:
+    browser, world = chromium, scene()
+    write_page(world, tmp_path / "w.html", replay=warned(world))
+    browser.open(f"file://{tmp_path}/w.html")
     assert browser.run("return document.getElementById('warned-count').textContent") == "1 warning"
     assert browser.run("return document.querySelectorAll('#events .warned').length") == 1
     browser.run("document.querySelector('#warned-agents button').click()")
     assert browser.run("return log2sim.chosen") == "p"
-    begins = warned(scene()).warnings.events[0].begin_s
+    begins = warned(world).warnings.events[0].begin_s
     assert browser.run("return log2sim.time") == pytest.approx(begins)
     assert "braking suffices" in browser.run("return document.getElementById('agent-warning').textContent")
     browser.run("log2sim.choose(null)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any, NoReturn
@@ -62,6 +63,9 @@ for command in (
 
 def main() -> None:
     """Run the command line; every `Log2SimError` becomes one message and its exit code."""
+    # Work is shared by processes, and their matrices are small: threads of OpenBLAS wait for each other. NumPy reads it when it is
+    # first imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with options.tolerating_lost_output(), options.ending_by_signals() as ended, holding_claims():
         _run(ended)
 
