@@ -42,7 +42,7 @@ MUTANTS = (
     ("gaps of tracks", "tracking/tracker.py", "-half_gap_s, noise[one])", "half_gap_s, noise[one])", "track"),
     ("outliers count", "agents/smooth/fixed_interval.py", "problem = replace(problem, weight=weight)", "problem = replace(problem, weight=1 + 0 * weight)", "smooth"),
     ("standing vehicles roll", "agents/smooth/fixed_interval.py", "still = np.isfinite(sigma)", "still = np.isfinite(sigma) & False", "smooth"),
-    ("sizes of whole sides", "agents/size.py", "(1 - PARTIAL_SHARE) * np.exp", "0 * np.exp", "size"),
+    ("sizes of whole sides", "agents/size.py", "(1 - partial) * np.exp", "0 * np.exp", "size"),
     ("persons in one place", "agents/judge.py", "< SAME_PERSON_M", "< 0 * SAME_PERSON_M", "plausibility_conflicts"),
     ("front and back", "agents/heading.py", "(0.0 if known > 0 else np.pi)", "(0.0 if known < 0 else np.pi)", "heading"),
     ("anti-windup", "simulation/reference.py", "(given == asked) | (error * wanted <= 0)", "(given == given)", "replay_follow"),

@@ -193,9 +193,10 @@ MIN_STATIC_POINTS = 5
 WHOLE_SIDE_SIGMA_M = 0.15
 # Scale of the sizes about the expected ones, as a share of what the limits of their category make of it; degrees of freedom: there
 # are small cars and long ones, and detectors find neither; chance that an end of a side is missing which seems to be seen from end
-# to end, such as a low hood. On 110 simulated logs .1 to 1.1 (lengths of cars .5), 4 to 10, and .3 (.65 where points are few);
-# spreads of .35 to .7, freedoms of 2 to 30 and chances of .2 to .5 change the share of wrong sizes by less than .01 there.
-SIZE_SPREAD, SIZE_FREEDOM, PARTIAL_SHARE = 0.5, 4.0, 0.35
+# to end, such as a low hood, which trucks and buses lack. On 110 simulated logs .1 to 1.1 (lengths of cars .5), 4 to 10, .3 (.65
+# where points are few) and .1; spreads of .35 to .7, freedoms of 2 to 30 and chances of .2 to .5 change the share of wrong sizes
+# by less than .01 there.
+SIZE_SPREAD, SIZE_FREEDOM, PARTIAL_SHARE, BOX_PARTIAL_SHARE = 0.5, 4.0, 0.35, 0.1
 # Relative error of the length of a car by that of its width, which is seen more often. Of the cars there it is 1.9; half of it is
 # left beside the errors of observed widths.
 LENGTH_PER_WIDTH = 1.0
@@ -320,14 +321,13 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
     least = np.quantile(ends.high - ends.low, SIZE_QUANTILE, axis=0)
     # What is shorter than a part that was seen at other times was not seen from end to end.
     used = whole & (seen + 2 * np.sqrt(variance) >= least)
-    size = expected.copy()
+    size, partial = expected.copy(), BOX_PARTIAL_SHARE if category in BOXES else PARTIAL_SHARE
     for axis in np.flatnonzero(used.any(axis=0))[::-1]:  # the width first
         sides, error = seen[used[:, axis], axis], variance[used[:, axis], axis]
         observed = weighted_quantile(sides, 1.0 / error, WHOLE_SIDE_QUANTILE)
         error_of_all = error.min() / independent(len(sides))
-        size[axis] = _posterior_side(
-            expected[axis], spread[axis], observed, error_of_all, (smallest[axis], largest[axis])
-        )
+        side = np.geomspace(smallest[axis], largest[axis], POSSIBLE_SIDES)
+        size[axis] = _posterior_median(side, expected[axis], spread[axis], observed, error_of_all, partial)
         if axis == 1 and category == "car":
             expected[0] = size[0] = min(expected[0] * (size[1] / expected[1]) ** LENGTH_PER_WIDTH, largest[0])
     # What lies between two rays is no evidence.
@@ -346,21 +346,19 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
     return np.clip(np.maximum(size, least), smallest, largest), is_likely
 
 
-def _posterior_side(
-    expected_m: float, spread: float, observed_m: float, variance_m2: float, limits_m: tuple[float, float]
+def _posterior_median(
+    side_m: Array, expected_m: float, spread: float, observed_m: float, variance_m2: float, partial: float
 ) -> float:
-    """Return the median of the length of a side after it was observed, m.
+    """Return the median of the possible lengths `side_m` (k,) of a side after it was observed, m.
 
     The logarithm of the length is distributed about that of `expected_m` by Student's t with a scale of `spread`. With a chance of
-    `PARTIAL_SHARE` any part of the side may have been observed, else all of it with an error of `variance_m2`.
+    `partial` any part of the side may have been observed, else all of it with an error of `variance_m2`.
     """
-    side = np.geomspace(*limits_m, POSSIBLE_SIDES)
-    prior = (1 + (np.log(side / expected_m) / spread) ** 2 / SIZE_FREEDOM) ** (-(SIZE_FREEDOM + 1) / 2)
-    apart = (observed_m - side) ** 2 / variance_m2
-    whole = (1 - PARTIAL_SHARE) * np.exp(-apart / 2) / np.sqrt(2 * np.pi * variance_m2)
-    weight = prior * (whole + PARTIAL_SHARE * (side > observed_m) / side)
-    below = np.cumsum(weight) - weight / 2
-    return float(np.interp(weight.sum() / 2, below, side))
+    prior = (1 + (np.log(side_m / expected_m) / spread) ** 2 / SIZE_FREEDOM) ** (-(SIZE_FREEDOM + 1) / 2)
+    apart = (observed_m - side_m) ** 2 / variance_m2
+    whole = (1 - partial) * np.exp(-apart / 2) / np.sqrt(2 * np.pi * variance_m2)
+    weight = prior * (whole + partial * (side_m > observed_m) / side_m)
+    return float(np.interp(weight.sum() / 2, np.cumsum(weight) - weight / 2, side_m))
 
 
 def _height(track: Track) -> tuple[float, Array]:
