@@ -214,7 +214,7 @@ def test_points_of_the_cloud_lie_on_what_the_picture_shows(seed: int, mount: str
 def test_boxes_in_space_project_into_boxes_in_the_picture(
     tmp_path: Path, mount: Literal["vehicle", "roadside"]
 ) -> None:
-    write_traffic(TrafficSettings(mount, 2, 5, light="overcast", weather="clear"), tmp_path)
+    write_traffic(TrafficSettings(mount, 3, 5, light="overcast", weather="clear"), tmp_path)
     log = open_log(tmp_path)
     labels, seen, fills = log.labels, log.image_labels["image_02"], []
     size_px = np.array([log.cameras["image_02"].width_px, log.cameras["image_02"].height_px] * 2)
