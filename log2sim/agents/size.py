@@ -191,15 +191,12 @@ WHOLE_SIDE_QUANTILE = 0.7
 MIN_STATIC_POINTS = 5
 # Standard deviation of a side observed from end to end: stray points lengthen it, gaps between rays shorten it.
 WHOLE_SIDE_SIGMA_M = 0.15
-# Scale of the sizes about the expected ones, as a share of what the limits of their category make of it; degrees of freedom: there
-# are small cars and long ones, and detectors find neither; chance that an end of a side is missing which seems to be seen from end
-# to end, such as a low hood, which trucks and buses lack. On 110 simulated logs .1 to 1.1 (lengths of cars .5), 4 to 10, .3 (.65
-# where points are few) and .1; spreads of .35 to .7, freedoms of 2 to 30 and chances of .2 to .5 change the share of wrong sizes
-# by less than .01 there.
+# Scale of the logarithms of sizes about the expected ones, as a share of what the limits of their category make of it; degrees of
+# freedom, as detectors estimate neither small cars nor long ones; probability that only a part of a side was observed though both
+# ends seem to be, as a low hood gives no points, which trucks and buses lack. On 110 simulated logs .1 to 1.1 (lengths of cars .5),
+# 4 to 10, .3 (.65 where points are few) and .1. Spreads of .35 to .7, freedoms of 2 to 30 and probabilities of .2 to .5 change the
+# share of wrong sizes by less than .01 there.
 SIZE_SPREAD, SIZE_FREEDOM, PARTIAL_SHARE, BOX_PARTIAL_SHARE = 0.5, 4.0, 0.35, 0.1
-# Relative error of the length of a car by that of its width, which is seen more often. Of the cars there it is 1.9; half of it is
-# left beside the errors of observed widths.
-LENGTH_PER_WIDTH = 1.0
 POSSIBLE_SIDES = 96  # lengths between the smallest and the largest that are compared: 1 to 2 % apart
 # Directive 96/53/EC, Annex I: 2.55 m, refrigerated vehicles 2.6 m; the United States allow 102 inches. What is beyond are mirrors.
 MAX_ROAD_WIDTH_M = 2.6
@@ -306,8 +303,8 @@ def _is_likely_height(size_m: Array, height_m: float, category: str) -> bool:
 def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Array, bool]:
     """Estimate length and width (2,) from the ends in n views, and whether they are likely.
 
-    What seems to be seen from end to end is weighed against what is expected, `known` (3,) from a 3D detector or typical of the
-    category. A side that was never seen so is as long as expected, or as the longest part that was seen.
+    What seems to be observed from end to end is weighed against what is expected, `known` (3,) from a 3D detector or typical of the
+    category. A side that never was is as long as expected, or as the longest part that was observed.
     """
     typical = np.array(TYPICAL_SIZE_M[category][:2])
     smallest, limit = (np.array(t[category][:2]) for t in (MIN_SIZE_M, MAX_SIZE_M))
@@ -326,10 +323,18 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
         sides, error = seen[used[:, axis], axis], variance[used[:, axis], axis]
         observed = weighted_quantile(sides, 1.0 / error, WHOLE_SIDE_QUANTILE)
         error_of_all = error.min() / independent(len(sides))
+        # The logarithm of the length is distributed about the expected one by Student's t. Any part of the side may have been observed,
+        # else all of it. The median of what that leaves of possible lengths, m.
         side = np.geomspace(smallest[axis], largest[axis], POSSIBLE_SIDES)
-        size[axis] = _posterior_median(side, expected[axis], spread[axis], observed, error_of_all, partial)
+        log_ratio = np.log(side / expected[axis]) / spread[axis]
+        prior = (1 + log_ratio**2 / SIZE_FREEDOM) ** (-(SIZE_FREEDOM + 1) / 2)
+        squared = (observed - side) ** 2 / error_of_all
+        likelihood = (1 - partial) * np.exp(-squared / 2) / np.sqrt(2 * np.pi * error_of_all)
+        weight = prior * (likelihood + partial * (side > observed) / side)
+        size[axis] = np.interp(weight.sum() / 2, np.cumsum(weight) - weight / 2, side)
         if axis == 1 and category == "car":
-            expected[0] = size[0] = min(expected[0] * (size[1] / expected[1]) ** LENGTH_PER_WIDTH, largest[0])
+            # Wider cars are longer, by 1.9 % for each percent of those in the simulated logs; of observed widths, which err, half is left.
+            expected[0] = size[0] = min(expected[0] * (size[1] / expected[1]), largest[0])
     # What lies between two rays is no evidence.
     between = np.where(ends.real == boxes.SIDE_END, ends.gap_m / 2, 0.0).sum(axis=2)
     sides = np.maximum(expected, least)
@@ -338,27 +343,11 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
     is_likely, body_m = bool((sides <= limit).all()), CATEGORY[category].min_seen_m
     if body_m is None:
         is_likely = is_likely and bool((sides >= smallest).all())
-    elif (
-        whole.any()
-    ):  # the longer of the sides that were seen, with half the gaps beside them, is no less than a body's
+    elif whole.any():
+        # The longer of the sides that were observed, with half the gaps beside them, is no less than a body's.
         most = [np.quantile(seen[whole[:, a], a], SIZE_QUANTILE) for a in range(2) if whole[:, a].any()]
         is_likely = is_likely and bool(max(most) >= body_m)
     return np.clip(np.maximum(size, least), smallest, largest), is_likely
-
-
-def _posterior_median(
-    side_m: Array, expected_m: float, spread: float, observed_m: float, variance_m2: float, partial: float
-) -> float:
-    """Return the median of the possible lengths `side_m` (k,) of a side after it was observed, m.
-
-    The logarithm of the length is distributed about that of `expected_m` by Student's t with a scale of `spread`. With a chance of
-    `partial` any part of the side may have been observed, else all of it with an error of `variance_m2`.
-    """
-    prior = (1 + (np.log(side_m / expected_m) / spread) ** 2 / SIZE_FREEDOM) ** (-(SIZE_FREEDOM + 1) / 2)
-    apart = (observed_m - side_m) ** 2 / variance_m2
-    whole = (1 - partial) * np.exp(-apart / 2) / np.sqrt(2 * np.pi * variance_m2)
-    weight = prior * (whole + partial * (side_m > observed_m) / side_m)
-    return float(np.interp(weight.sum() / 2, np.cumsum(weight) - weight / 2, side_m))
 
 
 def _height(track: Track) -> tuple[float, Array]:

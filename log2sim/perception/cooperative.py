@@ -75,13 +75,13 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
 
 # Fewer points are too far apart to say where a side ends: in random scenes they made boxes worse.
 MIN_REFINED_POINTS = 20
-# Corners of bodies are rounded, and the last ray on a side falls short of its end: in 30 random scenes outermost points were so
-# much less apart than a vehicle is long, and that by 0.06 m more or less.
+# Corners of bodies are rounded, and the last ray on a side falls short of its end: in 30 random scenes the distance of the outermost
+# points was less than the length of the vehicle by so much, with a standard deviation of 0.06 m.
 ROUNDED_M = 0.15
-# Networks guess the length of a vehicle better: where points say otherwise, a part of it was not seen.
+# Networks guess the length of a vehicle better: where points say otherwise, a part of it was not observed.
 MAX_LENGTH_SHARE = 0.25
-# Sides that are seen under a flatter angle have too few points; of some bodies few rays come back, and chance says from where:
-# in random scenes two lengths were a meter too short with some 100 points, and those with 150 and more mostly right.
+# Sides at a flatter angle (sine) have too few points; some bodies return few rays, and not from their ends: in random scenes two
+# lengths were a meter too short with some 100 points, and those with 150 and more mostly right. Not varied one by one.
 MIN_FACING, MIN_WHOLE_POINTS = 0.2, 150
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
@@ -90,7 +90,7 @@ MOVED_M = 0.3
 def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     """Move and turn boxes (M,) to the sides that points of a viewpoint show; they grow to hold them.
 
-    A vehicle of which a flank is seen, and rays pass both ends of what is seen, is as long as that: a network's guess would be
+    A vehicle whose flank is observed, with rays that pass both of its ends, is as long as its points: the network's estimate would be
     wrong for all viewpoints alike.
     """
     mine = np.flatnonzero(boxes.points >= MIN_REFINED_POINTS)
@@ -111,7 +111,7 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
         & (beyond[:, 1] > MIN_FACING * np.hypot(*sensor.T))
         & (np.abs(length / boxes.size_m[mine, 0] - 1) <= MAX_LENGTH_SHARE)
     )
-    # The middle of the points; only the far end is round where the near one is seen from ahead.
+    # The middle of the points; where the near end faces the sensor, only the far one is round.
     middle = sensor[:, 0] + np.where(turned, -1.0, 1.0) * (rows.low_m + rows.high_m)[:, 0] / 2
     toward = middle - np.where(beyond[:, 0] > 0, np.sign(sensor[:, 0]) * ROUNDED_M / 2, 0.0)
     axis = np.column_stack([np.cos(yaw[mine]), np.sin(yaw[mine])])

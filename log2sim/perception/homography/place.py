@@ -1,4 +1,4 @@
-"""Places of obstacles without LiDAR points: where something of a usual size stands whose image is in a box."""
+"""Places of obstacles without LiDAR points: where an object of typical size is whose image fills a box."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def place_obstacle(
 ) -> tuple[Array, Array] | None:
     """Place an obstacle by the box (4,) around its image: a cuboid that the edges of the box touch.
 
-    `ground_H_image`: (3, 3), of `homography_covariance` (9, 9), None for 0. `category`: its usual sizes are used.
+    `ground_H_image`: (3, 3), of `homography_covariance` (9, 9), None for 0. `category`: its typical sizes are used.
     `base_T_cam`: (4, 4): pose of the camera in the frame of the ground positions, m. `edge_sigma_px`: (4,): standard deviations
     of the left, upper, right and lower edge of the box, infinite where it ends with the image; None for those of an obstacle in sight.
 
@@ -50,8 +50,8 @@ def place_obstacle(
     origin = base_T_cam[:2, 3]
     range_m = float(np.hypot(*(foot - origin)))
     edge_px = np.full(4, FOOT_SIGMA_PX) if edge_sigma_px is None else edge_sigma_px
-    seen = np.isfinite(edge_px)
-    if not seen[BOTTOM] or not (seen[LEFT] or seen[RIGHT]) or not below.all() or range_m > MAX_RANGE_M:
+    visible = np.isfinite(edge_px)
+    if not visible[BOTTOM] or not (visible[LEFT] or visible[RIGHT]) or not below.all() or range_m > MAX_RANGE_M:
         return None
     by_px = homography_jacobian(ground_H_image, uv[None])[0]
     typical = np.array(TYPICAL_SIZE_M[category])
@@ -62,7 +62,7 @@ def place_obstacle(
     rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(camera.K).T @ base_T_cam[:3, :3].T
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
     for edge, ground, turn, corner in ((LEFT, left, 1.0, 0), (RIGHT, right, -1.0, 1)):
-        if not seen[edge]:
+        if not visible[edge]:
             continue
         # A camera that looks down sees uprights lean: any height may be that of the side.
         lean = float(wrap_angle(bearing[corner + 2] - bearing[corner]))
@@ -81,7 +81,7 @@ def place_obstacle(
     spanned_m = spanned_height_m(ground_H_image, camera, box_px, base_T_cam)
     above_m = -range_m * float(rays[:2, 2].sum() / np.hypot(rays[:2, 0], rays[:2, 1]).sum())
     # Seen from above, the upper edge is that of the far side.
-    if seen[TOP] and spanned_m > 0 and above_m < typical[2] + size_sigma[2]:
+    if visible[TOP] and spanned_m > 0 and above_m < typical[2] + size_sigma[2]:
         relative = np.hypot(
             size_sigma[2] / typical[2], np.hypot(edge_px[TOP], edge_px[BOTTOM]) / (box_px[3] - box_px[1])
         )
@@ -102,8 +102,8 @@ def place_obstacle(
     weights = np.exp(log - log.max())
     weights /= weights.sum()
     mean = weights @ center
-    apart = center - mean
-    total = np.einsum("y,yij->ij", weights, covariance) + np.einsum("y,yi,yj->ij", weights, apart, apart)
+    offset = center - mean
+    total = np.einsum("y,yij->ij", weights, covariance) + np.einsum("y,yi,yj->ij", weights, offset, offset)
     # Errors of edges that do not fit to each other are larger than they say (Birge, 1932).
     if len(rows) > 2:
         total *= max(1.0, float(squared.min()) / (len(rows) - 2))
