@@ -16,7 +16,6 @@ from log2sim.datatypes import Boxes3D, Measurements
 from log2sim.evaluation.detection.detect_log import drop_ego
 from log2sim.geometry import wrap_angle
 from log2sim.perception.cooperative import (
-    ROUNDED_M,
     SeenBoxes,
     align_parts,
     match_by_covariance,
@@ -257,7 +256,7 @@ def test_sides_of_boxes_in_the_points_of_both_ends_are_where_those_who_see_them_
 @pytest.mark.parametrize("sensor", [[0.5, -12.0, 2.0], [12.0, -9.0, 2.0], [-12.0, 9.0, 2.0]])
 def test_a_flank_that_is_seen_from_end_to_end_says_how_long_a_vehicle_is(yaw, sensor) -> None:
     # What the sensor sees of a car of 4.5 m with rounded corners, and a wall behind it all around; the network takes it for 5.2 m.
-    outline = outline_points(0.0, 0.0, length=4.5 - ROUNDED_M, step=0.05)
+    outline = outline_points(0.0, 0.0, length=4.35, step=0.05)
     towards = np.sign(sensor[:2])
     seen_by = outline[
         (outline[:, 1] * towards[1] > 0.85) | ((outline[:, 0] * towards[0] > 2.1) & (abs(sensor[0]) > 2.5))

@@ -23,7 +23,7 @@ from log2sim.config import Config
 from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
-from log2sim.perception.boxes import oriented_covariance, rotate
+from log2sim.perception.boxes import corner_correction, oriented_covariance, real_ends, rotate
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
@@ -75,14 +75,11 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
 
 # Fewer points are too far apart to say where a side ends: in random scenes they made boxes worse.
 MIN_REFINED_POINTS = 20
-# Corners of bodies are rounded, and the last ray on a side falls short of its end: in 30 random scenes the distance of the outermost
-# points was less than the length of the vehicle by so much, with a standard deviation of 0.06 m.
-ROUNDED_M = 0.15
 # Networks guess the length of a vehicle better: where points say otherwise, a part of it was not observed.
 MAX_LENGTH_SHARE = 0.25
-# Sides at a flatter angle (sine) have too few points; some bodies return few rays, and not from their ends: in random scenes two
-# lengths were a meter too short with some 100 points, and those with 150 and more mostly right. Not varied one by one.
-MIN_FACING, MIN_WHOLE_POINTS = 0.2, 150
+# Some bodies return few rays, and not from their ends: in random scenes two lengths were a meter too short with some 100 points, and
+# those with 150 and more mostly right. Not varied one by one.
+MIN_WHOLE_POINTS = 150
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
 
@@ -102,19 +99,18 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     center[mine, :2] = rows.center_m[:, :2]
     shown_m = rows.high_m - rows.low_m
     size[mine, :2] = np.fmax(size[mine, :2], shown_m)
-    length, sensor = shown_m[:, 0] + ROUNDED_M, rotate(rows.sensor_m[:, :2] - center[mine, :2], -yaw[mine])
-    beyond = np.abs(sensor) - size[mine, :2] / 2
+    real = real_ends(rows.low_m, rows.high_m, np.zeros(2), rows.ends_visible)
+    low, high = corner_correction(rows.low_m, rows.high_m, real, size[mine, 1])
+    length = (high - low)[:, 0]
     is_whole = (
         (_groups(boxes.take(mine)) == "vehicle")
-        & rows.ends_visible.all(axis=1)
+        & real[:, 0].all(axis=1)
         & (rows.points >= MIN_WHOLE_POINTS)
-        & (beyond[:, 1] > MIN_FACING * np.hypot(*sensor.T))
         & (np.abs(length / boxes.size_m[mine, 0] - 1) <= MAX_LENGTH_SHARE)
     )
-    # The middle of the points; where the near end faces the sensor, only the far one is round.
-    middle = sensor[:, 0] + np.where(turned, -1.0, 1.0) * (rows.low_m + rows.high_m)[:, 0] / 2
-    toward = middle - np.where(beyond[:, 0] > 0, np.sign(sensor[:, 0]) * ROUNDED_M / 2, 0.0)
-    axis = np.column_stack([np.cos(yaw[mine]), np.sin(yaw[mine])])
+    # Along its length to the middle of what is observed.
+    axis = np.column_stack([np.cos(rows.yaw_rad), np.sin(rows.yaw_rad)])
+    toward = (low + high)[:, 0] / 2 - ((rows.center_m - rows.sensor_m)[:, :2] * axis).sum(axis=1)
     center[mine, :2] += np.where(is_whole, toward, 0.0)[:, None] * axis
     size[mine, 0] = np.where(is_whole, length, size[mine, 0])
     return replace(boxes, center_m=center, size_m=size, yaw_rad=yaw)
