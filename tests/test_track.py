@@ -332,6 +332,15 @@ def test_what_was_measured_before_and_after_its_tick_is_placed_where_it_was_then
     assert speed == pytest.approx(20.0, abs=0.3)
 
 
+def test_a_short_track_whose_stamps_run_backward_is_not_its_own_continuation() -> None:
+    # Two ticks share a sweep, and in the second one a camera sees the object 0.2 ms earlier; beside it is a track of all ticks.
+    t_ns = stamps(10)
+    found = [seen(np.array([[0.0, 0.0]]), t_ns[k], "always") for k in range(10)]
+    for k, late_ns in ((4, 9_321_000), (5, 9_142_000)):
+        found[k] = seen(np.array([[0.0, 0.0], [30.0, 0.0]]), np.array([t_ns[k], t_ns[4] + late_ns]), ["always", "twice"])
+    assert names_of(track(found, t_ns, **OPTIONS | {"min_life_s": 0.2})) == [["always"], ["twice"]]
+
+
 def test_order_of_rows_time_and_map_offsets_change_nothing() -> None:
     ways = {"a": line(0, 0, 12, 0), "b": line(60, 3.5, -14, 0), "c": line(20, -8, 0, 0)}
     found, t_ns = record(ways, 40, hidden={"a": (15, 30)})
