@@ -10,7 +10,7 @@ import numpy as np
 
 from log2sim.agents import estimate
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.evidence import Recording
+from log2sim.agents.evidence import Recording, clutter_nats
 from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import extend_static, judge
 from log2sim.config import Config
@@ -125,12 +125,15 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         )  # fmt: skip
         tracks = mark_unrecorded(tracks, observations.recorded(schedule))
     with clock.stage("smooth", run.progress):
-        candidates = estimate.estimate_agents(tracks, obstacles, timeline, smooth=config.smooth.enabled, jobs=run.jobs)
+        clutter = clutter_nats(tracks)
+        candidates = estimate.estimate_agents(
+            tracks, obstacles, timeline, smooth=config.smooth.enabled, clutter=clutter, jobs=run.jobs
+        )
         candidates = decide_headings(candidates, estimate.ego_path(log, schedule), timeline)
         ego = estimate.ego_agent(log, timeline, run.poses.origin)
     with clock.stage("judge", run.progress):
         searched = schedule.drop_frames(observations.unseen)
-        judged = judge(candidates, ego, Recording(log, searched, obstacles, timeline), jobs=run.jobs)
+        judged = judge(candidates, ego, Recording(log, searched, obstacles, timeline), clutter=clutter, jobs=run.jobs)
         agents = [
             estimate.with_observers(c, estimate.with_pose_errors(c.agent, log, timeline), timeline) for c in judged
         ]

@@ -66,7 +66,7 @@ def test_every_weight_has_the_sign_of_its_reason():
     st.booleans(),
 )
 def test_more_of_a_good_reason_never_lowers_a_confidence(values, name, more, lidar):
-    table = {"bias": np.ones(2)} | {n: np.full(2, v) for n, v in zip(SIGNS, values)}
+    table = {"bias": np.ones(2), "confirmed": np.ones(2)} | {n: np.full(2, v) for n, v in zip(SIGNS, values)}
     table[name] = table[name] + np.array([0.0, SIGNS[name] * more])
     there, right = probabilities(table, lidar=lidar)
     assert there[0] <= there[1]

@@ -10,11 +10,22 @@ from test_plausibility_conflicts import agent, candidate
 from worlds import rows_at
 
 from log2sim.agents.candidate import Timeline
-from log2sim.agents.evidence import SIGNS, Recording, continued, gather, may_suffice, missing_nats, remaining
-from log2sim.agents.judge import MIN_THERE, decide
+from log2sim.agents.evidence import (
+    MIN_THERE,
+    SIGNS,
+    Recording,
+    clutter_nats,
+    continued,
+    gather,
+    may_suffice,
+    missing_nats,
+    remaining,
+)
+from log2sim.agents.judge import decide, probabilities
 from log2sim.agents.rays import Ending, classify_rays, count_rays
 from log2sim.agents.size import static_geometry
 from log2sim.datatypes import AgentTable, Log, Obstacles, Rays, Track
+from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.geometry import NS_PER_S
 from log2sim.perception.sync import Schedule
 
@@ -101,30 +112,56 @@ def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
     row = dict.fromkeys((*SIGNS, "pointless", "shown_ticks", "image_ticks"), 0.0) | {"confirmed": 1.0}
     assert decide(agent(5.0), row, MIN_THERE[True] - 0.01, lidar=True) is None
     assert decide(agent(5.0), row, MIN_THERE[True], lidar=True) == []
-    assert decide(agent(5.0), row | {"confirmed": 0.0}, 0.9, lidar=True) is None
+    assert decide(agent(5.0), row | {"confirmed": 0.0}, 0.9, lidar=True) == []
+    assert decide(agent(5.0), row | {"confirmed": 0.0}, 0.9, lidar=False) is None
     (doubt,) = decide(agent(5.0), row | {"through": np.log(10)}, 0.9, lidar=True)
     assert (doubt.kind, doubt.values["through_share"]) == ("empty", pytest.approx(0.9))
 
 
+def person(score: float, in_sweeps: bool, way_m: float = 0.0) -> Track:
+    found = rows_at(
+        np.outer(np.linspace(0, way_m, 5), [1.0, 0.0]), "pedestrian", score=score, camera="" if in_sweeps else "front"
+    )
+    return Track(
+        "pedestrian",
+        np.arange(5),
+        replace(found, t_ns=TIMELINE.t_ns, box_yaw_rad=np.full(5, 0.0 if in_sweeps else np.nan)),
+    )
+
+
 @pytest.mark.parametrize(
-    ("way_m", "score", "in_sweeps", "may", "confirmed"),
+    ("way_m", "score", "in_sweeps", "may", "may_in_clutter", "confirmed"),
     [
-        (0.0, 0.8, True, True, True), (0.0, 0.5, True, False, False), (1.5, 0.45, True, True, False), (1.5, 0.1, True, False, False),
-        (8.0, 0.45, True, True, True), (8.0, 0.45, False, True, False), (8.0, 0.2, False, False, False),
+        (0.0, 0.8, True, True, True, True), (0.0, 0.5, True, True, False, False), (1.5, 0.45, True, True, True, False),
+        (1.5, 0.1, True, False, False, False), (0.0, 0.02, True, False, False, False), (8.0, 0.45, True, True, True, True),
+        (8.0, 0.45, False, True, True, False), (8.0, 0.2, False, False, False, False),
     ],
 )  # fmt: skip
-def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(way_m, score, in_sweeps, may, confirmed):
-    found = rows_at(np.zeros((5, 2)), "pedestrian", score=score, camera="" if in_sweeps else "front")
-    found = replace(found, t_ns=TIMELINE.t_ns, box_yaw_rad=np.full(5, 0.0 if in_sweeps else np.nan))
-    track = Track("pedestrian", np.arange(5), found)
-    person = agent(20.0, category="pedestrian", size=(0.6, 0.6, 1.7), speed=way_m / 4)
-    seen = replace(candidate(person), track=track, geometry=static_geometry(track))
+def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(
+    way_m, score, in_sweeps, may, may_in_clutter, confirmed
+):
+    track = person(score, in_sweeps)
+    walking = agent(20.0, category="pedestrian", size=(0.6, 0.6, 1.7), speed=way_m / 4)
+    seen = replace(candidate(walking), track=track, geometry=static_geometry(track))
     recording = Recording(
         Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
     )
     assert gather([seen], recording)["confirmed"] == [confirmed]
-    on = replace(found, center_m=found.center_m + np.outer(np.linspace(0, way_m, 5), [1.0, 0.0, 0.0]))
-    assert may_suffice(replace(track, measurements=on), static=way_m == 0) == may
+    on = person(score, in_sweeps, way_m)
+    assert [may_suffice(on, static=way_m == 0, clutter=nats) for nats in (0.0, 3.0)] == [may, may_in_clutter]
+
+
+def test_where_most_is_detected_weakly_the_weak_ones_are_clutter_and_the_sure_ones_stay_what_they_are():
+    sure, weak = person(0.8, True), person(0.4, True)
+    assert clutter_nats([]) == clutter_nats([sure] * 9) == clutter_nats([sure] * 30 + [weak] * 20) == 0
+    # Of 100 weak ones some four are to be expected beside ten sure ones: one in twenty, where it is half of them elsewhere.
+    assert clutter_nats([sure] * 10 + [weak] * 100) == pytest.approx(np.log(20), abs=0.3)
+    nats = [clutter_nats([sure] * n + [weak] * 60) for n in range(0, 200, 5)]
+    assert np.diff(nats).max() <= 0 < nats[0]
+    # Sums of evidence, with and without.
+    table = dict.fromkeys((*SIGNS, "bias"), np.array([1.0, 1.0])) | {"confirmed": np.array([1.0, 0.0])}
+    before, after = (log_odds_of(probabilities(table, lidar=True, clutter=n)[0]) for n in (0.0, 1.5))
+    assert before - after == pytest.approx([0.0, 1.5])
 
 
 VAN, BACK, CORNER = (9.8, -3.0, 3.0, 2.5), (17.8, -0.9, 0.9, 1.5), (17.8, 0.4, 0.9, 1.5)

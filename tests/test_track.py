@@ -337,7 +337,9 @@ def test_a_short_track_whose_stamps_run_backward_is_not_its_own_continuation() -
     t_ns = stamps(10)
     found = [seen(np.array([[0.0, 0.0]]), t_ns[k], "always") for k in range(10)]
     for k, late_ns in ((4, 9_321_000), (5, 9_142_000)):
-        found[k] = seen(np.array([[0.0, 0.0], [30.0, 0.0]]), np.array([t_ns[k], t_ns[4] + late_ns]), ["always", "twice"])
+        found[k] = seen(
+            np.array([[0.0, 0.0], [30.0, 0.0]]), np.array([t_ns[k], t_ns[4] + late_ns]), ["always", "twice"]
+        )
     assert names_of(track(found, t_ns, **OPTIONS | {"min_life_s": 0.2})) == [["always"], ["twice"]]
 
 

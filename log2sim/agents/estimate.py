@@ -35,17 +35,29 @@ from log2sim.tracking.forward import MAX_MISSES
 
 
 def estimate_agents(
-    tracks: Sequence[Track], obstacles: Sequence[Obstacles | None], timeline: Timeline, *, smooth: bool, jobs: int = 1
+    tracks: Sequence[Track],
+    obstacles: Sequence[Obstacles | None],
+    timeline: Timeline,
+    *,
+    smooth: bool,
+    clutter: float = 0.0,
+    jobs: int = 1,
 ) -> list[AgentCandidate]:
     """Make a candidate of every object that the tracks show and that may suffice (`may_suffice`), moving ones first.
 
-    `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed. `jobs`: processes that
+    `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed. `clutter`: from
+    `evidence.clutter_nats`. `jobs`: processes that
     share the tracks; the result is the same for any number.
     """
 
     def estimate(numbers: Sequence[int]) -> list[tuple[int, AgentCandidate]]:
         """Make the candidates of some tracks, with the number of each one's track; its measurements stay in this process."""
-        parts = [(k, p) for k in numbers for p in explain_track(tracks[k]) if may_suffice(p.track, static=p.static)]
+        parts = [
+            (k, p)
+            for k in numbers
+            for p in explain_track(tracks[k])
+            if may_suffice(p.track, static=p.static, clutter=clutter)
+        ]
         moving = [(k, moving_candidate(p.track, obstacles, timeline, smooth=smooth)) for k, p in parts if not p.static]
         standing = static_candidates([p for _, p in parts if p.static], obstacles, timeline)
         found = [*moving, *zip((k for k, p in parts if p.static), standing)]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents, spans_of
-from log2sim.agents.evidence import MIN_TICK_RAYS, Recording, Table, gather
+from log2sim.agents.evidence import MIN_THERE, MIN_TICK_RAYS, Recording, Table, gather
 from log2sim.agents.rays import count_at
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
 from log2sim.agents.weights import RIGHT, THERE, VARIANCES
@@ -228,25 +228,27 @@ def extend_static(
     return out[: len(agents)]
 
 
-# What was detected well enough is dropped where it is rather not there. Without a LiDAR, what is not there is mostly placed wrong,
-# which is for doubts.
-MIN_THERE = {True: 0.5, False: 0.25}
 # A reason that makes an agent e times less likely is told.
 DOUBT_NATS = 1.0
 SAME_M = 0.005  # rounding
 
 
 def judge(
-    candidates: Sequence[AgentCandidate], ego: Agent | None, recording: Recording, *, jobs: int = 1
+    candidates: Sequence[AgentCandidate],
+    ego: Agent | None,
+    recording: Recording,
+    *,
+    clutter: float = 0.0,
+    jobs: int = 1,
 ) -> list[AgentCandidate]:
     """Keep the candidates that are there and can be true together, each named, with its confidence and what speaks against it.
 
-    At the place of the `ego` there is no other agent. `jobs`: processes that share the candidates; the result is the same for any
-    number.
+    At the place of the `ego` there is no other agent. `clutter`: from `evidence.clutter_nats`. `jobs`: processes that share the
+    candidates; the result is the same for any number.
     """
     t_s, lidar = recording.t_s, bool(recording.log.lidars)
     table = gather(candidates, recording, jobs)
-    there, right = probabilities(table, lidar=lidar)
+    there, right = probabilities(table, lidar=lidar, clutter=clutter)
     kept = [
         _rated(c.doubted(doubts), float(right[k]), recording.timeline)
         for k, c in enumerate(candidates)
@@ -258,8 +260,10 @@ def judge(
     return [c.doubted(found) for c, found in zip(named, conflict_doubts(named, ego, t_s))]
 
 
-def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
+def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[Array, Array]:
     """Return the probabilities (C,) that something is where each candidate is, and that the candidate is right.
+
+    `clutter`: nats by which those whose detections alone do not make them likely are less likely in this log than in others.
 
     Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
     speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
@@ -267,9 +271,9 @@ def probabilities(table: Table, *, lidar: bool) -> tuple[Array, Array]:
     is rather wrong; without one, nothing has points, and what images say of the distance counts instead: each case has its weights.
     """
     there, state = (
-        probability_of(np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0))
-        for weights in (THERE, RIGHT)
+        np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0) for weights in (THERE, RIGHT)
     )
+    there, state = probability_of(there - clutter * (table["confirmed"] == 0)), probability_of(state)
     return there, np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY)
 
 
@@ -278,7 +282,7 @@ def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: 
 
     `evidence`: its row of the table. `there`: probability that something is there, from `probabilities`.
     """
-    if not evidence["confirmed"] or there < MIN_THERE[lidar]:
+    if there < MIN_THERE[lidar] or not (lidar or evidence["confirmed"]):
         return None
     counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
     weights = THERE[lidar]

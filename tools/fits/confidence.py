@@ -85,7 +85,7 @@ def agents_of(case: Case, log: str) -> list[Rated]:
         patch.object(judging, "MIN_THERE", {True: 0.0, False: 0.0}),
         patch.object(judging, "gather", keep_table),
         patch.object(pipeline, "judge", keep_candidates),
-        patch.object(estimate, "may_suffice", lambda track, static: True),
+        patch.object(estimate, "may_suffice", lambda track, static, clutter: True),
     ):
         try:
             scenario = case.second().scenario
@@ -225,7 +225,9 @@ def say(text: str) -> None:
 
 def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
     """Print what is kept, and of this reliability and what is doubted: by a probability below one half, or by a doubt."""
-    kept = np.array([bool(a.evidence["confirmed"]) and p >= MIN_THERE[a.lidar] for a, p in zip(agents, there)])
+    kept = np.array(
+        [(a.lidar or bool(a.evidence["confirmed"])) and p >= MIN_THERE[a.lidar] for a, p in zip(agents, there)]
+    )
     ticks, exists = np.array([a.ticks for a in agents]), np.array([a.there for a in agents])
     recall = (ticks * exists)[kept].sum() / max((ticks * exists).sum(), 1)
     invented = (ticks * (1 - exists))[kept].sum() / max(ticks[kept].sum(), 1)
