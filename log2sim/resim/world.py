@@ -22,7 +22,6 @@ from log2sim.perception.records import RecordSource
 from log2sim.resim.alignment import Alignment, moved
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import (
-    Floats,
     Pattern,
     Rays,
     Shots,
@@ -117,9 +116,7 @@ class Seen:
 class Placed:
     """All surfels where they are while a sweep is recorded."""
 
-    surfels: Surfels
-    center: Floats  # (S, 3), m: the map less the shift of the rays
-    normal: Floats  # (S, 3)
+    surfels: Surfels  # in the map less the shift of the rays; column by column in memory
     first: NDArray[np.int64]  # (A + 2,): where the surfels of the background and of each agent begin, and the end
     ids: tuple[str, ...]  # of these agents
 
@@ -133,36 +130,44 @@ def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
 
 def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
     """Put the agents of a scenario into the background, each disc where it is when the sensor looks there."""
-    parts, ids = [world.background], []
     move = given_T_refined(world, rays.origin[len(rays.origin) // 2] + rays.shift_m, int(rays.t_ns[0]))
     rotation = move[:3, :3].astype(np.float32)
-    offset = move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m
-    center = [world.background.center_m @ rotation.T + offset.astype(np.float32)]
-    normal = [world.background.normal @ rotation.T]
+    offset = (move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m).astype(np.float32)
+    parts, ids = [world.background], []
+    center, normal = [rotation @ parts[0].center_m.T + offset[:, None]], [rotation @ parts[0].normal.T]
     t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
-    sensor = rays.bin_T_map[len(rays.bin_T_map) // 2]
+    middle = len(t_s) // 2
+    sensor = rays.bin_T_map[middle].astype(np.float32)
     for agent in scenario.others:
         there = alive(agent, t_s)
         if not there.any() or agent.id not in agents:
             continue
         surfels, states = agents[agent.id], agent.trajectory.at(t_s)
-        position = np.column_stack([states.x_m, states.y_m, states.z_m]) - rays.shift_m
-        fit = np.zeros((len(t_s), 3))
+        pose, z = np.column_stack([states.x_m, states.y_m, states.yaw_rad]) - [*rays.shift_m[:2], 0], states.z_m
         if agent.id in world.alignments:
             fit = world.alignments[agent.id].at(t_s, states.x_m, states.y_m)
-        bins = np.full(len(surfels), len(t_s) // 2)
+            pose = np.column_stack([moved(np.column_stack([fit[:, :2], z]), pose)[:, :2], pose[:, 2] + fit[:, 2]])
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        table = np.stack([pose[:, 0], pose[:, 1], z - rays.shift_m[2], cos, sin]).astype(np.float32)
+        px, py, pz = surfels.center_m.T
+        x, y, up, c, s = table[:, middle]
         for _ in range(2):
-            at = bins
-            points = _turned(moved(surfels.center_m, fit[at]), states.yaw_rad[at]) + position[at]
-            seen = points @ sensor[:3, :3].T + sensor[:3, 3]
-            bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
-        own = there[bins]
-        parts.append(surfels.take(own))
-        center.append(points[own].astype(np.float32))
-        normal.append(_turned(surfels.normal[own], states.yaw_rad[at[own]] + fit[at[own], 2]).astype(np.float32))
+            points = np.stack([c * px - s * py + x, s * px + c * py + y, pz + up])
+            ahead, left, _ = sensor[:3, :3] @ points + sensor[:3, 3:]
+            bins = bin_of(np.arctan2(left, ahead))
+            x, y, up, c, s = table.take(bins, axis=1)
+        nx, ny, nz = surfels.normal.T
+        turned, own = np.stack([c * nx - s * ny, s * nx + c * ny, nz]), there[bins]
+        if not own.all():
+            surfels, points, turned = surfels.take(own), points[:, own], turned[:, own]
+        parts.append(surfels)
+        center.append(points)
+        normal.append(turned)
         ids.append(agent.id)
     first = np.cumsum([0, *(len(p) for p in parts)])
-    return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
+    columns = (np.concatenate(of, axis=1).T for of in (center, normal))
+    rest = (np.concatenate([vars(p)[name] for p in parts]) for name in ("radius_m", "intensity", "share", "returned"))
+    return Placed(Surfels(*columns, *rest), first, tuple(ids))
 
 
 def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
@@ -174,12 +179,6 @@ def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
     late = np.where(distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - t_ns), np.iinfo(np.int64).max)
     k = int(late.argmin())
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
-
-
-def _turned(v: Floats | Array, yaw: Array) -> Array:
-    """Turn vectors (N, 3) about the vertical axis by yaws (N,)."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
 
 
 def build_world(
@@ -455,22 +454,25 @@ def _weighed(
             poses, moment, _ = poses_of(log, name, shots.t_ns)
             rays = rays_in_map(shots, poses, moment)
             placed = place(world, scenario, rays, numbered)
-            met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
             column = np.arange(len(placed.surfels))
             for k, id in enumerate(placed.ids):
                 part = slice(placed.first[k + 1], placed.first[k + 2])
                 column[part] = begin[id] + placed.surfels.returned[part].astype(np.int64)
-            behind = (shots.range_m[met.ray] - met.range_m) * met.facing
-            there = np.abs(behind) < SAME_SURFACE_M
-            np.add.at(hit, column[met.surfel[there]], met.weight[there])
-            through = behind > SAME_SURFACE_M
-            np.add.at(passed, column[met.surfel[through]], met.weight[through])
-            # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
-            nothing = np.isnan(shots.range_m)[met.ray]
-            nearest = np.full(len(shots.t_ns), np.inf)
-            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing].astype(np.float64))
-            first = nothing & (met.range_m == nearest[met.ray])
-            np.add.at(lost, column[met.surfel[first]], met.weight[first])
+            nothing, nearest = np.isnan(shots.range_m), np.full(len(shots.t_ns), np.inf)
+            lone = []
+            for met in meetings(rays, grid_of(rays), placed.surfels):
+                surfel, weight = column.take(met.surfel), met.weight.astype(np.float64)
+                behind = (shots.range_m.take(met.ray) - met.range_m) * met.facing
+                for of, where in ((hit, np.abs(behind) < SAME_SURFACE_M), (passed, behind > SAME_SURFACE_M)):
+                    rows = np.flatnonzero(where)
+                    np.add.at(of, surfel.take(rows), weight.take(rows))
+                # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
+                rows = np.flatnonzero(nothing.take(met.ray))
+                lone.append((met.ray.take(rows), met.range_m.take(rows), surfel.take(rows), weight.take(rows)))
+                np.minimum.at(nearest, lone[-1][0], lone[-1][1].astype(np.float64))
+            for ray, range_m, surfel, weight in lone:
+                rows = np.flatnonzero(range_m == nearest.take(ray))
+                np.add.at(lost, surfel.take(rows), weight.take(rows))
     prior = PRIOR_RAYS * np.concatenate([world.background.share, *(world.agents[id].share for id in ids)])
     share = ((hit + prior) / (hit + passed + prior)).astype(np.float32)
     returned = ((hit + PRIOR_RAYS) / (hit + lost + PRIOR_RAYS)).astype(np.float32)
