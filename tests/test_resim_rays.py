@@ -13,7 +13,7 @@ from log2sim.geometry import NS_PER_S, rotation_from_rpy
 from log2sim.resim.caster import first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, rays_in_map
 from log2sim.resim.sightings import Sighting, choose_sighting, sighting, thinned, with_sightings
-from log2sim.resim.surfels import SurfelGrid, Surfels, joined, smallest_axis
+from log2sim.resim.surfels import SurfelGrid, Surfels, Tiles, joined, smallest_axis
 from log2sim.resim.world import body_of, ground_below
 
 CAR = Agent("car", "car", (4.4, 1.8, 1.5), waypoints([0.0]), static=True)
@@ -125,7 +125,9 @@ def test_the_ground_goes_on_below_what_stands() -> None:
     slope = np.column_stack([grid, 0.05 * grid[:, 0] - 0.03 * grid[:, 1]])
     normal = np.array([-0.05, 0.03, 1]) / np.linalg.norm([-0.05, 0.03, 1])
     car = replace(CAR, waypoints=waypoints([0.0], 100.0, 50.0, 7.75))
-    below = ground_below(car, disc_surfels(slope, np.tile(normal, (len(slope), 1)), 0.1), np.array([100.0, 50, 7]))
+    below = ground_below(
+        car, Tiles(disc_surfels(slope, np.tile(normal, (len(slope), 1)), 0.1)), np.array([100.0, 50, 7])
+    )
     assert np.ptp(below.center_m[:, :2], axis=0) == pytest.approx([4.2, 1.6], abs=0.3)
     np.testing.assert_allclose(below.center_m @ normal, 0, atol=1e-5)
     np.testing.assert_allclose(below.normal @ normal, 1, atol=1e-5)

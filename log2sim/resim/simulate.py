@@ -116,7 +116,7 @@ class Simulation:
             nothing = np.zeros((0, 3), np.float32)
             return Sweep(stamp_ns, nothing, t_ns=np.zeros(0, np.int64)), np.zeros(0, np.int64)
         rays = rays_in_map(shots, poses, moment)
-        placed = place(self.world, self.scenario, rays, self.agents)
+        placed = place(self.world, self.scenario, rays, self.agents, model.max_range_m)
         parts = meetings(rays, grid_of(rays), placed.surfels)
         parts, material = with_sightings(
             parts,

@@ -5,14 +5,15 @@ Surfels of points: Pfister et al., SIGGRAPH 2000; of LiDAR sweeps: Behley & Stac
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.files.arrays import Columns
+from log2sim.files.arrays import Columns, Shelf
 from log2sim.geometry import Array
 from log2sim.resim.rays import Floats, Pattern, Shots, angles_of
 
@@ -24,8 +25,11 @@ MAX_RADIUS_M = 1.0
 FLAT_RATIO, FLAT_M, MIN_WIDTH_M = 0.4, 0.08, 0.02
 # Of a cell that is flat: share of its points with a plane, and length of their mean normal.
 FLAT_SHARE, MIN_COHERENCE = 0.35, 0.8
-# Cells of the finest level; each is twice as large as the one before.
+# Cells of the finest level; each is twice as large as the one before. Tiles hold whole cells of every level.
 CELL_M, LEVELS = 0.06, 6
+TILE_M = CELL_M * 2**10
+TILES_BYTES = 256 << 20  # of surfels in memory: several tiles beyond the reach of a LiDAR have 1 MB to 10 MB each
+Tile = tuple[int, int]
 RADIUS_PER_CELL = 0.8  # discs of neighboring cells overlap, so that no ray passes between them
 
 
@@ -73,6 +77,11 @@ class Surfels(Columns):
 def joined(parts: Iterable[Surfels]) -> Surfels:
     """Concatenate surfels of one frame."""
     return Surfels.join(list(parts) or [no_surfels()])
+
+
+def columns_of(surfels: Surfels) -> list[Floats]:
+    """Return the columns of surfels."""
+    return list(vars(surfels).values())
 
 
 def no_surfels() -> Surfels:
@@ -189,6 +198,41 @@ def smallest_axis(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Arr
     return np.stack([low, 3 * third - low - high, high]), axis / np.where(none, 1, norm)
 
 
+def by_tile(points: Array | Floats) -> Iterator[tuple[Tile, NDArray[np.intp]]]:
+    """Return the rows of points (N, 3), m, in each tile of the plane."""
+    tile = np.floor(points[:, :2] / TILE_M).astype(np.int64)
+    number = (tile[:, 0] << 32) + tile[:, 1]
+    order = np.argsort(number, kind="stable")
+    number = number[order]
+    for rows in np.split(order, np.flatnonzero(number[1:] != number[:-1]) + 1):
+        if len(rows):
+            yield (int(tile[rows[0], 0]), int(tile[rows[0], 1])), rows
+
+
+class Tiles(Shelf[Tile, Surfels]):
+    """Surfels of what stands, by tile; of a large world those near the sensor are in memory, and the others in a file."""
+
+    def __init__(self, surfels: Surfels | None = None) -> None:
+        super().__init__(columns_of, Surfels, TILES_BYTES)
+        self.add(surfels or no_surfels())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return a copy for other processes, which have no file yet."""
+        return Tiles, (joined(self.values()),)
+
+    def add(self, surfels: Surfels) -> None:
+        """Add more."""
+        for tile, rows in by_tile(surfels.center_m):
+            self[tile] = joined([self.get(tile, no_surfels()), surfels.take(rows)])
+
+    def near(self, x_m: float, y_m: float, reach_m: float) -> list[Tile]:
+        """Return the tiles that have something within a reach, or may have."""
+        tiles = np.array(list(self), np.int64).reshape(-1, 2)
+        outside = np.abs(tiles + 0.5 - np.array([x_m, y_m]) / TILE_M) - 0.5
+        near = np.hypot(*np.maximum(outside, 0).T) * TILE_M < reach_m
+        return sorted((int(x), int(y)) for x, y in tiles[near])
+
+
 class SurfelGrid:
     """Joins points of many sweeps cell by cell; its memory grows with the surfaces, not with the sweeps.
 
@@ -197,10 +241,20 @@ class SurfelGrid:
 
     PENDING_ROWS = 20_000
 
-    def __init__(self) -> None:
-        self._key = np.zeros(0, np.int64)
-        self._sums = np.zeros((0, 11))
+    def __init__(self, key: NDArray[np.int64] | None = None, sums: Array | None = None) -> None:
+        self._key = np.zeros(0, np.int64) if key is None else key
+        self._sums = np.zeros((0, 11)) if sums is None else sums
         self._pending: list[tuple[NDArray[np.int64], Array]] = []
+
+    @property
+    def nbytes(self) -> int:
+        """Return the memory that it takes."""
+        return sum(k.nbytes + s.nbytes for k, s in [(self._key, self._sums), *self._pending])
+
+    def arrays(self) -> tuple[NDArray[np.int64], Array]:
+        """Return what it can be made of again."""
+        self._join()
+        return self._key, self._sums
 
     def add(self, points: Array, normal: Floats, radius_m: Floats, intensity: Floats) -> None:
         """Add points (N, 3), m, that are less than 30 km from the origin."""
@@ -216,6 +270,8 @@ class SurfelGrid:
             self._join()
 
     def _join(self) -> None:
+        if not self._pending:
+            return
         parts = [(self._key, self._sums), *self._pending]
         self._key, self._sums = _summed(np.concatenate([k for k, _ in parts]), np.concatenate([s for _, s in parts]))
         self._pending = []
