@@ -10,7 +10,7 @@ from worlds import waypoints
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import NS_PER_S, rotation_from_rpy
-from log2sim.resim.caster import first_hits, grid_of, meetings
+from log2sim.resim.caster import Meetings, first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, rays_in_map
 from log2sim.resim.sightings import Sighting, choose_sighting, sighting, thinned, with_sightings
 from log2sim.resim.surfels import SurfelGrid, Surfels, Tiles, joined, smallest_axis
@@ -84,6 +84,35 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
         off = np.abs(found[there] - expected[there])
         assert np.isfinite(off).mean() > 0.98
         assert np.quantile(off, 0.97) < tolerance_m
+
+
+def test_rays_meet_the_discs_that_they_meet_one_by_one() -> None:
+    """Discs from 2 cm to 1.5 m, from one ray to hundreds wide, some without a plane, in double precision and one by one."""
+    rng = np.random.default_rng(3)
+    center, normal = rng.normal(size=(2, 300, 3))
+    center *= rng.uniform(2.5, 30, (300, 1)) / np.linalg.norm(center, axis=1, keepdims=True)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[:50] = 0
+    discs = disc_surfels(center, normal, 1.0)
+    discs = replace(discs, radius_m=np.exp(rng.uniform(np.log(0.02), np.log(1.5), 300)).astype(np.float32))
+    azimuth, elevation = np.meshgrid(np.arange(-180, 180, 0.3), np.arange(-60, 60, 2.0))
+    a, e = np.deg2rad(azimuth.ravel()), np.deg2rad(elevation.ravel())
+    shots = shots_toward(np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1))
+    rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
+    met = Meetings.join(meetings(rays, grid_of(rays), discs))
+    axis = np.where(normal.any(axis=1)[:, None], normal, center / np.linalg.norm(center, axis=1, keepdims=True))
+    slope = shots.direction.astype(np.float64) @ axis.T
+    range_m = (axis * center).sum(axis=1) / slope
+    off = np.linalg.norm(range_m[..., None] * shots.direction[:, None].astype(np.float64) - center, axis=2)
+    inside = off / discs.radius_m
+    expected = (inside < 0.99) & (range_m > 0.5) & (np.abs(slope) > 0.021)
+    found = np.zeros_like(expected)
+    found[met.ray, met.surfel] = True
+    assert len(met) == found.sum()  # each pair once
+    assert expected[:, discs.radius_m > 1].sum(axis=0).max() > 300
+    assert found[expected].mean() > 0.999
+    assert inside[met.ray, met.surfel].max() < 1.01
+    np.testing.assert_allclose(met.range_m, range_m[met.ray, met.surfel], rtol=1e-4)
 
 
 def test_the_nearer_of_two_discs_stops_a_ray_and_one_of_a_fence_its_share() -> None:

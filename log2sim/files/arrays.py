@@ -168,28 +168,29 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         self._apart, self._made, self.memory_bytes, self._changing = arrays, made, memory_bytes, changing
         self._file = ArrayFile(0)
         self._near: OrderedDict[Key, Thing] = OrderedDict()
+        self._sizes: dict[Key, int] = {}  # of those in memory, when they were last looked at
+        self._total = 0
         self._far: dict[Key, list[NDArray[Any] | StoredArray]] = {}
 
     def __getitem__(self, key: Key) -> Thing:
         """Return a thing, and keep it in memory for now."""
         if key not in self._near:
             stored = self._far.pop(key) if self._changing else self._far[key]
-            self._near[key] = self._made(*(a.read() if isinstance(a, StoredArray) else a for a in stored))
-            self.put_away()
+            self._put(key, self._made(*(a.read() if isinstance(a, StoredArray) else a for a in stored)))
         self._near.move_to_end(key)
         return self._near[key]
 
     def __setitem__(self, key: Key, thing: Thing) -> None:
         """Keep a thing."""
         self._far.pop(key, None)
-        self._near[key] = thing
-        self._near.move_to_end(key)
-        self.put_away()
+        self._put(key, thing)
 
     def __delitem__(self, key: Key) -> None:
         """Forget a thing."""
-        if self._near.pop(key, None) is None or key in self._far:
-            del self._far[key]
+        if self._far.pop(key, None) is None and key not in self._near:
+            raise KeyError(key)
+        self._near.pop(key, None)
+        self._total -= self._sizes.pop(key, 0)
 
     def __iter__(self) -> Iterator[Key]:
         """Go over the keys, those in the file first."""
@@ -200,11 +201,21 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         return len(self._far.keys() | self._near.keys())
 
     def put_away(self) -> None:
-        """Write to the file what memory has no room for; things that change may have grown since they were asked for."""
-        total = sum(thing.nbytes for thing in self._near.values())
-        while total > self.memory_bytes and len(self._near) > 1:
+        """Write to the file what memory has no room for, as things may have grown since they were asked for."""
+        self._sizes = {key: thing.nbytes for key, thing in self._near.items()}
+        self._total = sum(self._sizes.values())
+        self._make_room()
+
+    def _put(self, key: Key, thing: Thing) -> None:
+        self._total += thing.nbytes - self._sizes.get(key, 0)
+        self._near[key], self._sizes[key] = thing, thing.nbytes
+        self._near.move_to_end(key)
+        self._make_room()
+
+    def _make_room(self) -> None:
+        while self._total > self.memory_bytes and len(self._near) > 1:
             key, thing = self._near.popitem(last=False)
-            total -= thing.nbytes
+            self._total -= self._sizes.pop(key)
             if key not in self._far:
                 self._far[key] = [self._file.keep(a) for a in self._apart(thing)]
 

@@ -25,10 +25,11 @@ MAX_RADIUS_M = 1.0
 FLAT_RATIO, FLAT_M, MIN_WIDTH_M = 0.4, 0.08, 0.02
 # Of a cell that is flat: share of its points with a plane, and length of their mean normal.
 FLAT_SHARE, MIN_COHERENCE = 0.35, 0.8
-# Cells of the finest level; each is twice as large as the one before. Tiles hold whole cells of every level.
+# Cells of the finest level; each is twice as large as the one before.
 CELL_M, LEVELS = 0.06, 6
-TILE_M = CELL_M * 2**10
-TILES_BYTES = 256 << 20  # of surfels in memory: several tiles beyond the reach of a LiDAR have 1 MB to 10 MB each
+# Squares of the plane that hold whole cells of every level: for the cells, few of which lie at a border, and for the discs.
+GRID_TILE_M, TILE_M = CELL_M * 2**10, CELL_M * 2**8
+TILES_BYTES = 256 << 20  # of surfels in memory, 40 bytes each: more than a LiDAR sees from one place
 Tile = tuple[int, int]
 RADIUS_PER_CELL = 0.8  # discs of neighboring cells overlap, so that no ray passes between them
 
@@ -198,9 +199,9 @@ def smallest_axis(xx: Array, xy: Array, xz: Array, yy: Array, yz: Array, zz: Arr
     return np.stack([low, 3 * third - low - high, high]), axis / np.where(none, 1, norm)
 
 
-def by_tile(points: Array | Floats) -> Iterator[tuple[Tile, NDArray[np.intp]]]:
+def by_tile(points: Array | Floats, side_m: float) -> Iterator[tuple[Tile, NDArray[np.intp]]]:
     """Return the rows of points (N, 3), m, in each tile of the plane."""
-    tile = np.floor(points[:, :2] / TILE_M).astype(np.int64)
+    tile = np.floor(points[:, :2] / side_m).astype(np.int64)
     number = (tile[:, 0] << 32) + tile[:, 1]
     order = np.argsort(number, kind="stable")
     number = number[order]
@@ -222,7 +223,7 @@ class Tiles(Shelf[Tile, Surfels]):
 
     def add(self, surfels: Surfels) -> None:
         """Add more."""
-        for tile, rows in by_tile(surfels.center_m):
+        for tile, rows in by_tile(surfels.center_m, TILE_M):
             self[tile] = joined([self.get(tile, no_surfels()), surfels.take(rows)])
 
     def near(self, x_m: float, y_m: float, reach_m: float) -> list[Tile]:

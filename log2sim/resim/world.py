@@ -35,7 +35,17 @@ from log2sim.resim.rays import (
     recorded_shots,
 )
 from log2sim.resim.sightings import Sighting, frame_at, is_non_rigid, sighting, thinned
-from log2sim.resim.surfels import SurfelGrid, Surfels, Tile, Tiles, by_tile, joined, local_surface, no_surfels
+from log2sim.resim.surfels import (
+    GRID_TILE_M,
+    SurfelGrid,
+    Surfels,
+    Tile,
+    Tiles,
+    by_tile,
+    joined,
+    local_surface,
+    no_surfels,
+)
 from log2sim.synth import shapes
 
 # Around the box of an agent, whose edges are not exact: what is left out of the background, and what is taken for the agent.
@@ -275,7 +285,7 @@ def build_world(
     standing = Tiles()
     for key in list(grids):
         if isinstance(key, tuple):
-            standing[key] = grids.pop(key).surfels()
+            standing.add(grids.pop(key).surfels())
     for agent in scenario.others:
         if agent.static:
             standing.add(ground_below(agent, standing, shift))
@@ -404,7 +414,7 @@ def _add_sweep(
     points += poses[moment, :3, 3] - shift
     normal = np.einsum("nij,nj->ni", rotation, surface.normal[free])
     normal, radius, intensity = normal.astype(np.float32), surface.radius_m[free], intensity[free]
-    for tile, rows in by_tile(points):
+    for tile, rows in by_tile(points, GRID_TILE_M):
         _grid(grids, tile).add(points[rows], normal[rows], radius[rows], intensity[rows])
     return surface.noise_m
 
