@@ -115,3 +115,14 @@ def test_a_shelf_is_a_dictionary_whatever_waits_in_its_file(steps: list[tuple[in
         np.testing.assert_array_equal(shelf[key], array)
     with pytest.raises(KeyError):
         shelf[9]
+
+
+def test_what_was_just_used_stays_on_a_shelf() -> None:
+    shelf: Shelf[int, np.ndarray] = Shelf(lambda a: [a], np.array, 0, changing=True, rounds=2)
+    for key in range(3):
+        shelf[key] = np.zeros(3)
+    for round, waiting in ((1, 0), (2, 2), (3, 2)):
+        shelf[0][0] += 1
+        shelf.put_away()
+        assert len(shelf._far) == waiting, round
+    assert shelf[0][0] == 3

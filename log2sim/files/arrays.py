@@ -155,6 +155,8 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         What the arrays of those in memory may take; the one used last always stays.
     changing : bool
         Whether things change while they are in memory; others are written once. A changed thing takes new room in the file.
+    rounds : int
+        Things that were used in so many rounds before stay in memory, whatever they take; `put_away` ends a round.
     """
 
     def __init__(
@@ -164,8 +166,11 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         memory_bytes: int,
         *,
         changing: bool = False,
+        rounds: int = 0,
     ) -> None:
         self._apart, self._made, self.memory_bytes, self._changing = arrays, made, memory_bytes, changing
+        self._rounds, self._round = rounds, 0
+        self._used: dict[Key, int] = {}
         self._file = ArrayFile(0)
         self._near: OrderedDict[Key, Thing] = OrderedDict()
         self._sizes: dict[Key, int] = {}  # of those in memory, when they were last looked at
@@ -178,6 +183,7 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
             stored = self._far.pop(key) if self._changing else self._far[key]
             self._put(key, self._made(*(a.read() if isinstance(a, StoredArray) else a for a in stored)))
         self._near.move_to_end(key)
+        self._used[key] = self._round
         return self._near[key]
 
     def __setitem__(self, key: Key, thing: Thing) -> None:
@@ -190,6 +196,7 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         if self._far.pop(key, None) is None and key not in self._near:
             raise KeyError(key)
         self._near.pop(key, None)
+        self._used.pop(key, None)
         self._total -= self._sizes.pop(key, 0)
 
     def __iter__(self) -> Iterator[Key]:
@@ -201,7 +208,8 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         return len(self._far.keys() | self._near.keys())
 
     def put_away(self) -> None:
-        """Write to the file what memory has no room for, as things may have grown since they were asked for."""
+        """End a round: write to the file what memory has no room for, as things may have grown since they were asked for."""
+        self._round += 1
         self._sizes = {key: thing.nbytes for key, thing in self._near.items()}
         self._total = sum(self._sizes.values())
         self._make_room()
@@ -210,11 +218,15 @@ class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
         self._total += thing.nbytes - self._sizes.get(key, 0)
         self._near[key], self._sizes[key] = thing, thing.nbytes
         self._near.move_to_end(key)
+        self._used[key] = self._round
         self._make_room()
 
     def _make_room(self) -> None:
         while self._total > self.memory_bytes and len(self._near) > 1:
-            key, thing = self._near.popitem(last=False)
+            key, thing = next(iter(self._near.items()))
+            if self._used[key] > self._round - self._rounds:
+                return
+            del self._near[key], self._used[key]
             self._total -= self._sizes.pop(key)
             if key not in self._far:
                 self._far[key] = [self._file.keep(a) for a in self._apart(thing)]

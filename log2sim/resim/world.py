@@ -65,6 +65,7 @@ GRIDS_BYTES, COUNTS_BYTES = (
     256 << 20,
     64 << 20,
 )  # in memory, of surfaces while they are joined and of rays that are counted
+AROUND_SWEEPS = 20  # what so many have added to is within reach, and the next ones will add to it
 SIGHTINGS_EVERY = 50  # sweeps, after which they are counted
 PRIOR_RAYS, PRIOR_UNSEEN = 2.0, 0.15  # that end on a disc before any is counted; share of them for one that nobody saw
 BODY_DISC_M = 0.08  # radius of the discs of a body that nobody saw
@@ -239,7 +240,9 @@ def build_world(
     """
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
-    grids: Shelf[Tile | str, SurfelGrid] = Shelf(SurfelGrid.arrays, SurfelGrid, GRIDS_BYTES, changing=True)
+    grids: Shelf[Tile | str, SurfelGrid] = Shelf(
+        SurfelGrid.arrays, SurfelGrid, GRIDS_BYTES, changing=True, rounds=AROUND_SWEEPS
+    )
     seen = {agent.id: Seen(Alignment(agent), []) for agent in scenario.others}
     sightings = {id: s.sightings for id, s in seen.items()}
     refined = refine_poses(log)
