@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from log2sim.datatypes import Measurements, Obstacles, Rays
-from log2sim.files.arrays import ArrayFile, ArrayList, StoredArray, array_lengths, join_arrays, take_arrays
+from log2sim.files.arrays import ArrayFile, ArrayList, Shelf, StoredArray, array_lengths, join_arrays, take_arrays
 from log2sim.perception.first_pass import ObstacleList
 
 DTYPES = (np.float32, np.float64, np.int64, np.uint8)
@@ -92,3 +92,37 @@ def test_arrays_go_along_to_other_processes(memory_bytes: int) -> None:
     for array, back in zip(arrays, copy, strict=True):
         np.testing.assert_array_equal(back, array)
         assert back.dtype == array.dtype
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from(["add", "read", "forget"])), max_size=40), st.booleans())
+def test_a_shelf_is_a_dictionary_whatever_waits_in_its_file(steps: list[tuple[int, str]], changing: bool) -> None:
+    """Two of the arrays have room; those of one that changes are changed in place, and grow."""
+    shelf: Shelf[int, np.ndarray] = Shelf(lambda a: [a], np.array, 2 * 24, changing=changing)
+    known: dict[int, np.ndarray] = {}
+    for key, step in steps:
+        if step == "forget":
+            assert (shelf.pop(key, None) is None) == (known.pop(key, None) is None)
+        elif key not in known or step == "add":
+            known[key] = shelf[key] = np.arange(3.0) + len(known)
+        elif changing:
+            shelf[key][0] += 1
+            known[key] = shelf[key].copy()
+        assert sum(a.nbytes for a in shelf._near.values()) <= 2 * 24
+        assert set(shelf) == set(known)
+        assert len(shelf) == len(known)
+    for key, array in known.items():
+        np.testing.assert_array_equal(shelf[key], array)
+    with pytest.raises(KeyError):
+        shelf[9]
+
+
+def test_what_was_just_used_stays_on_a_shelf() -> None:
+    shelf: Shelf[int, np.ndarray] = Shelf(lambda a: [a], np.array, 0, changing=True, rounds=2)
+    for key in range(3):
+        shelf[key] = np.zeros(3)
+    for round, waiting in ((1, 0), (2, 2), (3, 2)):
+        shelf[0][0] += 1
+        shelf.put_away()
+        assert len(shelf._far) == waiting, round
+    assert shelf[0][0] == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from log2sim.resim.alignment import Alignment
 from log2sim.resim.cameras import Pictures
 from log2sim.resim.rays import all_shots, find_pattern, poses_of, recorded_shots
 from log2sim.resim.simulate import MASKS, Simulation, resimulate, seeing, simulate, with_sensors
-from log2sim.resim.surfels import SurfelGrid, local_surface
+from log2sim.resim.surfels import SurfelGrid, Tile, local_surface
 from log2sim.resim.world import Seen, World, _add_sweep, build_world
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import open_world, replay
@@ -141,11 +142,29 @@ def test_wheels_that_reach_out_of_a_short_box_are_kept(recorded: tuple[Log, Scen
     reach = {}
     for category in ("cyclist", "car"):
         short = replace(seen, category=category, size_m=(length - 0.6, width, height))
-        own = {short.id: Seen(SurfelGrid(), Alignment(short), [])}
+        grids: dict[Tile | str, SurfelGrid] = {}
+        own = {short.id: Seen(Alignment(short), [])}
         only = replace(truth, agents=(short,))
-        _add_sweep(log, log, only, name, shots, pattern, 1.0, world.shift_m, SurfelGrid(), own)
-        reach[category] = np.abs(own[short.id].surfaces.surfels().center_m[:, 0]).max() - short.size_m[0] / 2
+        _add_sweep(log, log, only, name, shots, pattern, 1.0, world.shift_m, grids, own)
+        reach[category] = np.abs(grids[short.id].surfels().center_m[:, 0]).max() - short.size_m[0] / 2
     assert reach["car"] < 0.15 < 0.25 < reach["cyclist"] < 0.35
+
+
+def test_a_world_of_which_most_waits_in_a_file_is_the_same(
+    recorded: tuple[Log, Scenario], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, truth = recorded
+    (name,) = log.lidars
+    log = log.changed(streams={name: replace(log.streams[name], t_ns=log.streams[name].t_ns[:4])})
+    worlds = [build_world(log, truth, [name])]
+    for limit in ("world.GRIDS_BYTES", "world.COUNTS_BYTES", "surfels.TILES_BYTES"):
+        monkeypatch.setattr(f"log2sim.resim.{limit}", 1)
+    worlds += [build_world(log, truth, [name]), pickle.loads(pickle.dumps(worlds[0]))]
+    expected, *others = (Simulation(log, w, truth).sweep(name, 1).xyz_m for w in worlds)
+    assert len(worlds[1].background) > 20
+    for world, sweep in zip(worlds[1:], others):
+        assert set(world.background) == set(worlds[0].background)
+        np.testing.assert_array_equal(sweep, expected)
 
 
 def test_surfaces_of_an_agent_lie_on_each_other_though_its_trajectory_is_off(recorded: tuple[Log, Scenario]) -> None:

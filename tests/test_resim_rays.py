@@ -10,10 +10,10 @@ from worlds import waypoints
 
 from log2sim.datatypes import Agent, Scenario
 from log2sim.geometry import NS_PER_S, rotation_from_rpy
-from log2sim.resim.caster import first_hits, grid_of, meetings
+from log2sim.resim.caster import Meetings, first_hits, grid_of, meetings
 from log2sim.resim.rays import Shots, rays_in_map
 from log2sim.resim.sightings import Sighting, choose_sighting, sighting, thinned, with_sightings
-from log2sim.resim.surfels import SurfelGrid, Surfels, joined, smallest_axis
+from log2sim.resim.surfels import SurfelGrid, Surfels, Tiles, joined, smallest_axis
 from log2sim.resim.world import body_of, ground_below
 
 CAR = Agent("car", "car", (4.4, 1.8, 1.5), waypoints([0.0]), static=True)
@@ -32,8 +32,8 @@ def disc_surfels(center: np.ndarray, normal: np.ndarray, radius: float) -> Surfe
 
 def cast(shots: Shots, surfels: Surfels, seed: int = 0) -> np.ndarray:
     rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
-    met = meetings(rays, grid_of(rays), surfels, surfels.center_m, surfels.normal)
-    return first_hits(met, surfels, len(shots.t_ns), np.random.default_rng(seed)).range_m
+    met = meetings(rays, grid_of(rays), surfels)
+    return first_hits(met, surfels.material, len(shots.t_ns), np.random.default_rng(seed)).range_m
 
 
 def test_a_plane_of_discs_is_met_where_the_plane_is() -> None:
@@ -72,8 +72,8 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
         poses[:, :3, :3], poses[:, 0, 3] = rotation_from_rpy(0.0, 0.0, yaw), x
         shots = replace(shots_toward(ray), t_ns=(t_s * NS_PER_S).astype(np.int64))
         rays = rays_in_map(shots, poses, moment)
-        met = meetings(rays, grid_of(rays), plane, plane.center_m - rays.shift_m.astype(np.float32), plane.normal)
-        found = first_hits(met, plane, len(ray), rng).range_m
+        shifted = replace(plane, center_m=plane.center_m - rays.shift_m.astype(np.float32))
+        found = first_hits(meetings(rays, grid_of(rays), shifted), plane.material, len(ray), rng).range_m
         world = np.einsum("nij,nj->ni", poses[moment, :3, :3], ray)
         with np.errstate(divide="ignore"):
             down, ahead = -1.8 / world[:, 2], (8 - x[moment]) / world[:, 0]
@@ -84,6 +84,35 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
         off = np.abs(found[there] - expected[there])
         assert np.isfinite(off).mean() > 0.98
         assert np.quantile(off, 0.97) < tolerance_m
+
+
+def test_rays_meet_the_discs_that_they_meet_one_by_one() -> None:
+    """Discs from 2 cm to 1.5 m, from one ray to hundreds wide, some without a plane, in double precision and one by one."""
+    rng = np.random.default_rng(3)
+    center, normal = rng.normal(size=(2, 300, 3))
+    center *= rng.uniform(2.5, 30, (300, 1)) / np.linalg.norm(center, axis=1, keepdims=True)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal[:50] = 0
+    discs = disc_surfels(center, normal, 1.0)
+    discs = replace(discs, radius_m=np.exp(rng.uniform(np.log(0.02), np.log(1.5), 300)).astype(np.float32))
+    azimuth, elevation = np.meshgrid(np.arange(-180, 180, 0.3), np.arange(-60, 60, 2.0))
+    a, e = np.deg2rad(azimuth.ravel()), np.deg2rad(elevation.ravel())
+    shots = shots_toward(np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1))
+    rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
+    met = Meetings.join(meetings(rays, grid_of(rays), discs))
+    axis = np.where(normal.any(axis=1)[:, None], normal, center / np.linalg.norm(center, axis=1, keepdims=True))
+    slope = shots.direction.astype(np.float64) @ axis.T
+    range_m = (axis * center).sum(axis=1) / slope
+    off = np.linalg.norm(range_m[..., None] * shots.direction[:, None].astype(np.float64) - center, axis=2)
+    inside = off / discs.radius_m
+    expected = (inside < 0.99) & (range_m > 0.5) & (np.abs(slope) > 0.021)
+    found = np.zeros_like(expected)
+    found[met.ray, met.surfel] = True
+    assert len(met) == found.sum()  # each pair once
+    assert expected[:, discs.radius_m > 1].sum(axis=0).max() > 300
+    assert found[expected].mean() > 0.999
+    assert inside[met.ray, met.surfel].max() < 1.01
+    np.testing.assert_allclose(met.range_m, range_m[met.ray, met.surfel], rtol=1e-4)
 
 
 def test_the_nearer_of_two_discs_stops_a_ray_and_one_of_a_fence_its_share() -> None:
@@ -101,10 +130,10 @@ def test_the_nearer_of_two_discs_stops_a_ray_and_one_of_a_fence_its_share() -> N
 def test_smallest_axes_are_those_of_an_eigenvalue_solver() -> None:
     a = np.random.default_rng(0).normal(size=(200, 3, 3))
     a = a @ a.transpose(0, 2, 1)
-    values, axis = smallest_axis(a)
+    values, axis = smallest_axis(*(a[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))))
     expected, vectors = np.linalg.eigh(a)
-    np.testing.assert_allclose(values, expected, atol=1e-9)
-    np.testing.assert_allclose(np.abs(np.einsum("ni,ni->n", axis, vectors[:, :, 0])), 1, atol=1e-6)
+    np.testing.assert_allclose(values.T, expected, atol=1e-9)
+    np.testing.assert_allclose(np.abs(np.einsum("in,ni->n", axis, vectors[:, :, 0])), 1, atol=1e-6)
 
 
 def test_a_body_fills_its_box() -> None:
@@ -125,7 +154,9 @@ def test_the_ground_goes_on_below_what_stands() -> None:
     slope = np.column_stack([grid, 0.05 * grid[:, 0] - 0.03 * grid[:, 1]])
     normal = np.array([-0.05, 0.03, 1]) / np.linalg.norm([-0.05, 0.03, 1])
     car = replace(CAR, waypoints=waypoints([0.0], 100.0, 50.0, 7.75))
-    below = ground_below(car, disc_surfels(slope, np.tile(normal, (len(slope), 1)), 0.1), np.array([100.0, 50, 7]))
+    below = ground_below(
+        car, Tiles(disc_surfels(slope, np.tile(normal, (len(slope), 1)), 0.1)), np.array([100.0, 50, 7])
+    )
     assert np.ptp(below.center_m[:, :2], axis=0) == pytest.approx([4.2, 1.6], abs=0.3)
     np.testing.assert_allclose(below.center_m @ normal, 0, atol=1e-5)
     np.testing.assert_allclose(below.normal @ normal, 1, atol=1e-5)
@@ -167,11 +198,16 @@ def test_legs_stay_apart_and_what_was_hidden_is_a_body(below: int) -> None:
     shots = shots_toward(fan(0.37))
     rays = rays_in_map(shots, np.eye(4)[None], np.zeros(len(shots.t_ns), np.intp))
     body = disc_surfels(np.array([[10.0, 0, -0.7], [10, 0, 0.5]]), np.tile([-1.0, 0, 0], (2, 1)), 0.15)
-    met = meetings(rays, grid_of(rays), body, body.center_m, body.normal)
-    met, discs = with_sightings(
-        met, body, first=np.array([0, 0, 2]), ids=[person.id], rays=rays, scenario=now, sightings={person.id: [seen]}
+    met, material = with_sightings(
+        meetings(rays, grid_of(rays), body),
+        body.material,
+        first=np.array([0, 0, 2]),
+        ids=[person.id],
+        rays=rays,
+        scenario=now,
+        sightings={person.id: [seen]},
     )
-    hits = first_hits(met, discs, len(shots.t_ns), np.random.default_rng(0))
+    hits = first_hits(met, material, len(shots.t_ns), np.random.default_rng(0))
     ended = hits.range_m
     at = shots.direction * (10 / shots.direction[:, :1])
     high = (at[:, 2] > -0.48) & (np.abs(at[:, 2] - 0.3) > 0.1)

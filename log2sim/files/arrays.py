@@ -6,9 +6,10 @@ import os
 import tempfile
 import threading
 import weakref
-from collections.abc import Iterable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping, Sequence
 from dataclasses import dataclass
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,11 @@ class Columns:
     def take(self, index: Any) -> Self:
         """Take the rows at `index`: integers, a slice or a mask."""
         return type(self)(**{name: None if v is None else v[index] for name, v in vars(self).items()})
+
+    @property
+    def nbytes(self) -> int:
+        """Return the memory that the columns take."""
+        return sum(v.nbytes for v in vars(self).values() if v is not None)
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
@@ -123,6 +129,107 @@ class ArrayList(Sequence[NDArray[Any]]):
             return ArrayList(self.items[index])
         item = self.items[index]
         return item.read() if isinstance(item, StoredArray) else item
+
+
+class Sized(Protocol):
+    """What takes memory."""
+
+    @property
+    def nbytes(self) -> int:
+        """Return how much."""
+        ...
+
+
+Key = TypeVar("Key", bound=Hashable)
+Thing = TypeVar("Thing", bound=Sized)
+
+
+class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
+    """Things made of arrays, by key: those that were used last are in memory, the others in a file.
+
+    Parameters
+    ----------
+    arrays, made : callable
+        Take a thing apart into arrays, and make it of them.
+    memory_bytes : int
+        What the arrays of those in memory may take; the one used last always stays.
+    changing : bool
+        Whether things change while they are in memory; others are written once. A changed thing takes new room in the file.
+    rounds : int
+        Things that were used in so many rounds before stay in memory, whatever they take; `put_away` ends a round.
+    """
+
+    def __init__(
+        self,
+        arrays: Callable[[Thing], Sequence[NDArray[Any]]],
+        made: Callable[..., Thing],
+        memory_bytes: int,
+        *,
+        changing: bool = False,
+        rounds: int = 0,
+    ) -> None:
+        self._apart, self._made, self.memory_bytes, self._changing = arrays, made, memory_bytes, changing
+        self._rounds, self._round = rounds, 0
+        self._used: dict[Key, int] = {}
+        self._file = ArrayFile(0)
+        self._near: OrderedDict[Key, Thing] = OrderedDict()
+        self._sizes: dict[Key, int] = {}  # of those in memory, when they were last looked at
+        self._total = 0
+        self._far: dict[Key, list[NDArray[Any] | StoredArray]] = {}
+
+    def __getitem__(self, key: Key) -> Thing:
+        """Return a thing, and keep it in memory for now."""
+        if key not in self._near:
+            stored = self._far.pop(key) if self._changing else self._far[key]
+            self._put(key, self._made(*(a.read() if isinstance(a, StoredArray) else a for a in stored)))
+        self._near.move_to_end(key)
+        self._used[key] = self._round
+        return self._near[key]
+
+    def __setitem__(self, key: Key, thing: Thing) -> None:
+        """Keep a thing."""
+        self._far.pop(key, None)
+        self._put(key, thing)
+
+    def __delitem__(self, key: Key) -> None:
+        """Forget a thing."""
+        if self._far.pop(key, None) is None and key not in self._near:
+            raise KeyError(key)
+        self._near.pop(key, None)
+        self._used.pop(key, None)
+        self._total -= self._sizes.pop(key, 0)
+
+    def __iter__(self) -> Iterator[Key]:
+        """Go over the keys, those in the file first."""
+        return iter([*(k for k in self._far if k not in self._near), *self._near])
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._far.keys() | self._near.keys())
+
+    def put_away(self) -> None:
+        """End a round: write to the file what memory has no room for, as things may have grown since they were asked for."""
+        self._round += 1
+        self._sizes = {key: thing.nbytes for key, thing in self._near.items()}
+        self._total = sum(self._sizes.values())
+        self._make_room()
+
+    def _put(self, key: Key, thing: Thing) -> None:
+        self._total += thing.nbytes - self._sizes.get(key, 0)
+        self._near[key], self._sizes[key] = thing, thing.nbytes
+        self._near.move_to_end(key)
+        self._used[key] = self._round
+        self._make_room()
+
+    def _make_room(self) -> None:
+        while self._total > self.memory_bytes and len(self._near) > 1:
+            key, thing = next(iter(self._near.items()))
+            if self._used[key] > self._round - self._rounds:
+                return
+            del self._near[key], self._used[key]
+            self._total -= self._sizes.pop(key)
+            if key not in self._far:
+                self._far[key] = [self._file.keep(a) for a in self._apart(thing)]
 
 
 def take_arrays(arrays: Sequence[NDArray[Any]], rows: Iterable[int]) -> Sequence[NDArray[Any]]:

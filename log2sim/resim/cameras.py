@@ -133,10 +133,10 @@ def look(world: World, log: Log, scenario: Scenario, agents: Mapping[str, Surfel
     nothing = np.full(len(ray), np.nan, np.float32)
     level = Shots((ray @ CAM_T_LEVEL / length[:, None]).astype(np.float32), moments[moment], nothing, nothing)
     rays = rays_in_map(level, poses @ transform(CAM_T_LEVEL, np.zeros(3)), moment)
-    placed = place(world, scenario, rays, agents)
+    placed = place(world, scenario, rays, agents, FAR_M)
     solid = replace(placed.surfels, share=(placed.surfels.share > 0.5).astype(np.float32))
-    meet = meetings(rays, grid_of(rays), solid, placed.center, placed.normal)
-    hits = first_hits(meet, solid, len(ray), np.random.default_rng(0))
+    parts = meetings(rays, grid_of(rays), solid)
+    hits = first_hits(parts, solid.material, len(ray), np.random.default_rng(0))
     met = np.isfinite(hits.range_m) & usable
     owner = np.where(met, np.searchsorted(placed.first[1:-1], hits.surfel, side="right"), 0).reshape(shape)
     towards = np.einsum("nij,nj->ni", poses[moment, :3, :3], ray)

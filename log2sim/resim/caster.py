@@ -5,6 +5,7 @@ Splatting of surfels (Zwicker et al., SIGGRAPH 2001) with the plane of each disc
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from log2sim.files.arrays import Columns
 from log2sim.resim.rays import Floats, Rays, bin_of
-from log2sim.resim.surfels import Surfels
+from log2sim.resim.surfels import Material, Surfels
 
 CELL_RAD, ROW_RAD = np.float32(np.deg2rad(0.1)), np.float32(np.deg2rad(0.2))  # of azimuth and of elevation
 # Of half the angles that a disc covers: meanwhile a fast ego comes a tenth nearer to what is beside it.
@@ -21,6 +22,7 @@ MARGIN = np.float32(1.1)
 MAX_HALF_WIDTH_RAD = np.float32(np.deg2rad(20.0))  # of a disc in the sensor's picture
 MIN_RANGE_M = 0.5
 CHUNK = 30_000  # discs at a time: their columns stay in the cache
+RUN = 8  # rays of one row that a disc may meet; those that a wider one may are cut to several such runs
 # A quarter of the usual noise: rays that look one way start within it where the LiDAR spins.
 SAME_START_M = np.float32(0.005)
 THICKNESS_M = 0.08  # discs this far behind the first one, across their plane, are the same surface
@@ -81,90 +83,113 @@ class Meetings(Columns):
     weight: Floats  # 1 in the middle of the disc, 0 at its edge
 
 
-def meetings(rays: Rays, grid: RayGrid, surfels: Surfels, center: Floats, normal: Floats) -> Meetings:
-    """Intersect the rays with all discs; `center` and `normal` (S, 3) are theirs in the map less the shift of the rays."""
-    found = []
-    for first in range(0, len(surfels), CHUNK):
-        part = slice(first, first + CHUNK)
-        found.append(_met(rays, grid, center[part], normal[part], surfels.radius_m[part], first))
-    if not found:
-        found.append(_met(rays, grid, center, normal, surfels.radius_m, 0))
-    return Meetings.join(found)
-
-
-def _met(rays: Rays, grid: RayGrid, center: Floats, normal: Floats, radius: Floats, first: int) -> Meetings:
+def meetings(rays: Rays, grid: RayGrid, surfels: Surfels) -> list[Meetings]:
+    """Intersect the rays with all discs, which are in the map less the shift of the rays; in parts that stay in the cache."""
     to_sensor = rays.bin_T_map.astype(np.float32)
-    middle = to_sensor[len(to_sensor) // 2]
-    bins = bin_of(np.arctan2(_row(middle, 1, center.T), _row(middle, 0, center.T)))
-    # Where the sensor is when it looks there, and the discs from there.
+    # Where the sensor is when it looks there.
     start = -np.einsum("bji,bj->bi", rays.bin_T_map[:, :3, :3], rays.bin_T_map[:, :3, 3]).astype(np.float32)
-    offset = np.stack([center[:, axis] - start[:, axis].take(bins) for axis in range(3)])
+    found: list[Meetings] = []
+    for first in range(0, max(len(surfels), 1), CHUNK):
+        found += _met(rays, grid, to_sensor, start, surfels.take(slice(first, first + CHUNK)), first)
+    return found
+
+
+def _met(rays: Rays, grid: RayGrid, to_sensor: Floats, start: Floats, discs: Surfels, first: int) -> Iterator[Meetings]:
+    center, radius, spread = discs.center_m.T, discs.radius_m, np.float32(rays.spread_m)
+    middle = to_sensor[len(to_sensor) // 2]
+    bins = bin_of(np.arctan2(_row(middle, 1, center), _row(middle, 0, center)))
+    offset = [center[axis] - start[:, axis].take(bins) for axis in range(3)]
     turn = [[to_sensor[:, i, j].take(bins) for j in range(3)] for i in range(3)]
     x, y, z = (_dot(turn[axis], offset) for axis in range(3))
-    flat_m = np.sqrt(x * x + y * y)
-    distance = np.sqrt(flat_m * flat_m + z * z)
-    elevation = np.arctan2(z, flat_m)
-    free = np.maximum(distance - radius - rays.spread_m, 0.1)
-    # Most discs are far away, and lie between two lines of the LiDAR even if they face it.
-    low_row, high_row = grid.rows_of(elevation, np.minimum((radius + rays.spread_m) / free, MAX_HALF_WIDTH_RAD))
-    own = np.flatnonzero((high_row > low_row) & (distance > MIN_RANGE_M / 2))
-    x, y, z, flat_m, distance, elevation, free, radius = (
-        v.take(own) for v in (x, y, z, flat_m, distance, elevation, free, radius)
-    )
-    offset, turn = offset.take(own, axis=1), [[v.take(own) for v in row] for row in turn]
-    normal = normal.take(own, axis=0).T.copy()
+    flat_m = np.maximum(np.sqrt(x * x + y * y), np.float32(0.01))
+    distance = np.maximum(np.sqrt(_dot(offset, offset)), np.float32(0.01))
     # What has no plane faces the sensor.
-    rough = ~normal.any(axis=0)
-    normal[:, rough] = offset[:, rough] / distance[rough]
-    azimuth = np.arctan2(y, x)
+    rough = (_dot(discs.normal.T, discs.normal.T) == 0) / distance
+    normal = [axis + rough * away for axis, away in zip(discs.normal.T, offset)]
     # Half the angles that a disc covers: less for one that is seen from its side.
     nx, ny, nz = (_dot(turn[axis], normal) for axis in range(3))
-    across = (x * ny - y * nx) / np.maximum(flat_m, 0.01)
-    upward = (flat_m * nz - z * (x * nx + y * ny) / np.maximum(flat_m, 0.01)) / np.maximum(distance, 0.01)
-    half_az = (radius * np.sqrt(np.maximum(1 - across**2, 0)) + rays.spread_m) / np.maximum(
-        free * flat_m / np.maximum(distance, 0.01), 0.1
-    )
-    half_el = (radius * np.sqrt(np.maximum(1 - upward**2, 0)) + rays.spread_m) / free
+    across = (x * ny - y * nx) / flat_m
+    upward = (flat_m * nz - z * (x * nx + y * ny) / flat_m) / distance
+    free = np.maximum(distance - radius - spread, np.float32(0.1))
+    half_az = radius * np.sqrt(np.maximum(1 - across * across, 0)) + spread
+    half_az /= np.maximum(free * flat_m / distance, np.float32(0.1))
+    half_el = (radius * np.sqrt(np.maximum(1 - upward * upward, 0)) + spread) / free
     half_az, half_el = (np.minimum(half * MARGIN, MAX_HALF_WIDTH_RAD) for half in (half_az, half_el))
-    low_row, high_row = grid.rows_of(elevation, half_el)
-    disc, row = _expanded(np.arange(len(own)), low_row, high_row)
-    row *= grid.columns
-    low = ((azimuth - half_az - grid.low_az) / CELL_RAD).astype(np.int64)
-    high = ((azimuth + half_az - grid.low_az) / CELL_RAD).astype(np.int64) + 1
-    begin = grid.start.take(row + low.take(disc)).astype(np.int64)
-    end = grid.start.take(row + high.take(disc)).astype(np.int64)
-    some = np.flatnonzero(end > begin)
-    disc, entry = _expanded(disc.take(some), begin.take(some), end.take(some))
+    azimuth = np.arctan2(y, x) - grid.low_az
+    low, high = (((azimuth + side) / CELL_RAD).astype(np.int64) for side in (-half_az, half_az))
+    low_row, high_row = grid.rows_of(np.arctan2(z, flat_m), half_el)
+    rows = (high_row - low_row) * (distance > MIN_RANGE_M / 2)
+    # The rays of each row that a disc may meet, which follow each other.
+    disc, cell = _expanded(low_row * grid.columns + low, rows, grid.columns)
+    begin, cell = grid.start.take(cell), cell + (high - low + 1).take(disc)
+    which, entry, longer = _runs(begin, grid.start.take(cell) - begin)
+    disc = disc.take(which)
     # Column by column: sums over three axes by einsum take three times as long.
-    ray = [grid.direction[axis].take(entry) for axis in range(3)]
-    facing = [normal[axis].take(disc) for axis in range(3)]
-    apart = [offset[axis].take(disc) for axis in range(3)]
-    plane, away2 = _dot(normal, offset).take(disc), (distance * distance).take(disc)
-    if rays.spread_m > SAME_START_M:
-        whose, begins = grid.ray.take(entry), start[bins[own]]
-        apart = [apart[k] + begins[:, k].take(disc) - rays.origin[:, k].take(whose) for k in range(3)]
-        plane, away2 = _dot(facing, apart), _dot(apart, apart)
-    slope, along = _dot(ray, facing), _dot(ray, apart)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = plane / slope
-    # From the middle of the disc to where the ray meets its plane.
-    off2 = t * (t - 2 * along) + away2
-    weight = np.asarray(1 - off2 / (radius * radius).take(disc), np.float32)
-    slope = np.abs(slope)
-    met = np.flatnonzero((weight > 0) & (t > MIN_RANGE_M) & (slope > MIN_FACING))
-    surfel = (own.take(disc.take(met)) + first).astype(np.int32)
-    return Meetings(grid.ray.take(entry.take(met)), surfel, t.take(met), slope.take(met), weight.take(met))
+    facing, apart = ([column.take(disc) for column in columns] for columns in (normal, offset))
+    plane, thin = _dot(normal, offset).take(disc), np.reciprocal(radius * radius).take(disc)
+    apart_starts = rays.spread_m > SAME_START_M
+    place = [column.take(disc) for column in center] if apart_starts else []
+    # Of every run the first ray, then the second: what is known of a disc is read once for all of them.
+    for k, count in enumerate(longer):
+        now = entry[:count] + k
+        ray, facing = [column.take(now) for column in grid.direction], [column[:count] for column in facing]
+        if apart_starts:
+            whose = grid.ray.take(now)
+            apart = [place[axis][:count] - rays.origin[:, axis].take(whose) for axis in range(3)]
+            plane = _dot(facing, apart)
+        slope = _dot(ray, facing)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = plane[:count] / slope
+            # From the middle of the disc to where the ray meets its plane.
+            off = [t * column - away[:count] for column, away in zip(ray, apart)]
+            weight = 1 - _dot(off, off) * thin[:count]
+        slope = np.abs(slope)
+        met = np.flatnonzero((weight > 0) & (t > MIN_RANGE_M) & (slope > MIN_FACING))
+        surfel = (disc.take(met) + first).astype(np.int32)
+        yield Meetings(grid.ray.take(now.take(met)), surfel, t.take(met), slope.take(met), weight.take(met))
+
+
+def _runs(begin: NDArray[np.int32], count: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.int64], list[int]]:
+    """Cut `count` entries from `begin` on to runs of at most `RUN`, the longest first.
+
+    Returns
+    -------
+    which : (R,) int
+        Whose run it is.
+    entry : (R,) int64
+        Its first one.
+    longer : list of int
+        How many runs have more than 0, 1, 2 ... entries.
+    """
+    which = np.flatnonzero(count)
+    entry, left = begin.take(which).astype(np.int64), count.take(which)
+    long = np.flatnonzero(left > RUN)
+    if len(long):
+        more, rest = _expanded(entry.take(long) + RUN, (left.take(long) - 1) // RUN, RUN)
+        long = long.take(more)
+        end = entry.take(long) + left.take(long)
+        which, entry, left = (np.append(which, which.take(long)), np.append(entry, rest), np.append(left, end - rest))
+    lacking = (RUN - np.minimum(left, RUN)).astype(np.uint8)
+    order = np.argsort(lacking, kind="stable")
+    longer = np.cumsum(np.bincount(lacking, minlength=RUN))[::-1]
+    return which.take(order), entry.take(order), longer.tolist()
 
 
 def _expanded(
-    index: NDArray[np.int64], begin: NDArray[np.int64], end: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Repeat each index for every number from its begin up to its end, and return those numbers."""
-    count = end - begin
-    which = np.repeat(np.arange(len(count)), count)
-    number = (begin - (np.cumsum(count) - count)).take(which)
-    number += np.arange(len(number))
-    return index.take(which), number
+    first: NDArray[np.int64], count: NDArray[np.signedinteger[Any]], step: int
+) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+    """Return `count` times the index of each number, and as many numbers: first, first + step, first + 2 step ...
+
+    In place of `np.repeat`, which takes three times as long where counts differ.
+    """
+    some = np.flatnonzero(count)
+    end = np.cumsum(count.take(some))
+    which = np.full(int(end[-1]) if len(end) else 0, 0)
+    which[end[:-1]] = 1
+    np.cumsum(which, out=which)
+    number = (first.take(some) - step * (end - count.take(some))).take(which)
+    number += np.arange(0, step * len(which), step)
+    return some.take(which), number
 
 
 def _dot(a: Any, b: Any) -> Floats:
@@ -199,34 +224,40 @@ class Hits:
     returned: Floats
 
 
-def first_hits(met: Meetings, surfels: Surfels, count: int, rng: np.random.Generator) -> Hits:
+def first_hits(parts: Sequence[Meetings], material: Material, count: int, rng: np.random.Generator) -> Hits:
     """Let each of `count` rays end on the first disc that stops it; discs of one surface are averaged.
 
     One draw a ray decides on all discs that lie within a meter of range, as they are of one fence or one tree.
     """
-    share = surfels.share.take(met.surfel)
-    stops = share > 0.98
-    open_ = np.flatnonzero(~stops)
     draws = rng.random((count, 8), dtype=np.float32)
-    stops[open_] = draws[met.ray[open_], met.range_m[open_].astype(np.int32) % 8] < share[open_]
-    kept = np.flatnonzero(stops)
-    ray, t = met.ray.take(kept), met.range_m.take(kept)
-    first = np.full(count, np.inf)  # in double precision `ufunc.at` takes a twentieth of the time
-    np.minimum.at(first, ray, t.astype(np.float64))
-    depth = (t - first.take(ray).astype(np.float32)) * met.facing.take(kept)
-    which = np.full(count, -1, np.int32)
-    at = np.flatnonzero(depth == 0)
-    which[ray[at]] = met.surfel[kept[at]]
-    same = np.flatnonzero(depth < THICKNESS_M)
-    kept, ray, t = kept.take(same), ray.take(same), t.take(same)
-    surfel, weight = met.surfel.take(kept), met.weight.take(kept)
-    total = np.bincount(ray, weight, count)
-
-    def mean(values: Floats) -> Floats:
-        with np.errstate(invalid="ignore"):
-            return (np.bincount(ray, weight * values, count) / total).astype(np.float32)
-
-    distance = mean(t)
+    first, stopped = np.full(count, np.inf), []  # in double precision `ufunc.at` takes a twentieth of the time
+    for met in parts:
+        share = material.share.take(met.surfel)
+        stops = share > 0.98
+        some = np.flatnonzero(~stops)
+        slab = met.range_m.take(some).astype(np.int64) % 8
+        stops[some] = draws.take(met.ray.take(some) * 8 + slab) < share.take(some)
+        stopped.append(stops)
+        some = np.flatnonzero(stops)
+        np.minimum.at(first, met.ray.take(some), met.range_m.take(some).astype(np.float64))
+    nearest, which = first.astype(np.float32), np.full(count, -1, np.int32)
+    total, *sums = np.zeros((4, count))
+    for met, stops in zip(parts, stopped):
+        depth = (met.range_m - nearest.take(met.ray)) * met.facing
+        some = np.flatnonzero(stops & (depth < THICKNESS_M))
+        ray, t, surfel, weight = (
+            met.ray.take(some),
+            met.range_m.take(some),
+            met.surfel.take(some),
+            met.weight.take(some),
+        )
+        np.add.at(total, ray, weight.astype(np.float64))
+        values = t, np.nan_to_num(material.intensity.take(surfel)), material.returned.take(surfel)
+        for of, value in zip(sums, values):
+            np.add.at(of, ray, (weight * value).astype(np.float64))
+        some = np.flatnonzero(t == nearest.take(ray))
+        which[ray.take(some)] = surfel.take(some)
+    with np.errstate(invalid="ignore"):
+        distance, strength, returned = ((of / total).astype(np.float32) for of in sums)
     distance[which < 0] = np.inf
-    strength = np.nan_to_num(surfels.intensity).take(surfel)
-    return Hits(distance, which, mean(strength), mean(surfels.returned.take(surfel)))
+    return Hits(distance, which, strength, returned)

@@ -26,6 +26,7 @@ ELEVATION_BIN_RAD = np.deg2rad(0.02)
 MIN_LINE_SHARE = 0.65  # of points within a quarter of the gap of a line; a half of them where there are no lines
 MIN_LINE_WIDTH_RAD = np.deg2rad(0.06)  # angles of points are not better where poses were taken off them
 MAX_LINES = 300
+NEAR_RAYS = 0.7  # between two rays, in steps and lines, that are one
 MIN_DOWN_RAD = np.deg2rad(5.0)  # below the horizon: a street is not steeper
 
 
@@ -204,7 +205,7 @@ def all_shots(shots: Shots, pattern: Pattern) -> Shots:
         return shots
     azimuth, elevation = angles_of(shots.direction @ pattern.level_R_sensor.T.astype(np.float32))
     line = _nearest(lines, elevation)
-    order = np.lexsort((azimuth, line))
+    order = np.argsort(line * 8.0 + azimuth)  # a turn is less than that; numbers are sorted faster than pairs
     a, k = azimuth[order].astype(np.float64), line[order]
     # Every line begins and ends at the seam at -180 degrees.
     first, last = np.searchsorted(k, np.arange(len(lines))), np.searchsorted(k, np.arange(len(lines)), side="right")
@@ -220,10 +221,14 @@ def all_shots(shots: Shots, pattern: Pattern) -> Shots:
     fill_e = lines[own[which]]
     inside = pattern.covered[own[which], _cell(fill_a)] & ~empty[own[which]]
     fill_a, fill_e = fill_a[inside], fill_e[inside]
-    # Lines that are no straight ones in these angles may look like two, either with gaps where the other has points.
+    # Lines that are no straight ones in these angles may look like two, either with gaps where the other has points. Of a
+    # line's own points none is as near as that, and of those of the next ones only what lies off them toward it.
     rows = [np.interp(e, lines, np.arange(len(lines))) for e in (elevation, fill_e)]
-    taken = cKDTree(np.column_stack([azimuth / pattern.step_rad, rows[0]]))
-    alone = np.isinf(taken.query(np.column_stack([fill_a / pattern.step_rad, rows[1]]), distance_upper_bound=0.7)[0])
+    off = np.flatnonzero(np.abs(rows[0] - line) > 1 - NEAR_RAYS)
+    taken = cKDTree(np.column_stack([azimuth[off] / pattern.step_rad, rows[0][off]]))
+    alone = np.isinf(
+        taken.query(np.column_stack([fill_a / pattern.step_rad, rows[1]]), distance_upper_bound=NEAR_RAYS)[0]
+    )
     fill_a, fill_e = fill_a[alone], fill_e[alone]
     level = np.stack([np.cos(fill_e) * np.cos(fill_a), np.cos(fill_e) * np.sin(fill_a), np.sin(fill_e)], 1)
     # The time of the nearest azimuth: a LiDAR that turns has little else.

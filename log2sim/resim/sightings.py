@@ -18,7 +18,7 @@ from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.resim.caster import Meetings
 from log2sim.resim.rays import Floats, Rays, bin_of
-from log2sim.resim.surfels import Surfels, joined
+from log2sim.resim.surfels import Material
 
 # Turned by 20 degrees a person shows a third of a width that was hidden. From 1.5 times as far the gaps are half as wide again.
 MIN_TURN_COS, MAX_FARTHER = np.cos(np.deg2rad(20.0)), 1.5
@@ -168,20 +168,20 @@ def thinned(of: Mapping[str, list[Sighting]], most_bytes: int) -> int:
 
 
 def with_sightings(
-    met: Meetings, surfels: Surfels, *, first: NDArray[np.int64], ids: Sequence[str], rays: Rays, scenario: Scenario,
-    sightings: Mapping[str, Sequence[Sighting]],
-) -> tuple[Meetings, Surfels]:  # fmt: skip
+    parts: Sequence[Meetings], material: Material, *, first: NDArray[np.int64], ids: Sequence[str], rays: Rays,
+    scenario: Scenario, sightings: Mapping[str, Sequence[Sighting]],
+) -> tuple[list[Meetings], Material]:  # fmt: skip
     """Let rays end on people and riders as in their sightings; where those were hidden, on their discs.
 
-    `first` (A + 2,) are the first discs of the background and of the agents `ids`, and the end. Each ray that ends on a
-    sighting gets a disc of its own, after the others.
+    `first` (A + 2,) are the first discs of the background and of the agents `ids`, and the end. After the discs comes one that
+    stops nothing, for the rays that would meet those of a body, then one for each ray that ends on a sighting.
     """
-    bounds = np.searchsorted(met.surfel, first)
-    parts, discs, total = [met.take(slice(bounds[1]))], [], len(surfels)
+    passed, total = len(material), len(material) + 1
+    parts, discs = list(parts), [material, Material(*(np.zeros(1, np.float32) for _ in range(3)))]
+    # By disc whether its agent is seen as in a sighting, and by agent the rays that end on its discs nevertheless.
+    seen, behind = np.zeros(passed + 1, bool), dict[int, NDArray[np.bool_]]()
     for k, id in enumerate(ids):
         some = sightings.get(id, ())
-        body = met.take(slice(bounds[k + 1], bounds[k + 2]))
-        parts.append(body)
         if not some:
             continue
         agent = scenario[id]
@@ -191,8 +191,8 @@ def with_sightings(
         for _ in range(2):
             agent_R_map, center = frame_at(agent, float(t_s[bin]))
             center -= rays.shift_m
-            seen = rays.bin_T_map[bin, :3, :3] @ center + rays.bin_T_map[bin, :3, 3]
-            bin = int(bin_of(np.arctan2(seen[1:2], seen[:1]))[0])
+            ahead = rays.bin_T_map[bin, :3, :3] @ center + rays.bin_T_map[bin, :3, 3]
+            bin = int(bin_of(np.arctan2(ahead[1:2], ahead[:1]))[0])
         sensor = -rays.bin_T_map[bin, :3, :3].T @ rays.bin_T_map[bin, :3, 3]
         view = agent_R_map @ (sensor - center)
         away, reach = float(np.linalg.norm(view)), float(np.linalg.norm(np.array(agent.size_m) / 2 + AROUND_M))
@@ -208,17 +208,24 @@ def with_sightings(
             chosen.angles(rays.direction[ray] @ agent_R_map.T.astype(np.float32)), distance_upper_bound=scale
         )
         state = np.append(chosen.state, np.int8(PASSED))[near]
-        hidden = np.zeros(len(rays.direction), dtype=bool)
-        hidden[ray[state == HIDDEN]] = True
-        parts[-1] = body.take(hidden[body.ray])
+        seen[first[k + 1] : first[k + 2]] = True
+        if (state == HIDDEN).any():
+            behind[k] = np.zeros(len(rays.direction), bool)
+            behind[k][ray[state == HIDDEN]] = True
         stops = (state == ENDED) | (state == LOST)
         ray, near = ray[stops], near[stops]
         one = np.ones(len(ray), np.float32)
         distance = np.linalg.norm(offset[near], axis=1).astype(np.float32)
         parts.append(Meetings(ray, np.arange(total, total + len(ray), dtype=np.int32), distance, one, one))
         total += len(ray)
-        back = (chosen.state[near] == ENDED).astype(np.float32)
-        discs.append(
-            Surfels(chosen.point_m[near], np.zeros((len(ray), 3), np.float32), one, chosen.intensity[near], one, back)
-        )
-    return Meetings.join(parts), joined([surfels, *discs])
+        discs.append(Material(chosen.intensity[near], one, (chosen.state[near] == ENDED).astype(np.float32)))
+    for met in parts if seen.any() else []:
+        rows = np.flatnonzero(seen.take(met.surfel, mode="clip"))
+        if not len(rows):
+            continue
+        ray, surfel = met.ray.take(rows), met.surfel.take(rows)
+        stays = np.zeros(len(rows), bool)
+        for k, hidden in behind.items():
+            stays |= (surfel >= first[k + 1]) & (surfel < first[k + 2]) & hidden.take(ray)
+        met.surfel[rows[~stays]] = passed
+    return parts, Material.join(discs)

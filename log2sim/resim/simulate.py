@@ -116,18 +116,18 @@ class Simulation:
             nothing = np.zeros((0, 3), np.float32)
             return Sweep(stamp_ns, nothing, t_ns=np.zeros(0, np.int64)), np.zeros(0, np.int64)
         rays = rays_in_map(shots, poses, moment)
-        placed = place(self.world, self.scenario, rays, self.agents)
-        met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
-        met, surfels = with_sightings(
-            met,
-            placed.surfels,
+        placed = place(self.world, self.scenario, rays, self.agents, model.max_range_m)
+        parts = meetings(rays, grid_of(rays), placed.surfels)
+        parts, material = with_sightings(
+            parts,
+            placed.surfels.material,
             first=placed.first,
             ids=placed.ids,
             rays=rays,
             scenario=self.scenario,
             sightings=self.world.sightings,
         )
-        hits = first_hits(met, surfels, len(shots.t_ns), rng)
+        hits = first_hits(parts, material, len(shots.t_ns), rng)
         back = rng.random(len(shots.t_ns), dtype=np.float32) < hits.returned
         back &= hits.range_m < model.max_range_m
         # Ranges of sightings have their noise.

@@ -7,7 +7,7 @@ edge and keeps that share; one that nearly all pass through was there for a mome
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,13 +16,13 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import GROUP_OF, Agent, Log, Scenario
 from log2sim.errors import LogError, RecordError
+from log2sim.files.arrays import Shelf
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.perception.records import RecordSource
 from log2sim.resim.alignment import Alignment, moved
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import (
-    Floats,
     Pattern,
     Rays,
     Shots,
@@ -35,7 +35,17 @@ from log2sim.resim.rays import (
     recorded_shots,
 )
 from log2sim.resim.sightings import Sighting, frame_at, is_non_rigid, sighting, thinned
-from log2sim.resim.surfels import SurfelGrid, Surfels, joined, local_surface, no_surfels
+from log2sim.resim.surfels import (
+    GRID_TILE_M,
+    SurfelGrid,
+    Surfels,
+    Tile,
+    Tiles,
+    by_tile,
+    joined,
+    local_surface,
+    no_surfels,
+)
 from log2sim.synth import shapes
 
 # Around the box of an agent, whose edges are not exact: what is left out of the background, and what is taken for the agent.
@@ -43,13 +53,19 @@ LEFT_OUT_M, TAKEN_M = 0.35, 0.15
 GROUND_M = 0.12  # above the bottom of a box; below that it may be the ground
 HELD_S = 0.3  # before the first and after the last waypoint
 COVERED_M = 0.25  # around a disc of an agent, where none is added
-CHECKED_SWEEPS = 25  # of each LiDAR: enough rays for the share of each disc
+# Of each LiDAR, and of so much of its way, over which a place is seen well: enough rays for the share of each disc.
+CHECKED_SWEEPS, CHECKED_WAY_M = 25, 100.0
 SAME_SURFACE_M = 0.1  # across it, between where a ray met and where it should
 MIN_SHARE = 0.2
 SAME_PLACE_M = 0.5
 # Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
 AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
 MOST_SIGHTINGS_BYTES = 256 << 20  # 64,000 sightings of 4 kB: ten minutes with ten people in sight all the time
+GRIDS_BYTES, COUNTS_BYTES = (
+    256 << 20,
+    64 << 20,
+)  # in memory, of surfaces while they are joined and of rays that are counted
+AROUND_SWEEPS = 20  # what so many have added to is within reach, and the next ones will add to it
 SIGHTINGS_EVERY = 50  # sweeps, after which they are counted
 PRIOR_RAYS, PRIOR_UNSEEN = 2.0, 0.15  # that end on a disc before any is counted; share of them for one that nobody saw
 BODY_DISC_M = 0.08  # radius of the discs of a body that nobody saw
@@ -80,7 +96,7 @@ class World:
     given, refined : PoseTrack or None
         Poses of the ego by which agents are placed, and at the same stamps those by which surfaces lie on each other: its
         background is in the map of the latter.
-    background : Surfels
+    background : Tiles
     agents : mapping of str to Surfels
         By id, in the frame of the agent.
     sightings : mapping of str to list of Sighting
@@ -96,7 +112,7 @@ class World:
     shift_m: Array
     given: PoseTrack | None
     refined: PoseTrack | None
-    background: Surfels
+    background: Tiles
     agents: Mapping[str, Surfels]
     sightings: Mapping[str, list[Sighting]]
     alignments: Mapping[str, Alignment]
@@ -106,9 +122,8 @@ class World:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What sweeps have shown of an agent; sightings are of people and riders alone, alignments of the others."""
+    """What sweeps have shown of an agent beside its surfaces; sightings are of people and riders alone, alignments of the others."""
 
-    surfaces: SurfelGrid
     alignment: Alignment
     sightings: list[Sighting]
 
@@ -117,11 +132,10 @@ class Seen:
 class Placed:
     """All surfels where they are while a sweep is recorded."""
 
-    surfels: Surfels
-    center: Floats  # (S, 3), m: the map less the shift of the rays
-    normal: Floats  # (S, 3)
+    surfels: Surfels  # in the map less the shift of the rays; column by column in memory
     first: NDArray[np.int64]  # (A + 2,): where the surfels of the background and of each agent begin, and the end
     ids: tuple[str, ...]  # of these agents
+    tiles: tuple[Tile, ...]  # of the background, one after the other
 
 
 def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
@@ -131,38 +145,61 @@ def alive(agent: Agent, t_s: Array) -> NDArray[np.bool_]:
     return there | agent.is_permanent
 
 
-def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels]) -> Placed:
-    """Put the agents of a scenario into the background, each disc where it is when the sensor looks there."""
-    parts, ids = [world.background], []
+def _is_near(agent: Agent, t_s: Array, here: Array, reach_m: float) -> bool:
+    """Tell whether an agent may be there at some of the times (T,), within reach of a place (2,), m, of the map."""
+    w = agent.waypoints
+    if not agent.is_permanent and (w.t_s[0] - HELD_S > t_s.max() or w.t_s[-1] + HELD_S < t_s.min()):
+        return False
+    # Between two waypoints it is no farther from both than they are apart.
+    way = np.hypot(np.diff(w.x_m), np.diff(w.y_m)).max(initial=0)
+    reach_m += float(way) + float(np.hypot(*agent.size_m[:2])) + 2 * HELD_S * float(np.abs(w.speed_mps).max())
+    return bool(np.hypot(w.x_m - here[0], w.y_m - here[1]).min() < reach_m)
+
+
+def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels], reach_m: float) -> Placed:
+    """Put the agents of a scenario within reach into the background, each disc where it is when the sensor looks there."""
     move = given_T_refined(world, rays.origin[len(rays.origin) // 2] + rays.shift_m, int(rays.t_ns[0]))
     rotation = move[:3, :3].astype(np.float32)
-    offset = move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m
-    center = [world.background.center_m @ rotation.T + offset.astype(np.float32)]
-    normal = [world.background.normal @ rotation.T]
+    offset = (move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m).astype(np.float32)
+    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
+    x_m, y_m, _ = np.linalg.inv(move[:3, :3]) @ (here - move[:3, 3]) - world.shift_m
+    tiles, ids = world.background.near(float(x_m), float(y_m), reach_m), []
+    parts = [no_surfels(), *(world.background[tile] for tile in tiles)]
+    center = [rotation @ part.center_m.T + offset[:, None] for part in parts]
+    normal = [rotation @ part.normal.T for part in parts]
     t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
-    sensor = rays.bin_T_map[len(rays.bin_T_map) // 2]
+    middle = len(t_s) // 2
+    sensor = rays.bin_T_map[middle].astype(np.float32)
     for agent in scenario.others:
-        there = alive(agent, t_s)
-        if not there.any() or agent.id not in agents:
+        if agent.id not in agents or not _is_near(agent, t_s, here, reach_m):
             continue
+        there = alive(agent, t_s)
         surfels, states = agents[agent.id], agent.trajectory.at(t_s)
-        position = np.column_stack([states.x_m, states.y_m, states.z_m]) - rays.shift_m
-        fit = np.zeros((len(t_s), 3))
+        pose, z = np.column_stack([states.x_m, states.y_m, states.yaw_rad]) - [*rays.shift_m[:2], 0], states.z_m
         if agent.id in world.alignments:
             fit = world.alignments[agent.id].at(t_s, states.x_m, states.y_m)
-        bins = np.full(len(surfels), len(t_s) // 2)
+            pose = np.column_stack([moved(np.column_stack([fit[:, :2], z]), pose)[:, :2], pose[:, 2] + fit[:, 2]])
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        table = np.stack([pose[:, 0], pose[:, 1], z - rays.shift_m[2], cos, sin]).astype(np.float32)
+        px, py, pz = surfels.center_m.T
+        x, y, up, c, s = table[:, middle]
         for _ in range(2):
-            at = bins
-            points = _turned(moved(surfels.center_m, fit[at]), states.yaw_rad[at]) + position[at]
-            seen = points @ sensor[:3, :3].T + sensor[:3, 3]
-            bins = bin_of(np.arctan2(seen[:, 1], seen[:, 0]))
-        own = there[bins]
-        parts.append(surfels.take(own))
-        center.append(points[own].astype(np.float32))
-        normal.append(_turned(surfels.normal[own], states.yaw_rad[at[own]] + fit[at[own], 2]).astype(np.float32))
+            points = np.stack([c * px - s * py + x, s * px + c * py + y, pz + up])
+            ahead, left, _ = sensor[:3, :3] @ points + sensor[:3, 3:]
+            bins = bin_of(np.arctan2(left, ahead))
+            x, y, up, c, s = table.take(bins, axis=1)
+        nx, ny, nz = surfels.normal.T
+        turned, own = np.stack([c * nx - s * ny, s * nx + c * ny, nz]), there[bins]
+        if not own.all():
+            surfels, points, turned = surfels.take(own), points[:, own], turned[:, own]
+        parts.append(surfels)
+        center.append(points)
+        normal.append(turned)
         ids.append(agent.id)
-    first = np.cumsum([0, *(len(p) for p in parts)])
-    return Placed(joined(parts), np.concatenate(center), np.concatenate(normal), first, tuple(ids))
+    first = np.cumsum([0, sum(len(p) for p in parts[: len(tiles) + 1]), *(len(p) for p in parts[len(tiles) + 1 :])])
+    columns = (np.concatenate(of, axis=1).T for of in (center, normal))
+    rest = (np.concatenate([vars(p)[name] for p in parts]) for name in ("radius_m", "intensity", "share", "returned"))
+    return Placed(Surfels(*columns, *rest), first, tuple(ids), tuple(tiles))
 
 
 def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
@@ -174,12 +211,6 @@ def given_T_refined(world: World, here: Array, t_ns: int) -> Array:
     late = np.where(distance < distance.min() + SAME_PLACE_M, np.abs(world.given.t_ns - t_ns), np.iinfo(np.int64).max)
     k = int(late.argmin())
     return np.asarray(world.given.map_T_ego[k] @ inverse(world.refined.map_T_ego[k]))
-
-
-def _turned(v: Floats | Array, yaw: Array) -> Array:
-    """Turn vectors (N, 3) about the vertical axis by yaws (N,)."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
 
 
 def build_world(
@@ -209,8 +240,10 @@ def build_world(
     """
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
-    background = SurfelGrid()
-    seen = {agent.id: Seen(SurfelGrid(), Alignment(agent), []) for agent in scenario.others}
+    grids: Shelf[Tile | str, SurfelGrid] = Shelf(
+        SurfelGrid.arrays, SurfelGrid, GRIDS_BYTES, changing=True, rounds=AROUND_SWEEPS
+    )
+    seen = {agent.id: Seen(Alignment(agent), []) for agent in scenario.others}
     sightings = {id: s.sightings for id, s in seen.items()}
     refined = refine_poses(log)
     surveyed = log if refined is None else log.changed(ego=refined)
@@ -231,7 +264,8 @@ def build_world(
                 scale = float(known.mean()) if len(known) and known.mean() > 0 else np.nan
                 top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
             far = max(far, float(shots.range_m.max()))
-            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, background, seen))
+            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, grids, seen))
+            grids.put_away()
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
             if done % SIGHTINGS_EVERY == 0:
                 gone += thinned(sightings, MOST_SIGHTINGS_BYTES)
@@ -242,31 +276,44 @@ def build_world(
         raise LogError(
             f"log '{log.name}': no sweep of {', '.join(lidars)} can be used; there is nothing to simulate from"
         )
-    surfaces = {id: s.alignment.centered(s.surfaces.surfels()) for id, s in seen.items()}
+    surfaces = {
+        id: s.alignment.centered(grids[id].surfels() if id in grids else no_surfels()) for id, s in seen.items()
+    }
     agents = {agent.id: completed(agent, surfaces[agent.id]) for agent in scenario.others}
     unseen = [id for id, surfels in surfaces.items() if not len(surfels)]
     notes = [f"no point of {', '.join(unseen)} was recorded: each is a body of its category"] if unseen else []
     if gone:
         kept = sum(len(some) for some in sightings.values())
         notes.append(f"of {gone + kept} sightings of people and riders {kept} are kept, by side, distance and time")
-    standing = background.surfels()
-    standing = joined([standing, *(ground_below(a, standing, shift) for a in scenario.others if a.static)])
+    standing = Tiles()
+    for key in list(grids):
+        if isinstance(key, tuple):
+            standing.add(grids.pop(key).surfels())
+    for agent in scenario.others:
+        if agent.static:
+            standing.add(ground_below(agent, standing, shift))
     given = log.ego if refined is not None else None
     alignments = {id: s.alignment for id, s in seen.items()}
     world = World(shift, given, refined, standing, agents, sightings, alignments, models, tuple(notes))
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
     for _ in range(2):
-        trimmed = {id: _trimmed(surfels) for id, surfels in world.agents.items()}
-        world = replace(world, background=_trimmed(world.background), agents=trimmed)
-        world = _weighed(log, scenario, world, leave_out, progress)
-    there = {id: surfels.take(surfels.share > MIN_SHARE) for id, surfels in world.agents.items()}
-    return replace(world, background=world.background.take(world.background.share > MIN_SHARE), agents=there)
+        world = _weighed(log, scenario, _changed(world, _trimmed), leave_out, progress)
+    return _changed(world, lambda surfels: surfels.take(surfels.share > MIN_SHARE))
 
 
-def ground_below(agent: Agent, background: Surfels, shift_m: Array) -> Surfels:
+def _changed(world: World, change: Callable[[Surfels], Surfels]) -> World:
+    """Return a world with other surfels; those of the background are changed in place."""
+    for tile in list(world.background):
+        world.background[tile] = change(world.background[tile])
+    return replace(world, agents={id: change(surfels) for id, surfels in world.agents.items()})
+
+
+def ground_below(agent: Agent, standing: Tiles, shift_m: Array) -> Surfels:
     """Go on with the ground around an agent that stands, which hides what is below it; nothing where there is no ground."""
     w, half = agent.waypoints, np.array(agent.size_m) / 2
+    x, y = w.x_m[0] - shift_m[0], w.y_m[0] - shift_m[1]
+    background = joined(standing[t] for t in standing.near(x, y, float(np.hypot(*half[:2])) + 2 * AROUND_M))
     c, s = np.cos(w.yaw_rad[0]), np.sin(w.yaw_rad[0])
     offset = background.center_m - (np.array([w.x_m[0], w.y_m[0], w.z_m[0] - half[2]]) - shift_m)
     along, across = c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]
@@ -315,7 +362,7 @@ def _add_sweep(
     pattern: Pattern,
     scale: float,
     shift: Array,
-    background: SurfelGrid,
+    grids: MutableMapping[Tile | str, SurfelGrid],
     seen: Mapping[str, Seen],
 ) -> float:
     """Share out the points of a sweep to the background and the agents; return the noise of its ranges, m."""
@@ -328,7 +375,10 @@ def _add_sweep(
     free = ~_on_ego(log, name, shots, points)
     t_s = (shots.t_ns - scenario.t0_ns) / NS_PER_S
     middle_s, people = np.array([t_s.mean()]), list[tuple[Agent, NDArray[np.intp]]]()
+    here, far = poses[0, :3, 3], float(shots.range_m.max())
     for agent in scenario.others:
+        if not _is_near(agent, t_s[[0, -1]], here, far):
+            continue
         half = np.array(agent.size_m) / 2
         x, y, _, _, speed = (v[0] for v in agent.trajectory.at(middle_s))
         reach = np.hypot(half[0], half[1]) + LEFT_OUT_M + 0.2 * abs(speed)
@@ -356,7 +406,7 @@ def _add_sweep(
         rows = rows[taken]
         if len(rows):
             axes = axes[taken].astype(np.float32)
-            seen[agent.id].surfaces.add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
+            _grid(grids, agent.id).add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
             if is_non_rigid(agent):
                 people.append((agent, rows))
     if people:
@@ -366,8 +416,16 @@ def _add_sweep(
     points = np.einsum("nij,nj->ni", rotation, shots.direction[free] * shots.range_m[free, None])
     points += poses[moment, :3, 3] - shift
     normal = np.einsum("nij,nj->ni", rotation, surface.normal[free])
-    background.add(points, normal.astype(np.float32), surface.radius_m[free], intensity[free])
+    normal, radius, intensity = normal.astype(np.float32), surface.radius_m[free], intensity[free]
+    for tile, rows in by_tile(points, GRID_TILE_M):
+        _grid(grids, tile).add(points[rows], normal[rows], radius[rows], intensity[rows])
     return surface.noise_m
+
+
+def _grid(grids: MutableMapping[Tile | str, SurfelGrid], key: Tile | str) -> SurfelGrid:
+    if key not in grids:
+        grids[key] = SurfelGrid()
+    return grids[key]
 
 
 def _add_sightings(
@@ -438,14 +496,16 @@ def _weighed(
     log: Log, scenario: Scenario, world: World, leave_out: Callable[[str, int], bool], progress: Progress
 ) -> World:
     """Count which rays end on each disc, pass through it or do not come back; leave out what is not there."""
-    ids = list(world.agents)
-    begin = dict(zip(["", *ids], np.cumsum([0, len(world.background), *(len(world.agents[i]) for i in ids)])))
-    hit, passed, lost = np.zeros((3, len(world.background) + sum(len(a) for a in world.agents.values())))
+    # Of each tile and agent, by disc: the rays that end on it, pass through it and do not come back.
+    counts: Shelf[Tile | str, Array] = Shelf(lambda a: [a], np.array, COUNTS_BYTES, changing=True)
     # Whole agents: what `place` takes of them depends on the time.
     numbered = {k: replace(a, returned=np.arange(len(a), dtype=np.float32)) for k, a in world.agents.items()}
     for name, model in world.models.items():
         usable = [i for i in range(len(log.streams[name].t_ns)) if not leave_out(name, i)]
-        chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, CHECKED_SWEEPS).astype(int))]
+        poses, known = log.map_T_sensor(name, log.streams[name].t_ns[usable])
+        way_m = float(np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1).sum())
+        many = round(CHECKED_SWEEPS * max(1.0, way_m / CHECKED_WAY_M))
+        chosen = [usable[k] for k in np.unique(np.linspace(0, len(usable) - 1, many).astype(int))]
         for done, i in enumerate(chosen):
             progress(f"rays of {name} through the world", done + 1, len(chosen))
             shots = _readable(log, name, i)
@@ -454,33 +514,40 @@ def _weighed(
             shots = all_shots(shots, model.pattern)
             poses, moment, _ = poses_of(log, name, shots.t_ns)
             rays = rays_in_map(shots, poses, moment)
-            placed = place(world, scenario, rays, numbered)
-            met = meetings(rays, grid_of(rays), placed.surfels, placed.center, placed.normal)
-            column = np.arange(len(placed.surfels))
-            for k, id in enumerate(placed.ids):
-                part = slice(placed.first[k + 1], placed.first[k + 2])
-                column[part] = begin[id] + placed.surfels.returned[part].astype(np.int64)
-            behind = (shots.range_m[met.ray] - met.range_m) * met.facing
-            there = np.abs(behind) < SAME_SURFACE_M
-            np.add.at(hit, column[met.surfel[there]], met.weight[there])
-            through = behind > SAME_SURFACE_M
-            np.add.at(passed, column[met.surfel[through]], met.weight[through])
-            # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
-            nothing = np.isnan(shots.range_m)[met.ray]
-            nearest = np.full(len(shots.t_ns), np.inf)
-            np.minimum.at(nearest, met.ray[nothing], met.range_m[nothing].astype(np.float64))
-            first = nothing & (met.range_m == nearest[met.ray])
-            np.add.at(lost, column[met.surfel[first]], met.weight[first])
-    prior = PRIOR_RAYS * np.concatenate([world.background.share, *(world.agents[id].share for id in ids)])
-    share = ((hit + prior) / (hit + passed + prior)).astype(np.float32)
-    returned = ((hit + PRIOR_RAYS) / (hit + lost + PRIOR_RAYS)).astype(np.float32)
+            placed = place(world, scenario, rays, numbered, model.max_range_m)
+            hit, passed, lost = found = np.zeros((3, len(placed.surfels)))
+            nothing, nearest = np.isnan(shots.range_m), np.full(len(shots.t_ns), np.inf)
+            lone = []
+            for met in meetings(rays, grid_of(rays), placed.surfels):
+                surfel, weight = met.surfel.astype(np.int64), met.weight.astype(np.float64)
+                behind = (shots.range_m.take(met.ray) - met.range_m) * met.facing
+                for of, where in ((hit, np.abs(behind) < SAME_SURFACE_M), (passed, behind > SAME_SURFACE_M)):
+                    rows = np.flatnonzero(where)
+                    np.add.at(of, surfel.take(rows), weight.take(rows))
+                # Of a ray that did not come back, the first disc; of one that did, that on which it ended.
+                rows = np.flatnonzero(nothing.take(met.ray))
+                lone.append((met.ray.take(rows), met.range_m.take(rows), surfel.take(rows), weight.take(rows)))
+                np.minimum.at(nearest, lone[-1][0], lone[-1][1].astype(np.float64))
+            for ray, range_m, surfel, weight in lone:
+                rows = np.flatnonzero(range_m == nearest.take(ray))
+                np.add.at(lost, surfel.take(rows), weight.take(rows))
+            end = 0
+            for tile in placed.tiles:
+                begin, end = end, end + len(world.background[tile])
+                counts[tile] = counts.get(tile, 0) + found[:, begin:end]
+            for id, begin, end in zip(placed.ids, placed.first[1:], placed.first[2:]):
+                counts[id] = counts.get(id, np.zeros((3, len(numbered[id]))))
+                counts[id][:, placed.surfels.returned[begin:end].astype(np.int64)] += found[:, begin:end]
 
-    def judged(surfels: Surfels, at: int) -> Surfels:
-        rows = slice(at, at + len(surfels))
-        return replace(surfels, share=share[rows], returned=returned[rows])
+    def judged(surfels: Surfels, key: Tile | str) -> Surfels:
+        hit, passed, lost = counts.get(key, np.zeros((3, len(surfels))))
+        prior = PRIOR_RAYS * surfels.share
+        share, returned = (hit + prior) / (hit + passed + prior), (hit + PRIOR_RAYS) / (hit + lost + PRIOR_RAYS)
+        return replace(surfels, share=share.astype(np.float32), returned=returned.astype(np.float32))
 
-    agents = {id: judged(world.agents[id], begin[id]) for id in ids}
-    return replace(world, background=judged(world.background, 0), agents=agents)
+    for tile in list(world.background):
+        world.background[tile] = judged(world.background[tile], tile)
+    return replace(world, agents={id: judged(surfels, id) for id, surfels in world.agents.items()})
 
 
 def mesh_of(agent: Agent) -> shapes.Mesh:

@@ -1,8 +1,9 @@
 """Peak memory of a reconstruction against the length of its log, which is driven several times in a row.
 
     python tools/bench.py memory LOG --times 4 --times 30
+    python tools/bench.py memory LOG --times 4 --times 30 --world
 
-Each length runs in a process of its own. The table has the peak by stage and what a tick more adds to it.
+Each length runs in a process of its own, and so does the world of simulated sensors (`--world`). The table has the peak by stage and what a tick more adds to it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,27 +26,49 @@ RUN = """
 import json, sys
 from log2sim import Config, open_log, reconstruct
 from benchmarks.memory import loop_log
-path, times = json.loads(sys.argv[1])
+path, times, saved = json.loads(sys.argv[1])
 result = reconstruct(loop_log(open_log(path), times), Config.load(detect={"name": "lidar:vehicle"}))
+result.scenario.save(saved)
 print(json.dumps({"ticks": result.report["ticks"], "stages": result.report["stages"], "agents": len(result.scenario.agents)}))
+"""
+WORLD = """
+import json, resource, sys
+from log2sim import Scenario, open_log
+from benchmarks.memory import loop_log
+from log2sim.resim.world import build_world
+path, times, saved = json.loads(sys.argv[1])
+log = loop_log(open_log(path), times)
+build_world(log, Scenario.load(saved), list(log.lidars))
+print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 """
 
 
-def measure(path: str, times: int) -> dict[str, Any]:
+def measure(path: str, times: int, world: bool) -> dict[str, Any]:
     """Reconstruct a log that is driven several times in a row; returns ticks, agents and the report's stages."""
-    job = json.dumps([path, times])
-    ran = subprocess.run(
-        [sys.executable, "-c", RUN, job], capture_output=True, text=True, check=False, cwd=Path(__file__).parents[1]
-    )
-    if ran.returncode:
-        raise SystemExit(ran.stderr)
-    found: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    with tempfile.TemporaryDirectory() as folder:
+        job = [path, times, str(Path(folder) / "scenario.json")]
+        found: dict[str, Any] = _run(RUN, job)
+        if world:
+            found["stages"].append({"stage": "world", "peak_memory_mib": _run(WORLD, job)})
     return found
 
 
-def main(log: Path, times: list[int] = [1, 4, 16]) -> None:
+def _run(code: str, job: list[Any]) -> Any:
+    ran = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(job)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[1],
+    )
+    if ran.returncode:
+        raise SystemExit(ran.stderr)
+    return json.loads(ran.stdout.splitlines()[-1])
+
+
+def main(log: Path, times: list[int] = [1, 4, 16], world: bool = False) -> None:
     """Print the table."""
-    runs = [measure(str(log.resolve()), count) for count in times]
+    runs = [measure(str(log.resolve()), count, world) for count in times]
     peaks = [{stage["stage"]: float(stage["peak_memory_mib"]) for stage in run["stages"]} for run in runs]
     names = dict.fromkeys(name for of_run in peaks for name in of_run)
     rows = [[name, *(f"{of_run[name]:.0f} MiB" if name in of_run else "-" for of_run in peaks)] for name in names]

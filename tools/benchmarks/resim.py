@@ -39,7 +39,7 @@ from log2sim.pipeline import reconstruct
 from log2sim.resim.cameras import Pictures
 from log2sim.resim.rays import Shots, all_shots, poses_of, recorded_shots
 from log2sim.resim.simulate import Simulation, simulated_log
-from log2sim.resim.surfels import Surfels
+from log2sim.resim.surfels import Surfels, Tiles
 from log2sim.resim.world import World, build_world
 from log2sim.scenarios.tagging import find_tags
 from log2sim.synth import load_scene, synthesize
@@ -126,7 +126,7 @@ def flat_world(log: Log, world: World) -> World:
     one = np.ones(len(center), np.float32)
     up = np.tile(np.array([0, 0, 1], np.float32), (len(center), 1))
     ground = Surfels(center, up, one * np.float32(GROUND_STEP_M), one, one, one)
-    return replace(world, given=None, refined=None, background=ground, agents={}, sightings={}, alignments={})
+    return replace(world, given=None, refined=None, background=Tiles(ground), agents={}, sightings={}, alignments={})
 
 
 def held_out(log: Log, scenario: Scenario, name: str, world: World, first: int) -> list[tuple[str, Figures]]:
@@ -147,7 +147,11 @@ def held_out(log: Log, scenario: Scenario, name: str, world: World, first: int) 
         near = [p[np.linalg.norm(p, axis=1) < LIMIT_M] for p in (shots.direction * shots.range_m[:, None], moved.xyz_m)]
         rows["nearest sweep, moved"][-1].update(chamfer(*near))
     count = len(rows["held out"])
-    speed = {"sweeps/s": count / cast_s, "rays": sent / count, "surfels": float(len(world.background))}
+    speed = {
+        "sweeps/s": count / cast_s,
+        "rays": sent / count,
+        "surfels": float(sum(map(len, world.background.values()))),
+    }
     return [(title, mean(of) | (speed if title == "held out" else {})) for title, of in rows.items()]
 
 
