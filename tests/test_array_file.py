@@ -11,7 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from log2sim.datatypes import Measurements, Obstacles, Rays
-from log2sim.files.arrays import ArrayFile, ArrayList, Shelf, StoredArray, array_lengths, join_arrays, take_arrays
+from log2sim.files.arrays import (
+    ArrayFile,
+    ArrayList,
+    DiskBackedMap,
+    StoredArray,
+    array_lengths,
+    join_arrays,
+    take_arrays,
+)
 from log2sim.perception.first_pass import ObstacleList
 
 DTYPES = (np.float32, np.float64, np.int64, np.uint8)
@@ -96,33 +104,33 @@ def test_arrays_go_along_to_other_processes(memory_bytes: int) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from(["add", "read", "forget"])), max_size=40), st.booleans())
-def test_a_shelf_is_a_dictionary_whatever_waits_in_its_file(steps: list[tuple[int, str]], changing: bool) -> None:
+def test_a_map_on_disk_is_a_dictionary_whatever_waits_in_its_file(steps: list[tuple[int, str]], changing: bool) -> None:
     """Two of the arrays have room; those of one that changes are changed in place, and grow."""
-    shelf: Shelf[int, np.ndarray] = Shelf(lambda a: [a], np.array, 2 * 24, changing=changing)
+    kept_things: DiskBackedMap[int, np.ndarray] = DiskBackedMap(lambda a: [a], np.array, 2 * 24, changing=changing)
     known: dict[int, np.ndarray] = {}
     for key, step in steps:
         if step == "forget":
-            assert (shelf.pop(key, None) is None) == (known.pop(key, None) is None)
+            assert (kept_things.pop(key, None) is None) == (known.pop(key, None) is None)
         elif key not in known or step == "add":
-            known[key] = shelf[key] = np.arange(3.0) + len(known)
+            known[key] = kept_things[key] = np.arange(3.0) + len(known)
         elif changing:
-            shelf[key][0] += 1
-            known[key] = shelf[key].copy()
-        assert sum(a.nbytes for a in shelf._near.values()) <= 2 * 24
-        assert set(shelf) == set(known)
-        assert len(shelf) == len(known)
+            kept_things[key][0] += 1
+            known[key] = kept_things[key].copy()
+        assert sum(a.nbytes for a in kept_things._near.values()) <= 2 * 24
+        assert set(kept_things) == set(known)
+        assert len(kept_things) == len(known)
     for key, array in known.items():
-        np.testing.assert_array_equal(shelf[key], array)
+        np.testing.assert_array_equal(kept_things[key], array)
     with pytest.raises(KeyError):
-        shelf[9]
+        kept_things[9]
 
 
-def test_what_was_just_used_stays_on_a_shelf() -> None:
-    shelf: Shelf[int, np.ndarray] = Shelf(lambda a: [a], np.array, 0, changing=True, rounds=2)
+def test_what_was_just_used_stays_in_memory() -> None:
+    kept_things: DiskBackedMap[int, np.ndarray] = DiskBackedMap(lambda a: [a], np.array, 0, changing=True, rounds=2)
     for key in range(3):
-        shelf[key] = np.zeros(3)
+        kept_things[key] = np.zeros(3)
     for round, waiting in ((1, 0), (2, 2), (3, 2)):
-        shelf[0][0] += 1
-        shelf.put_away()
-        assert len(shelf._far) == waiting, round
-    assert shelf[0][0] == 3
+        kept_things[0][0] += 1
+        kept_things.put_away()
+        assert len(kept_things._far) == waiting, round
+    assert kept_things[0][0] == 3

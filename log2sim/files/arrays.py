@@ -144,7 +144,7 @@ Key = TypeVar("Key", bound=Hashable)
 Thing = TypeVar("Thing", bound=Sized)
 
 
-class Shelf(MutableMapping[Key, Thing], Generic[Key, Thing]):
+class DiskBackedMap(MutableMapping[Key, Thing], Generic[Key, Thing]):
     """Things made of arrays, by key: those that were used last are in memory, the others in a file.
 
     Parameters

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from log2sim.files.arrays import Columns, Shelf
+from log2sim.files.arrays import Columns, DiskBackedMap
 from log2sim.geometry import Array
 from log2sim.resim.rays import Floats, Pattern, Shots, angles_of
 
@@ -210,7 +210,7 @@ def by_tile(points: Array | Floats, side_m: float) -> Iterator[tuple[Tile, NDArr
             yield (int(tile[rows[0], 0]), int(tile[rows[0], 1])), rows
 
 
-class Tiles(Shelf[Tile, Surfels]):
+class Tiles(DiskBackedMap[Tile, Surfels]):
     """Surfels of what stands, by tile; of a large world those near the sensor are in memory, and the others in a file."""
 
     def __init__(self, surfels: Surfels | None = None) -> None:

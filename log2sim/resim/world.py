@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.datatypes import GROUP_OF, Agent, Log, Scenario
 from log2sim.errors import LogError, RecordError
-from log2sim.files.arrays import Shelf
+from log2sim.files.arrays import DiskBackedMap
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, inverse
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.perception.records import RecordSource
@@ -61,10 +61,8 @@ SAME_PLACE_M = 0.5
 # Ground around an agent, how far it may be off the bottom of its box, and the discs that go on with it.
 AROUND_M, MAX_STEP_M, GROUND_DISC_M = 1.5, 0.4, 0.15
 MOST_SIGHTINGS_BYTES = 256 << 20  # 64,000 sightings of 4 kB: ten minutes with ten people in sight all the time
-GRIDS_BYTES, COUNTS_BYTES = (
-    256 << 20,
-    64 << 20,
-)  # in memory, of surfaces while they are joined and of rays that are counted
+# In memory: of surfaces while they are joined, and of rays that are counted.
+GRIDS_BYTES, COUNTS_BYTES = 256 << 20, 64 << 20
 AROUND_SWEEPS = 20  # what so many have added to is within reach, and the next ones will add to it
 SIGHTINGS_EVERY = 50  # sweeps, after which they are counted
 PRIOR_RAYS, PRIOR_UNSEEN = 2.0, 0.15  # that end on a disc before any is counted; share of them for one that nobody saw
@@ -240,7 +238,7 @@ def build_world(
     """
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
-    grids: Shelf[Tile | str, SurfelGrid] = Shelf(
+    grids: DiskBackedMap[Tile | str, SurfelGrid] = DiskBackedMap(
         SurfelGrid.arrays, SurfelGrid, GRIDS_BYTES, changing=True, rounds=AROUND_SWEEPS
     )
     seen = {agent.id: Seen(Alignment(agent), []) for agent in scenario.others}
@@ -497,7 +495,7 @@ def _weighed(
 ) -> World:
     """Count which rays end on each disc, pass through it or do not come back; leave out what is not there."""
     # Of each tile and agent, by disc: the rays that end on it, pass through it and do not come back.
-    counts: Shelf[Tile | str, Array] = Shelf(lambda a: [a], np.array, COUNTS_BYTES, changing=True)
+    counts: DiskBackedMap[Tile | str, Array] = DiskBackedMap(lambda a: [a], np.array, COUNTS_BYTES, changing=True)
     # Whole agents: what `place` takes of them depends on the time.
     numbered = {k: replace(a, returned=np.arange(len(a), dtype=np.float32)) for k, a in world.agents.items()}
     for name, model in world.models.items():
