@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -27,7 +28,8 @@ from log2sim.logs.ros.messages import read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "samples/cookbook").glob("*.md"))}
-README = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
+FRONT = (ROOT / "README.md").read_text(encoding="utf-8")
+README = "\n".join([FRONT, *PAGES.values()])
 GROUP = typer.main.get_group(entry.app)
 
 
@@ -50,10 +52,15 @@ def blocks() -> Iterator[str]:
             yield "\n".join(lines)
 
 
-def runnable_script() -> str:
-    """Blocks marked `sh` and `python` as one bash script that stops at the first line that fails and names it."""
+def runnable(page: str) -> list[tuple[str, str]]:
+    """Blocks marked `sh` and `python`."""
+    return re.findall(r"^```(sh|python)\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+
+
+def script_of(page: str) -> str:
+    """The blocks as one bash script that stops at the first line that fails and names it."""
     lines = ["set -Eeo pipefail", """trap 'echo "failed: $BASH_COMMAND" >&2' ERR"""]
-    for language, block in re.findall(r"^```(sh|python)\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL):
+    for language, block in runnable(page):
         lines.append(block if language == "sh" else f"python - <<'END_OF_PYTHON'\n{block}END_OF_PYTHON")
     return "\n".join(lines)
 
@@ -173,12 +180,19 @@ def fresh_environment(tmp_path: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_every_line_of_the_readme_runs_for_a_new_user(fresh_checkout: Path, fresh_environment: dict[str, str]) -> None:
-    script = runnable_script()
-    ran = subprocess.run(
-        ["bash", "--norc", "-c", script],
-        cwd=fresh_checkout, env=fresh_environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert ran.returncode == 0, ran.stderr[-3000:]
+    """README.md in a shell, and then the cookbook in one process of the environment that README.md made."""
+    python = fresh_checkout / ".venv/bin/python"
+    inside = {**fresh_environment, "PATH": f"{python.parent}:{fresh_environment['PATH']}"}
+    pages = [block for page in PAGES.values() for block in runnable(page)]
+    for command, variables, given in (
+        (["bash", "--norc", "-c", script_of(FRONT)], fresh_environment, ""),
+        ([python, "tests/run_blocks.py"], inside, json.dumps(pages)),
+    ):
+        ran = subprocess.run(
+            command, cwd=fresh_checkout, env=variables, input=given, capture_output=True, text=True, check=False
+        )
+        assert ran.returncode == 0, ran.stderr[-3000:]
+    script = script_of(README)
     promised = set(re.findall(r"--(?:out|report) (\S+)", script)) | set(re.findall(r"""\.save\("([^"]+)"\)""", script))
     missing = sorted(name for name in promised if not (fresh_checkout / name).exists())
     assert promised, "the README writes no files"
