@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browser import Browser
+from browser import Browser, opened
 from command_line import names, run
 from worlds import waypoints
 
@@ -144,14 +143,6 @@ def test_a_page_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 # What it does
 
 
-@pytest.fixture
-def browser(chromium: Browser) -> Iterator[Browser]:
-    """The browser, whose pages must neither log an error nor ask for anything but themselves."""
-    yield chromium
-    assert chromium.log("browser") == []
-    assert {address.split("#")[0].rpartition("/")[2] for address in chromium.requests()} <= {"page.html"}
-
-
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the sample with all layers."""
@@ -159,11 +150,6 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario = Scenario.load(TRUTH)
     write_page(scenario, path, truth=scenario, replay=replay(scenario, dt_s=0.1))
     return path
-
-
-def opened(browser: Browser, page: Path, hash: str = "", **window: Any) -> Browser:
-    browser.open(page.as_uri() + hash, **window)
-    return browser
 
 
 def page_with(tmp_path: Path, *agents: Agent, name: str = "made") -> Path:
