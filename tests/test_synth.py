@@ -93,18 +93,6 @@ def test_a_written_log_holds_its_truth_and_nothing_is_replaced_unasked(tmp_path:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "mine"]
 
 
-SAMPLE = Path(__file__).resolve().parent.parent / "samples" / "crossing.toml"
-
-
-def test_the_sample_has_the_agents_that_a_junction_needs() -> None:
-    scene = load_scene(SAMPLE)
-    assert len(scene.agent) >= 8
-    assert {a.category for a in scene.agent} >= {"car", "pedestrian", "cyclist", "bus"}
-    assert len(scene.camera) >= 3
-    assert any(a.wait_s for a in scene.agent)
-    assert any(a.pose for a in scene.agent)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
