@@ -21,6 +21,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from command_line import run
 from entry import commands_in
 
 from log2sim.cli import entry
@@ -31,6 +32,7 @@ PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / 
 FRONT = (ROOT / "README.md").read_text(encoding="utf-8")
 README = "\n".join([FRONT, *PAGES.values()])
 GROUP = typer.main.get_group(entry.app)
+SAMPLE_S = 3.6  # the latest moment that a line names, and a little more
 
 
 def test_documents_name_tools_that_exist() -> None:
@@ -145,7 +147,7 @@ def _imports(block: str) -> list[ast.ImportFrom]:
 
 @pytest.fixture
 def fresh_checkout(tmp_path: Path) -> Path:
-    """A copy of what a clone of this checkout with its uncommitted work would hold."""
+    """A copy of what a clone of this checkout with its uncommitted work would hold, with the first seconds of the sample."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git to tell the files of the checkout from others")
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
@@ -155,6 +157,11 @@ def fresh_checkout(tmp_path: Path) -> Path:
             target = tmp_path / "log2sim" / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target)
+    sample, part = tmp_path / "log2sim/samples/crossing", tmp_path / "part"
+    assert run("convert", sample, "--stop", SAMPLE_S, "--out", part).code == 0
+    (sample / "truth.json").rename(part / "truth.json")
+    shutil.rmtree(sample)
+    part.rename(sample)
     return tmp_path / "log2sim"
 
 
