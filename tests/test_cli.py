@@ -195,12 +195,8 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
     [
         ((), "no edits"),
         (("--shift", "ego"), "--shift ego: expected an agent, '=' and a number"),
-        (("--shift", "=1"), "expected an agent, '=' and a number"),
-        (("--speed", "ego=fast"), "expected an agent, '=' and a number"),
         (("--speed", "ego=0"), "expected a number from 0.01 to 100"),
         (("--lateral", "ego=nan"), "nan m for agent 'ego'"),
-        (("--shift", "eg=1"), "did you mean 'ego'?"),
-        (("--remove", "ego", "--shift", "ego=1"), "left out by another edit"),
     ],
 )
 def test_edit_refuses_what_makes_no_sense_and_writes_nothing(

@@ -58,7 +58,7 @@ def world_at_20_hz() -> tuple[Log, Scenario]:
     return tiny_log(agents, duration_s=4.5, ego=ego, **sensors(20.0))
 
 
-@pytest.mark.parametrize("rate_hz", [20, 10, 2])
+@pytest.mark.parametrize("rate_hz", [20, 2])
 def test_everybody_is_found_at_any_rate(world_at_20_hz: tuple[Log, Scenario], rate_hz: int) -> None:
     log, truth = world_at_20_hz
     found = evaluate(reconstruct(every(log, 20 // rate_hz), LABELS).scenario, truth)

@@ -10,7 +10,7 @@ from log2sim.datatypes import Lidar, Log
 from log2sim.files import stages
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, transform
-from log2sim.plan import Decision, HomographyScope, Plan, Stage, make_plan, select_sensors
+from log2sim.plan import Decision, Plan, Stage, make_plan, select_sensors
 
 
 def make_log(
@@ -54,15 +54,6 @@ def test_every_stage_is_decided_once_with_a_reason() -> None:
     assert not plan_of().keeps(Stage.DETECTION_IN_SWEEPS)
     assert all(len(d.reason) > 5 for d in decisions)
     assert decisions[0].to_dict() == {"stage": "use of every LiDAR", "kept": True, "reason": "1 within range"}
-
-
-def test_a_homography_is_kept_without_lidar_and_for_what_lidar_misses() -> None:
-    assert plan_of(make_log(lidars=())).homography is HomographyScope.CAMERAS_IN_NEED
-    assert plan_of().homography is HomographyScope.CAMERAS_IN_NEED
-    assert plan_of(config=Config.load(settings=["topdown.method=off"])).homography is HomographyScope.NONE
-    reasons = [decided(Stage.HOMOGRAPHY, log)[1] for log in (make_log(lidars=()), make_log())]
-    assert "without LiDAR" in reasons[0]
-    assert "without LiDAR points" in reasons[1]
 
 
 def test_a_variant_changes_one_decision() -> None:

@@ -52,13 +52,6 @@ def make_scenario() -> Scenario:
     )
 
 
-def test_the_ego_is_told_from_the_others() -> None:
-    scenario = make_scenario()
-    assert scenario.ego is scenario.agents[0]
-    assert [a.id for a in scenario.others] == ["car-1", "x"]
-    assert replace(scenario, agents=scenario.agents[1:]).ego is None
-
-
 def drive(t_s: list[float], yaw_rad: list[float] | None = None) -> Agent:
     """An agent at x = 10 t, y = -t, z = 1, speeding up as 2 t."""
     t = np.array(t_s)

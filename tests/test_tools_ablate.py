@@ -6,7 +6,6 @@ import importlib
 import sys
 
 import ablate
-import numpy as np
 import pytest
 
 from log2sim.config import Config
@@ -75,17 +74,6 @@ def test_changes_reach_all_that_is_derived_from_what_is_changed(toy):
         assert answer() == -1.0
     ablate.Imports(toy).put("toy.user", "turned", found["toy.user.turned"].value)
     assert answer() == 7.0
-
-
-def test_whole_numbers_change_by_one_and_shares_stay_below_one():
-    assert [ablate.scaled(2, f) for f in (0.7, 1.3)] == [1, 3]
-    assert ablate.scaled(10, 1.3) == 13
-    assert [ablate.scaled(v, 1.3, share=True) for v in (0.9, 0.2)] == pytest.approx([0.95, 0.26])
-    doubled = ablate.mapped({"a": (0.9, True, "x"), "b": np.array([1.0, 2.0])}, lambda v: 2 * v)
-    assert doubled["a"] == (1.8, True, "x")
-    np.testing.assert_array_equal(doubled["b"], [2.0, 4.0])
-    changes = {v.change: v.value for v in ablate.scalings(ablate.Variation("", "m", "MAX_GAP_M", "", 2.0))}
-    assert changes == {"x0.7": pytest.approx(1.4), "x1.3": pytest.approx(2.6), "off": np.inf}
 
 
 def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
