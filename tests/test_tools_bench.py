@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import pickle
 import re
+import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks import poses, warnings
+from benchmarks.kitti import choose, describe_sequence, read_sequence
+from conftest import SHARED
 from entry import commands_in, run_named
-from fits import late_fusion
+from fits import confidence as fit_confidence
+from fits import confidence_logs, late_fusion
 from fits.logistic import logistic_regression
+from kitti.boxes import read_tracks
+from kitti.scoring import evaluate
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from mutants import MUTANTS
+from mutation.harness import BAD, GOOD, Harness
 from profile_ticks import Measured, figures
 from scipy.optimize import minimize
 from worlds import tiny_toml
 
+from log2sim.datatypes import Frame
 from log2sim.logs.native.writer import write_log
 
 pytestmark = pytest.mark.slow
@@ -138,3 +148,58 @@ def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread
     row, stages = figures("some", "labels", [run(1.0), run(9.0), run(2.0)], floor)
     assert row == ["some", "`labels`", "10", "10.00", "100", "200", "100", "50", "30", "4.00", "2.00"]
     assert "| detect | 100.0 | 100.0 |" in stages
+
+
+@pytest.mark.slow
+def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
+    log, scene, true = confidence_logs.make_log(1, 0)
+    detector = confidence_logs.SimulatedDetector(log, scene, true, 3)
+    camera, stamp = log.cameras["camera"], int(log.streams["camera"].t_ns[3])
+    frame = Frame(camera, stamp, lambda: np.zeros((camera.height_px, camera.width_px, 3), np.uint8))
+    one, two = detector.detect(frame), detector.detect(frame)
+    np.testing.assert_array_equal(one.box_px, two.box_px)
+    assert len(one)
+    assert one.score.min() >= confidence_logs.MIN_SCORE
+    cases = pickle.loads(pickle.dumps(confidence_logs.cases_of(1, 0)))
+    agents = [agent for case in cases for agent in fit_confidence.agents_of(case, "one")]
+    assert [sum(a.lidar == lidar for a in agents) > 3 for lidar in (True, False)] == [True, True]
+    assert all(0 <= a.right <= a.there <= 1 and a.ticks > 0 for a in agents)
+    assert np.isfinite([list(a.evidence.values()) for a in agents]).all()
+    there, p = fit_confidence.probabilities(agents, fit_confidence.fit_there_and_right(agents))
+    assert ((p > 0) & (p < 1) & (there < 1)).all()
+    assert set(fit_confidence.fit_all_variances(agents, p)) == {"sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"}
+
+
+INPUTS = range(1, 48, 2)  # one or two of each kind
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks, and reads /proc")
+def test_nothing_crashes_hangs_or_is_swallowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some inputs of each kind; `tools/mutate.py --count N` runs more."""
+    monkeypatch.chdir(tmp_path)
+    harness = Harness(tmp_path.resolve(), 20)
+    rows = [harness.run(index) for index in INPUTS]
+    counts = Counter(row.verdict for row in rows)
+    bad = [f"{r.verdict}: {r.index} {r.kind}: {r.damage}: {r.reason}" for r in rows if r.verdict in BAD]
+    assert not bad, "\n".join(bad)
+    assert min(counts[name] for name in GOOD) > 1
+
+
+KITTI = SHARED / "data" / "kitti_tracking"
+
+
+@pytest.mark.slow
+@pytest.mark.real
+@pytest.mark.parametrize("online", [True, False])
+def test_a_recorded_sequence_is_tracked_ahead_of_the_baseline(online: bool) -> None:
+    if not KITTI.is_dir():
+        pytest.skip(
+            "the KITTI tracking labels and detections are not beside this checkout (../shared/data/kitti_tracking)"
+        )
+    told = choose(describe_sequence(*read_sequence(KITTI, "0004"), online=online), online=online)
+    score = evaluate({"0004": told}, {"0004": read_tracks(KITTI / "label_02" / "0004.txt")}, "Car")
+    assert score.id_switches <= 1
+    # AB3DMOT with its repository settings has 90.4 and 83.7 here.
+    assert score.samota > 94.0
+    assert score.mota > (90.0 if online else 93.0)
