@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
-import tifffile
 from command_line import names, run
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from plain_settings import AGENTS_ONLY
@@ -297,16 +295,6 @@ def test_a_png_comes_with_its_place_and_says_what_is_left_out(tiny_folder: Path,
     assert picture[picture[..., 3] > 0][:, :3].std() > 5
     assert "without --scenario only agents with labels are left out" in ran.out
     assert "m.png: " in ran.out
-
-
-def test_heights_as_geotiff_with_a_scenario(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
-    out = tmp_path / "h.tif"
-    ran = run("map", tiny_folder, "--scenario", tiny_scenario, "--out", out, "--layer", "height", "--cell", "0.2")
-    assert ran.code == 0, ran.err
-    assert names(tmp_path) == ["h.tif"]
-    heights = tifffile.imread(out)
-    assert abs(float(np.nanmedian(heights))) < 0.05
-    assert "without --scenario" not in ran.out
 
 
 SPARSE = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}

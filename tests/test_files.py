@@ -1,4 +1,4 @@
-"""Files written whole or not at all, limits."""
+"""Files written whole or not at all, limits; the cache folder; arrays that wait in a file."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import subprocess
@@ -267,12 +266,3 @@ def test_a_hit_is_opened_at_its_moment(folder, tmp_path, monkeypatch) -> None:
     assert opened == [f"{(tmp_path / 'hits-1.html').resolve().as_uri()}#t={row['t_s']:.2f}&agent={row['agent']}"]
     assert (tmp_path / "hits-1.html").stat().st_size > 10_000
     assert "there are" in run("find", folder, "overtaking", "--open", 10_000).line
-
-
-def test_the_help_lists_all_tags() -> None:
-    shown = set(
-        itertools.chain.from_iterable(
-            line.replace(",", " ").replace(".", " ").split() for line in run("find", "--help").out.splitlines()
-        )
-    )
-    assert set(TAGS) <= shown

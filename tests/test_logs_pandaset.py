@@ -1,4 +1,4 @@
-"""PandaSet reader: labels, map frame, and geometry on the recorded sequence."""
+"""PandaSet reader: labels, map frame, geometry on the recorded sequence, and the unpickler of its tables."""
 
 from __future__ import annotations
 

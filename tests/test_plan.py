@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -66,24 +68,12 @@ def test_a_variant_changes_one_decision() -> None:
     ]
 
 
-class Hand:
-    """A clock that stands until it is moved."""
-
-    def __init__(self):
-        self.now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-    def move(self, seconds):
-        self.now += seconds
-
-
 @pytest.fixture
 def hand(monkeypatch):
-    made = Hand()
-    monkeypatch.setattr(stages.time, "perf_counter", made)
-    return made
+    """A clock that stands until it is moved."""
+    times = [1000.0]
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: sum(times))
+    return SimpleNamespace(move=times.append)
 
 
 def test_an_inner_stage_stops_the_clock_of_the_outer_one(hand):

@@ -82,21 +82,3 @@ def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
     assert {v.stage for v in found} == set(ablate.STAGES)
     labels = {v.label for v in found}
     assert {"track.max_gap_s", "agents.judge.TOUCHING", "datatypes.categories.CATEGORY.max_size_m"} <= labels
-
-
-def test_rows_are_worse_better_or_equal_beyond_the_noise_of_seeds():
-    def row(label: str, change: str, outcome: str, **figures: float) -> dict:
-        figures = dict.fromkeys(ablate.FIGURES, 1.0) | figures
-        told = {"label": label, "change": change, "figures": figures, "outcome": outcome}
-        return {"case": "log", "stage": "tracking", "unit": "", "value": "2", **told}
-
-    rows = [row("seed", str(k), "abc", recall=1.0 + 0.01 * k) for k in range(3)]
-    rows += [
-        row("A", "x0.7", "d", recall=0.9), row("B", "x0.7", "d", recall=1.01), row("C", "off", "ab"), row("D", "x1.3", "d", invented=0.5),
-    ]  # fmt: skip
-    usual, noise = ablate.usual_and_noise(rows)
-    told = {r["label"]: ablate.effect({"log": r}, usual, noise)[1].split()[0] for r in rows[3:]}
-    assert told == {"A": "worse", "B": "equal", "C": "same", "D": "better"}
-    assert ablate.matters(rows) == {"A", "D"}
-    text = ablate.tables(rows)
-    assert "The same scenarios without: C." in text

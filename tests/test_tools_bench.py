@@ -1,4 +1,4 @@
-"""Benchmarks and fits: one command for each, worlds and figures against closed forms and second methods, small runs."""
+"""Benchmarks and fits: one command for each, worlds and figures against closed forms and second methods, small runs; damaged inputs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks import poses, warnings
+from benchmarks import poses
 from benchmarks.kitti import choose, describe_sequence, read_sequence
 from conftest import SHARED
 from entry import commands_in, run_named
@@ -93,29 +93,6 @@ def test_poses_are_compared_by_surfaces_and_parked_vehicles(tmp_path: Path, caps
     given, lidar = found["surfaces, sweeps 2 s apart, m"]
     assert lidar < given
     assert found["4 parked, median scatter, m"][0] == 0.0  # synthetic labels are exact
-
-
-CALIBRATION = """P2: 700 0 600 0 0 700 180 0 0 0 1 0
-R_rect 1 0 0 0 1 0 0 0 1
-Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0
-Tr_imu_velo 1 0 0 0 0 1 0 0 0 0 1 0
-"""
-
-
-def test_warnings_of_labels_of_kitti_are_counted_a_minute(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The ego goes north at 10 m/s; a car drives 20 m before its camera and 3 m to the left, one stands on the right."""
-    motion, labels = [], []
-    for k in range(30):
-        motion.append(f"{0.1 * k} 100 {k} 1.65 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}")
-        labels.append(f"{k} 1 Car 0 0 0 0 0 0 0 1.5 1.8 4.4 -3 1.65 20 {-np.pi / 2}")
-        labels.append(f"{k} 2 Van 0 0 0 0 0 0 0 2.0 1.9 5.0 6 1.65 {50 - k} {-np.pi / 2}")
-        labels.append(f"{k} -1 DontCare -1 -1 -10 0 0 9 9 -1 -1 -1 -1000 -1000 -1000 -10")
-    files = {"ego_motion": "\n".join(motion) + "\n", "label_02": "\n".join(labels) + "\n", "calib": CALIBRATION}
-    for name, text in files.items():
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "0003.txt").write_text(text)
-    warnings.main([tmp_path])
-    assert "3 s driven: 0 warnings, 0.00 a minute" in capsys.readouterr().out
 
 
 def test_a_logistic_regression_has_the_weights_of_a_minimizer() -> None:

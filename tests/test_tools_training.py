@@ -68,28 +68,6 @@ def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any)
     assert (tmp_path / "x.onnx").stat().st_size < 0.55 * (tmp_path / "x.pt").stat().st_size
 
 
-def test_blended_weights_compute_what_lies_between(tmp_path: Path, torch: Any) -> None:
-    from lidar_training.export import blend, description, export_onnx
-    from lidar_training.network import BevNetwork
-
-    paths = [tmp_path / f"{k}.onnx" for k in range(2)]
-    for seed, path in enumerate(paths):
-        torch.manual_seed(seed)
-        network = BevNetwork().eval()
-        # What the head gets is the same for any input, so that the maps are linear in the weights that differ.
-        for layer in (network.merge2[0], network.merge2[1]):
-            layer.weight.data.zero_()
-        network.merge2[1].bias.data.fill_(1.0)
-        torch.save({"mean": network.state_dict()}, tmp_path / "r.pt")
-        export_onnx(tmp_path / "r.pt", path, description("vehicle", 0.25, 40.0))
-    grid = np.random.default_rng(0).random((12, 64, 64), np.float32)
-    one, other = (load_network(path).run(grid) for path in paths)
-    blend(paths[0], paths[1], 0.25)
-    mean = load_network(paths[0]).run(grid)
-    assert np.abs(one - other).max() > 0.1
-    np.testing.assert_allclose(mean, 0.75 * one + 0.25 * other, atol=2e-3)
-
-
 def test_a_bicycle_without_rider_is_no_person_but_may_be_a_two_wheeler(torch: Any) -> None:
     from lidar_training.network import GROUPS, targets_of
 

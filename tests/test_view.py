@@ -169,15 +169,20 @@ def place_of(browser: Browser, id: str) -> Array:
     return np.array(browser.run("return log2sim.placeOf(arguments[0])", id), dtype=np.float64)
 
 
-def pixel(browser: Browser, place: Array) -> tuple[int, ...]:
-    """Color of the canvas at a place after the next frame."""
-    script = """const [x, y, done] = arguments;
+def pixels(browser: Browser, place: Array, width: int) -> list[tuple[int, ...]]:
+    """Colors of the canvas from a place on to the right after the next frame."""
+    script = """const [x, y, width, done] = arguments;
         requestAnimationFrame(() => requestAnimationFrame(() => {
-            const pen = new OffscreenCanvas(1, 1).getContext("2d", {willReadFrequently: true});
+            const pen = new OffscreenCanvas(width, 1).getContext("2d", {willReadFrequently: true});
             pen.drawImage(document.getElementById("map"), -Math.round(x), -Math.round(y));
-            done([...pen.getImageData(0, 0, 1, 1).data]);
+            done([...pen.getImageData(0, 0, width, 1).data]);
         }));"""
-    return tuple(browser.run_async(script, float(place[0]), float(place[1])))[:3]
+    row = browser.run_async(script, float(place[0]), float(place[1]), width)
+    return [tuple(row[k : k + 3]) for k in range(0, len(row), 4)]
+
+
+def pixel(browser: Browser, place: Array) -> tuple[int, ...]:
+    return pixels(browser, place, 1)[0]
 
 
 def rgb(hex: str) -> tuple[int, ...]:
@@ -260,15 +265,7 @@ def doubtful_scene() -> Scenario:
 def striped(browser: Browser, id: str) -> list[tuple[int, ...]]:
     """Colors along the middle line of an agent that heads east, behind its heading mark."""
     scale = browser.run("return log2sim.pixelsPerMeter")
-    script = """const [x, y, width, done] = arguments;
-        requestAnimationFrame(() => requestAnimationFrame(() => {
-            const pen = new OffscreenCanvas(width, 1).getContext("2d", {willReadFrequently: true});
-            pen.drawImage(document.getElementById("map"), -Math.round(x), -Math.round(y));
-            done([...pen.getImageData(0, 0, width, 1).data]);
-        }));"""
-    x, y = place_of(browser, id)
-    row = browser.run_async(script, x - 1.8 * scale, y, int(1.6 * scale))
-    return sorted({tuple(row[k : k + 3]) for k in range(0, len(row), 4)}, key=sum)
+    return sorted(set(pixels(browser, place_of(browser, id) - [1.8 * scale, 0.0], int(1.6 * scale))), key=sum)
 
 
 def test_doubtful_agents_are_hatched_while_the_doubt_holds(browser: Browser, tmp_path: Path) -> None:
