@@ -147,7 +147,7 @@ def _imports(block: str) -> list[ast.ImportFrom]:
 
 @pytest.fixture
 def fresh_checkout(tmp_path: Path) -> Path:
-    """A copy of what a clone of this checkout with its uncommitted work would hold, with the first seconds of the sample."""
+    """What a clone of this checkout with its uncommitted work would hold; of the sample every other record of its first seconds."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git to tell the files of the checkout from others")
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
@@ -160,6 +160,12 @@ def fresh_checkout(tmp_path: Path) -> Path:
     sample, part = tmp_path / "log2sim/samples/crossing", tmp_path / "part"
     assert run("convert", sample, "--stop", SAMPLE_S, "--out", part).code == 0
     (sample / "truth.json").rename(part / "truth.json")
+    stamps = set[str]()
+    for table in (*part.glob("*/index.csv"), part / "labels/boxes_2d.csv"):
+        head, *rows = table.read_text().splitlines()
+        kept = rows[::2] if table.name == "index.csv" else [row for row in rows if row.split(",")[0] in stamps]
+        stamps.update(row.split(",")[0] for row in kept)
+        table.write_text("\n".join([head, *kept]) + "\n")
     shutil.rmtree(sample)
     part.rename(sample)
     return tmp_path / "log2sim"

@@ -214,5 +214,6 @@ def test_the_package_and_the_examples_have_the_types_that_they_use(tmp_path: Pat
     command = [sys.executable, "-m", "mypy", "--cache-dir", ROOT / ".mypy_cache", "log2sim", *files]
     ran = subprocess.run([str(c) for c in command], cwd=ROOT, capture_output=True, text=True, check=False)
     errors = [line for line in ran.stdout.splitlines() if ": error:" in line]
-    assert [line for line in errors if not line.endswith(UNTYPED) or not line.startswith(str(tmp_path))] == []
+    # By name: of what did not change since an earlier run, errors come with the folder of that run.
+    assert [line for line in errors if not (line.endswith(UNTYPED) and re.search(r"/readme_\d+\.py:", line))] == []
     assert ran.returncode in (0, 1), ran.stderr[-1000:]

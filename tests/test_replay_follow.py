@@ -44,6 +44,18 @@ def test_maneuvers_are_followed_within_limits(name):
     assert agent.flags == ()
 
 
+def test_a_push_off_the_path_dies_out_without_overshoot_to_the_other_side():
+    agent = driven(lambda t: np.full_like(t, 8.0), np.zeros_like, 10.0)
+    w = agent.waypoints
+    y = np.where(w.t_s < 2.0, 0.0, 1.4)  # the log steps sideways, too little for a leap
+    stepped = changed(agent, waypoints=changed(w, y_m=y))
+    result, _, _ = followed(stepped, model="kinematic")
+    late = result.t_s > 5.0
+    assert np.abs(result.y_m[late] - 1.4).max() < 0.05
+    assert result.y_m.max() < 1.4 + 0.15
+    assert any("distance from what can be driven" in flag for flag in result.flags)
+
+
 def test_standing_vehicles_stay_where_they_are_while_their_boxes_jitter():
     rng = np.random.default_rng(5)
     t = np.arange(100) * 0.1
