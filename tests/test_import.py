@@ -106,8 +106,6 @@ def test_a_file_of_others_is_read_headings_that_nobody_wrote_follow_the_way(tmp_
         ('domainAbsoluteRelative="absolute"', 'domainAbsoluteRelative="relative"', "absolute domain"),
         ('time="1"', "", "Vertex time is 'None', expected a finite number"),
         ('time="1"', 'time="nan"', "Vertex time is 'nan'"),
-        ('time="1"', 'time="0"', r"agent 'ego': waypoints\.t_s does not increase at index 1"),
-        ('x="0" y="4"', 'x="0"', "WorldPosition y is 'None'"),
         ('<WorldPosition x="0" y="4"/>', '<LanePosition roadId="1" laneId="-1" s="0"/>', "no <WorldPosition>"),
         ('value="2.5"', 'value="two"', "WorldPosition y is 'two'"),
         ('y="$y"', 'y="$z"', "'\\$z' is no parameter"),
