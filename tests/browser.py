@@ -122,6 +122,11 @@ class Browser:
             raise RuntimeError(json.load(error)["value"]["message"]) from None
 
 
+def opened(browser: Browser, page: Path, hash: str = "", **window: Any) -> None:
+    """Open the page of a file."""
+    browser.open(page.as_uri() + hash, **window)
+
+
 @contextlib.contextmanager
 def browsing(profile: Path, flags: Sequence[str] = ()) -> Iterator[Browser]:
     """A browser with a fresh profile, ended with the block."""

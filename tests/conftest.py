@@ -150,3 +150,12 @@ def chromium(one_browser: Browser) -> Browser:
     one_browser.log("browser")
     one_browser.requests()
     return one_browser
+
+
+@pytest.fixture
+def browser(chromium: Browser) -> Iterator[Browser]:
+    """The browser, whose page must neither log an error nor ask for anything but itself."""
+    yield chromium
+    assert chromium.log("browser") == []
+    asked = [address.split("#")[0] for address in chromium.requests() if not address.startswith("blob:")]
+    assert {address.rpartition("/")[2] for address in asked} <= {"page.html"}

@@ -107,19 +107,6 @@ def test_a_file_that_is_no_network_of_colors_is_refused(tmp_path: Path) -> None:
         open_color_network(LIDAR_FILE)
 
 
-@pytest.mark.parametrize(
-    ("rgb", "name"),
-    [
-        ((0, 0, 0), "black"), ((255, 255, 255), "white"), ((119, 119, 119), "gray"), ((192, 192, 192), "silver"),
-        ((255, 0, 0), "red"), ((0, 0, 255), "blue"), ((0, 128, 0), "green"), ((255, 255, 0), "yellow"),
-        ((139, 69, 19), "brown"), ((255, 140, 0), "orange"), ((0, 0, 128), "blue"), ((128, 0, 0), "red"),
-        ((255, 105, 180), "red"), ((240, 234, 214), "white"), ((28, 29, 31), "black"), ((60, 84, 62), "green"),
-    ],
-)  # fmt: skip
-def test_basic_colors_have_their_names(rgb: tuple[int, int, int], name: str) -> None:
-    assert name_of(rgb) == name
-
-
 def test_the_names_agree_with_a_survey() -> None:
     """XKCD color survey, as matplotlib holds it: names that end with a basic term, such as 'pale olive green'."""
     said = {key: key.removeprefix("xkcd:").split()[-1].replace("grey", "gray") for key in mcolors.XKCD_COLORS}

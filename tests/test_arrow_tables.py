@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import struct
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from log2sim.errors import LogError, MissingExtra, RecordError
-from log2sim.logs.arrow import ParquetRows, read_columns
+from log2sim.errors import LogError, RecordError
+from log2sim.logs.arrow import read_columns
 
 pa = pytest.importorskip("pyarrow")
 feather = pytest.importorskip("pyarrow.feather")
@@ -134,11 +133,3 @@ def test_damaged_files_are_read_or_refused(tmp_path: Path, name: str) -> None:
             refused.append(str(error))
     assert len(refused) > 60
     assert all(line.startswith(str(path)) and "\n" not in line for line in refused)
-
-
-def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(MissingExtra, match="parquet"):
-        read_columns(tmp_path / "a.feather", {"x": "float"})
-    with pytest.raises(MissingExtra, match="parquet"):
-        ParquetRows(tmp_path / "a.parquet", {"x": "float"}).read(0)

@@ -61,11 +61,13 @@ def workers_of(process: subprocess.Popen[str]) -> list[int]:
     return [c.pid for c in psutil.Process(process.pid).children() if "spawn_main" in " ".join(c.cmdline())]
 
 
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    install_reader(tmp_path / "site")
-    monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    return tmp_path / "site"
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("batch") / "site"
+    install_reader(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(folder))
+        yield folder
 
 
 @pytest.fixture
@@ -140,22 +142,22 @@ def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
 
     for log in waiting:
         (log / "go").touch()
-    again = start(root, out)
-    printed, errors = again.communicate(timeout=LIMIT_S)
-    assert again.returncode == 0, errors
-    assert f"{len(first)} of them done before" in printed
+    again = run("batch", root, "--out", out, "--jobs", 1, *FAST)
+    assert again.code == 0, again.err
+    assert f"{len(first)} of them done before" in again.out
     assert {path: path.stat().st_mtime_ns for path in first} == first
     assert all(row is not None and row.is_done for row in rows_of(root, out).values())
 
 
-@pytest.fixture
-def scheduler(site: Path, tmp_path: Path) -> Iterator[str]:
+@pytest.fixture(scope="module")
+def scheduler(site: Path) -> Iterator[str]:
     """Address of a Dask scheduler with one worker, both of somebody else; the worker is started again when it dies."""
     pytest.importorskip("distributed")
-    (tmp_path / "scheduler.py").write_text(SCHEDULER)
+    program = site.parent / "scheduler.py"
+    program.write_text(SCHEDULER)
     path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
     process = subprocess.Popen(
-        [sys.executable, tmp_path / "scheduler.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        [sys.executable, program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": path, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"},
     )  # fmt: skip
     assert process.stdout is not None

@@ -15,7 +15,7 @@ from worlds import tiny_log, waypoints
 from log2sim.config import Config
 from log2sim.datatypes import Agent, Detections, Frame, Log, Scenario, Waypoints
 from log2sim.errors import LogError
-from log2sim.evaluation.bench.benchmark import Benchmark, bench, bench_document, format_benchmark
+from log2sim.evaluation.bench.benchmark import Benchmark, bench, bench_document
 from log2sim.evaluation.bench.runs import BenchContext, detect_once, make_context
 from log2sim.evaluation.bench.runs import timed_first_pass as run_first_pass
 from log2sim.evaluation.bench.scores import (
@@ -303,18 +303,6 @@ def test_the_dataframe_has_a_row_for_each_setting_with_its_figures(result: Bench
         assert row["ms_per_tick"] == point.ms_per_tick
         known = {name: value for name, value in point.figures.items() if value is not None}
         assert {k: row[k] for k in known} == known
-
-
-def test_the_table_has_every_setting_and_marks_the_present(result: Benchmark) -> None:
-    lines = format_benchmark(result).split("\n")
-    for panel in result.panels:
-        rows = lines[lines.index(f"{panel.stage}: {panel.label}") + 2 :][: len(panel.points)]
-        for p in panel.points:
-            [row] = [r for r in rows if f" {p.setting}  " in r]
-            assert ("*" in row) == p.present
-        order = [next(p.ms_per_tick for p in panel.points if f" {p.setting}  " in r) for r in rows]
-        assert order == sorted(order)
-    assert "What the figures support:" in lines
 
 
 @pytest.mark.slow

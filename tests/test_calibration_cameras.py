@@ -46,9 +46,6 @@ def yawed(camera: Camera, degrees: float) -> Camera:
     return replace(camera, mount_T_cam=turn_mount(camera.mount_T_cam, np.radians([0.0, 0.0, degrees])))
 
 
-# Edges of scans
-
-
 # Alignment in a world of posts
 
 

@@ -128,15 +128,6 @@ def test_pixels_that_no_ray_reaches_have_none() -> None:
     assert np.isnan(beside[1]).all()
 
 
-def test_no_points_and_no_pixels() -> None:
-    for model, distortion in LENSES:
-        camera = make_camera(model, distortion)
-        uv, valid = project(camera, np.zeros((0, 3)))
-        assert uv.shape == (0, 2)
-        assert valid.shape == (0,)
-        assert undistort(camera, np.zeros((0, 2))).shape == (0, 2)
-
-
 def test_depth_is_tested_before_it_divides() -> None:
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, -5.0], [0.0, 0.0, MIN_DEPTH_M], [0.0, 0.0, 0.2], [np.nan] * 3])
     for model, distortion in LENSES:

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
-import tifffile
 from command_line import names, run
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from plain_settings import AGENTS_ONLY
@@ -29,43 +27,10 @@ from log2sim.logs.native.writer import write_log
 COMMANDS = [
     "reconstruct", "replay", "edit", "plot", "view", "detect", "evaluate", "bench", "synth", "inspect", "validate", "cache", "config",
 ]  # fmt: skip
-PNG = b"\x89PNG"
 
 
 def read(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-@pytest.mark.slow
-def test_the_whole_chain_from_a_scene_to_a_picture(tmp_path: Path) -> None:
-    (tmp_path / "scene.toml").write_text(tiny_toml())
-    log, out = tmp_path / "log", tmp_path / "out"
-    chain = [
-        ("synth", tmp_path / "scene.toml", "--out", log, "--seed", "3"),
-        ("validate", log),
-        ("inspect", log),
-        ("reconstruct", log, "--out", out / "scenario.json", "--report", out / "report.json", "--detector", "labels"),
-        ("evaluate", out / "scenario.json", "--truth", log, "--out", out / "metrics.json"),
-        ("replay", out / "scenario.json", "--out", out / "replay.json"),
-        ("plot", out / "scenario.json", "--replay", out / "replay.json", "--truth", log, "--out", out / "tracks.png"),
-        *(("validate", out / f"{name}.json") for name in ("scenario", "report", "metrics", "replay")),
-    ]
-    for command in chain:
-        ran = run(*command)
-        assert ran.code == 0, (command, ran.err)
-    assert names(out) == ["metrics.json", "replay.json", "report.json", "scenario.json", "tracks.png"]
-    check(read(out / "report.json"), "report-1", LogError)
-    metrics = read(out / "metrics.json")
-    check(metrics, "metrics-1", LogError)
-    assert metrics["recall"] == 1.0
-    assert metrics["precision"] == 1.0
-    assert metrics["position_rmse_m"] < 0.4
-    assert metrics["id_switches"] == 0
-    assert read(out / "replay.json")["metrics"]["cross_track_rms_m"] < 0.1
-    assert (out / "tracks.png").read_bytes()[:4] == PNG
-    assert Scenario.load(out / "scenario.json").name == "tiny"
-    seed = read(out / "scenario.json")["provenance"]
-    assert seed["log2sim_version"] == log2sim.__version__
 
 
 def test_reconstruct_says_what_came_out_and_writes_nothing_unasked(tiny_folder: Path, tmp_path: Path) -> None:
@@ -228,12 +193,8 @@ def test_edit_changes_a_scenario_that_then_replays_and_plots(tmp_path: Path) -> 
     [
         ((), "no edits"),
         (("--shift", "ego"), "--shift ego: expected an agent, '=' and a number"),
-        (("--shift", "=1"), "expected an agent, '=' and a number"),
-        (("--speed", "ego=fast"), "expected an agent, '=' and a number"),
         (("--speed", "ego=0"), "expected a number from 0.01 to 100"),
         (("--lateral", "ego=nan"), "nan m for agent 'ego'"),
-        (("--shift", "eg=1"), "did you mean 'ego'?"),
-        (("--remove", "ego", "--shift", "ego=1"), "left out by another edit"),
     ],
 )
 def test_edit_refuses_what_makes_no_sense_and_writes_nothing(
@@ -246,32 +207,38 @@ def test_edit_refuses_what_makes_no_sense_and_writes_nothing(
 
 
 @pytest.mark.slow
-def test_every_command_names_the_files_it_wrote(
-    tiny_folder: Path, tiny_scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_every_command_from_a_scene_on_works_and_names_the_files_it_wrote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    scenario = tiny_scenario
+    (tmp_path / "scene.toml").write_text(tiny_toml())
     commands = [
-        (f"reconstruct {tiny_folder} --detector labels -o s.json --report r.json --topdown t.png",),
-        ("detect", tiny_folder, "--detector", "lidar:labels", "-o", "boxes.json"),
-        ("replay", scenario, "-o", "replay.json"),
-        ("plot", scenario, "-o", "plot.svg"),
-        ("view", scenario, "-o", "page.html"),
-        ("predict", scenario, "-o", "prediction.json"),
-        ("edit", scenario, "--drop-doubtful", "-o", "edited.json"),
-        ("export", scenario, "--to", "openscenario", "-o", "xosc"),
-        ("import", "xosc/scenario.xosc", "-o", "imported.json"),
-        ("convert", tiny_folder, "--stop", "0.2", "-o", "part"),
-        ("map", tiny_folder, "--cell", "0.5", "-o", "map.png"),
-        ("inspect", tiny_folder, "--overlay", "moment.png"),
+        "synth scene.toml -o log --seed 3",
+        "reconstruct log --detector labels -o s.json --report r.json --topdown t.png",
+        "detect log --detector lidar:labels -o boxes.json",
+        "evaluate s.json --truth log -o metrics.json",
+        "replay s.json -o replay.json",
+        "plot s.json --replay replay.json --truth log -o plot.svg",
+        "view s.json -o page.html",
+        "predict s.json -o prediction.json",
+        "edit s.json --drop-doubtful -o edited.json",
+        "export s.json --to openscenario -o xosc",
+        "import xosc/scenario.xosc -o imported.json",
+        "convert log --stop 0.2 -o part",
+        "map log --cell 0.5 -o map.png",
+        "inspect log --overlay moment.png",
     ]
     for command in commands:
         before = names(tmp_path)
-        ran = run(*command)
+        ran = run(command)
         assert ran.code == 0, (command, ran.err)
         new = set(names(tmp_path)) - set(before)
         assert new
         assert [name for name in new if name not in ran.out] == [], command
+    for name in ("log", "s.json", "r.json", "metrics.json", "replay.json"):
+        assert run("validate", name).code == 0
+    assert Scenario.load(tmp_path / "s.json").name == "tiny"
+    assert read(tmp_path / "s.json")["provenance"]["log2sim_version"] == log2sim.__version__
 
 
 __all__ = ["folder", "made"]  # fixtures
@@ -328,16 +295,6 @@ def test_a_png_comes_with_its_place_and_says_what_is_left_out(tiny_folder: Path,
     assert picture[picture[..., 3] > 0][:, :3].std() > 5
     assert "without --scenario only agents with labels are left out" in ran.out
     assert "m.png: " in ran.out
-
-
-def test_heights_as_geotiff_with_a_scenario(tiny_folder: Path, tiny_scenario: Path, tmp_path: Path) -> None:
-    out = tmp_path / "h.tif"
-    ran = run("map", tiny_folder, "--scenario", tiny_scenario, "--out", out, "--layer", "height", "--cell", "0.2")
-    assert ran.code == 0, ran.err
-    assert names(tmp_path) == ["h.tif"]
-    heights = tifffile.imread(out)
-    assert abs(float(np.nanmedian(heights))) < 0.05
-    assert "without --scenario" not in ran.out
 
 
 SPARSE = {**LIDAR, "channels": 16, "azimuth_step_deg": 2.0}

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from log2sim import config as config_module
 from log2sim.config import Config, TrackConfig
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files import documents
@@ -20,11 +19,6 @@ def write(folder: Path, text: str) -> Path:
     path = folder / "run.toml"
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def test_without_anything_the_defaults_hold() -> None:
-    assert Config.load() == Config()
-    assert Config.load(None, [], seed=None, cameras=None) == Config()
 
 
 def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
@@ -47,6 +41,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
 def test_the_later_word_counts(tmp_path: Path) -> None:
     path = write(tmp_path, "seed = 1\n[track]\nmax_gap_s = 1.0\nbirth_score = 0.1\nmin_life_s = 0.2\n")
     settings = ["track.max_gap_s=2.0", "seed=2", "track.birth_score=0.2", "track.birth_score=0.3"]
+    assert Config.load(None, [], seed=None, cameras=None) == Config()
     config = Config.load(path, settings, seed=3, stop_s=None)
     assert config.seed == 3
     assert config.track == TrackConfig(birth_score=0.3, max_gap_s=2.0, min_life_s=0.2)
@@ -87,16 +82,13 @@ def test_settings_read_like_toml_or_as_text(setting: str, read: object) -> None:
         ("seed=-1", r"'seed' is -1, expected a whole number from 0 to 4294967295"),
         ("detect.tiles=65", r"'detect\.tiles' is 65, expected a whole number from 0 to 64"),
         ("track.birth_score=1.1", r"'track\.birth_score' is 1\.1, expected a number from 0 to 1"),
-        ("track.birth_score=high", r"'track\.birth_score' is 'high', expected a number from 0 to 1"),
         ("track.birth_score=nan", r"'track\.birth_score' is nan, expected a finite number"),
         ("smooth.enabled=1", r"'smooth\.enabled' is 1, expected true or false"),
-        ("smooth.enabled=yes", r"'smooth\.enabled' is 'yes', expected true or false"),
         ("measure.mode=robus", r"'measure\.mode' is 'robus', expected one of robust, paper"),
         ("detect.name=3", r"'detect\.name' is 3, expected text"),
         ("cameras=3", r"'cameras' is 3, expected a list"),
         ("cameras=[1]", r"'cameras\[0\]' is 1, expected text"),
         ("start_s=inf", r"'start_s' is inf, expected a finite number"),
-        ("start_s=nan", r"'start_s' is nan, expected a finite number"),
     ],
 )
 def test_what_cannot_be_is_one_clear_line(setting: str, message: str) -> None:
@@ -121,15 +113,6 @@ def test_files_that_are_no_toml(tmp_path: Path, content: bytes, message: str) ->
     path = tmp_path / "run.toml"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=rf"run\.toml: {message}"):
-        Config.load(path)
-
-
-def test_a_file_larger_than_any_config_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path, "seed = 1\n")
-    monkeypatch.setattr(config_module, "CONFIG_LIMIT_BYTES", 9)
-    assert Config.load(path).seed == 1
-    monkeypatch.setattr(config_module, "CONFIG_LIMIT_BYTES", 8)
-    with pytest.raises(ConfigError, match="9 bytes, more than the 8 that it may have"):
         Config.load(path)
 
 

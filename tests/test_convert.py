@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import names, run
-from log_encoders import argoverse, kitti, native, nuscenes, pandaset, waymo, waymo_parquet
+from log_encoders import argoverse, kitti, native, nuscenes, pandaset, waymo
 from log_encoders.world import make_world, world_log
 from plain_settings import AGENTS_ALONE
 
@@ -48,7 +48,7 @@ def assert_same(ours: Scenario, theirs: Scenario, atol_m: float) -> None:
 
 ENCODERS = {
     "log2sim": native.encode, "kitti": kitti.encode_raw, "pandaset": pandaset.encode, "waymo": waymo.encode,
-    "waymo-parquet": waymo_parquet.encode, "nuscenes": nuscenes.encode_world, "argoverse2": argoverse.encode,
+    "nuscenes": nuscenes.encode_world, "argoverse2": argoverse.encode,
 }  # fmt: skip
 
 

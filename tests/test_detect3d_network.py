@@ -200,21 +200,18 @@ def without(key: str) -> dict[str, Any]:
     [
         (None, r"no entry 'log2sim\.lidar', a JSON document with cell_m"),
         ("{", r"'log2sim\.lidar'.*JSON"),
-        ("[1]", r"'log2sim\.lidar'"),
         (without("stride"), r"'stride' is missing"),
         ({**INFO, "version": 2}, r"'version' is 2, expected 1"),
         ({**INFO, "cell_m": -1.0}, r"'cell_m' is -1\.0, expected a number from 0\.05 to 2"),
-        ({**INFO, "cell_m": "NaN"}, r"'cell_m'"),
         ({**INFO, "range_m": 1000.0}, r"'range_m' is 1000, expected at most 512 cells"),
         ({**INFO, "groups": ["vehicle", "vehicle"]}, r"'groups' has 'vehicle' twice or unknown"),
-        ({**INFO, "groups": ["plane"]}, r"expected some of vehicle, two_wheeler"),
         ({**INFO, "categories": {**INFO["categories"], "vehicle": ["tank"]}}, r"'categories\.vehicle' is \['tank'\]"),
         ({**INFO, "calibration": {}}, r"'calibration\.vehicle' is missing or has not 5 numbers"),
         ({**INFO, "min_score": {"vehicle": 2.0}}, r"'min_score\.vehicle' is missing or no number from 0 to 1"),
         ({**INFO, "groups": ["vehicle"]}, r"output 'maps' is float32 \(1, 25, 32, 32\).*expected float32 \(1, 19, 32, 32\)"),
         ({**INFO, "stride": 4}, r"expected float32 \(1, 25, 16, 16\)"),
     ],
-    ids=range(15),
+    ids=range(12),
 )  # fmt: skip
 def test_metadata_that_cannot_be_are_one_clear_line(metadata: Any, message: str, tmp_path: Path) -> None:
     path = write_network(tmp_path / "bad.onnx", metadata)

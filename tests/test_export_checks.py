@@ -30,7 +30,6 @@ def spoiled(key: str, index: int, value: float) -> Agent:
     [
         (spoiled("t_s", 4, 0.3), r"agent 'bad': waypoints\.t_s does not increase at index 4 \(0\.3 s\)"),
         (spoiled("x_m", 4, np.nan), "agent 'bad': waypoints.x_m is not finite at index 4"),
-        (spoiled("sigma_xy_m", 4, np.inf), "agent 'bad': waypoints.sigma_xy_m is not finite at index 4"),
         (agent(line(), "bad", size_m=(4.0, 0.0, 1.5)), r"agent 'bad': size \(4\.0, 0\.0, 1\.5\) m, expected positive"),
         (agent(line(), "bad", size_m=(4.0, np.nan, 1.5)), "agent 'bad': size"),
         (agent(line(), "bad", yaw_rad=np.pi, speed_mps=np.full(31, 10.0)), "agent 'bad': goes backward on 30"),

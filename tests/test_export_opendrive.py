@@ -40,9 +40,7 @@ def creeping() -> Agent:
 
 PATHS = {
     "straight": agent(line()),
-    "diagonal": agent(line(heading_rad=2.2)),
     "turn": agent(bend()),
-    "tight turn": agent(bend(5.0, np.pi, 100)),
     "s": agent(np.column_stack([np.linspace(0, 60, 200), 3 * np.sin(np.linspace(0, 60, 200) / 8)])),
     "crossing itself": agent(eight()),
     "loops": agent(bend(9.0, 13.0, 500)),
@@ -52,7 +50,6 @@ PATHS = {
     "standing": agent(np.zeros((20, 2)) + np.array([3.0, 4.0]), yaw_rad=0.3),
     "standing and trembling": agent(np.random.default_rng(1).normal(0.0, 0.003, (50, 2)), yaw_rad=0.3),
     "one waypoint": agent([[3.0, 4.0]], yaw_rad=-3.0),
-    "two waypoints": agent([[0.0, 0.0], [25.0, 9.0]]),
     "12 cm": agent(line(0.12, 5)),
     "stopping between": agent(np.concatenate([line(10.0, 21), np.full((30, 2), [10.0, 0.0]), bend()[1:] + np.array([10.0, 0.0])]), yaw_rad=None),
     "far away": agent(bend() + np.array([4.0e6, -5.0e6])),

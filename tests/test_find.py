@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import itertools
 import json
 import os
 import subprocess
@@ -100,7 +98,6 @@ def test_only_probable_ones_are_found_unless_the_condition_says_which() -> None:
         ("cut_inn", "did you mean 'cut_in'"),
         ("cut_in and tct_s < 2", "did you mean 'ttc_s'"),
         ("cut_in and ego.sped_mps > 2", "did you mean 'speed_mps'"),
-        ("cut_in and egoo.speed_mps > 2", "did you mean 'ego'"),
         ("cut_in and hard_braking.gap > 2", "did you mean 'gap_m'"),
         ("cut_in and ttc_s", "expected a tag or a comparison"),
         ("cut_in < 3", "compares"),
@@ -110,8 +107,6 @@ def test_only_probable_ones_are_found_unless_the_condition_says_which() -> None:
         ("", "1 to 2000"),
         ("__import__('os').system('touch x')", "not understood"),
         ("(lambda: 1)()", "not understood"),
-        ("[cut_in for x in (1,)]", "not understood"),
-        ("cut_in and gap_m ** 9 > 1", "not understood"),
         ("cut_in and " * 900 + "cut_in", "letters"),
         ("(" * 300 + "cut_in" + ")" * 300, ""),
         ("not " * 250 + "cut_in", "parts"),
@@ -271,19 +266,3 @@ def test_a_hit_is_opened_at_its_moment(folder, tmp_path, monkeypatch) -> None:
     assert opened == [f"{(tmp_path / 'hits-1.html').resolve().as_uri()}#t={row['t_s']:.2f}&agent={row['agent']}"]
     assert (tmp_path / "hits-1.html").stat().st_size > 10_000
     assert "there are" in run("find", folder, "overtaking", "--open", 10_000).line
-
-
-def test_the_help_lists_all_tags() -> None:
-    shown = set(
-        itertools.chain.from_iterable(
-            line.replace(",", " ").replace(".", " ").split() for line in run("find", "--help").out.splitlines()
-        )
-    )
-    assert set(TAGS) <= shown
-
-
-def test_conditions_are_parsed_by_the_grammar_of_python_alone() -> None:
-    """No text of the condition is evaluated: what is asked of it are its nodes."""
-    tree = ast.parse(Path(ask.__code__.co_filename).read_text())
-    called = {n.func.id for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
-    assert not called & {"eval", "exec", "compile"}

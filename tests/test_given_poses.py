@@ -84,18 +84,11 @@ def faults_of(track: PoseTrack, found: CheckedPoses) -> tuple[Finding, ...]:
 # --- healthy poses stay as they are
 
 HEALTHY = {
-    "fast": drive(6, 50, speed=30.0, sigma=0.01),
-    "10 Hz on a motorway": drive(6, 10, speed=30.0, sigma=0.02),
-    "hard stop": drive(6, 50, speed=14.0, brake=9.5),
-    "hard stop at 10 Hz": drive(6, 10, speed=14.0, brake=9.5),
-    "turns": drive(10, 20, turn=0.7, sigma=0.01),
     "1000 Hz": drive(3, 1000, sigma=0.01),
-    "standing": drive(5, 50, speed=0.0),
     "standing with noise": drive(5, 50, speed=0.0, sigma=0.02),
     "waiting, then driving": replace(drive(6, 50), map_T_ego=drive(6, 50, brake=5.0).map_T_ego[::-1].copy()),
     "two poses": drive(0.2, 10),
     "one pose": drive(0.0, 10),
-    "5 Hz": drive(10, 5, turn=0.4),
 }
 
 

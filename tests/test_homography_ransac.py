@@ -321,16 +321,6 @@ def test_the_straw_man_is_as_good_as_its_sizes_and_says_how_far_off_it_is() -> N
         world.fit("straw-man")
 
 
-def test_the_straw_man_allows_for_sizes_that_differ() -> None:
-    world = pitching_stream(8, outliers=0.0)
-    sizes = np.random.default_rng(0).normal(1.0, 0.08, (40, 10))
-    by_size = world.xy * np.tile(sizes, (1, 2)).reshape(-1, 1)
-    fit = world.fit("straw-man", xy_by_size=by_size)
-    assert fit.ok, fit.reason
-    assert fit.inliers.mean() > 0.6
-    assert 0.3 < world.error_m(fit.ground_H_image, FAR_M) < 10.0
-
-
 # Extremes.
 
 

@@ -10,7 +10,8 @@ import pytest
 from painted_ground import ASPHALT, GRASS, WHITE, Painter, dashes_of, line_of, outline_of
 from scipy.spatial import cKDTree
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, Camera, ground_homography
+from log2sim.road.lane_picture import find_markings_in_picture
 from log2sim.road.markings import find_markings
 from log2sim.road.strokes import stretches_of
 
@@ -208,3 +209,40 @@ def test_dashed_lines_end_at_a_junction_and_not_at_their_own_gaps(dash_m: float,
     one_worn_away = np.delete(dashes(dash_m, gap_m, (0.0, 120.0)), 3, axis=0)
     if 2 * gap_m + dash_m < 10.0 or 2 * gap_m + dash_m <= 3 * gap_m:
         assert len(stretches_of(one_worn_away)) == 1
+
+
+OFFSETS = (-5.25, -1.75, 1.75, 5.25)
+
+
+def picture() -> tuple[np.ndarray, Camera]:
+    """Photograph a straight road from 1.5 m above it, 3 deg downwards."""
+    painter = Painter((0.0, 70.0, -12.0, 12.0))
+    for k, offset in enumerate(OFFSETS):
+        line = line_of(lambda x, o=offset: o + 0 * x, 0, 70)
+        painter.lines([line] if k in (0, 3) else dashes_of(line, 3, 6))
+    ground = painter.ground(lidar=False)
+    pitch = np.deg2rad(3.0)
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[0, -np.sin(pitch), np.cos(pitch)], [-1, 0, 0], [0, -np.cos(pitch), -np.sin(pitch)]])
+    pose[2, 3] = 1.5
+    focal = 640 / np.tan(np.deg2rad(30))
+    K = np.array([[focal, 0, 639.5], [0, focal, 359.5], [0, 0, 1]])
+    camera = Camera("front", 1280, 720, K, "ego", pose)
+    cell_H_ground = np.array([[20, 0, -0.5], [0, -20, 12 * 20 - 0.5], [0, 0, 1]])
+    cell_H_image = cell_H_ground @ ground_homography(camera, pose)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    image = cv2.warpPerspective(
+        ground.color_bgr,
+        cell_H_image,
+        (1280, 720),
+        flags=flags,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(200, 190, 180),
+    )
+    return image, camera
+
+
+def test_a_known_camera_measures_lines_where_they_are() -> None:
+    image, camera = picture()
+    found = find_markings_in_picture(image, camera)
+    assert np.allclose([line.offset_m for line in found.lane_lines], sorted(OFFSETS, reverse=True), atol=0.1)

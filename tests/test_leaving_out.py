@@ -298,6 +298,3 @@ def test_a_waypoint_that_departs_in_any_column_stays(column: str) -> None:
     assert 23 in np.rint(simplify_waypoints(replace(DRIVE, **{column: values})).t_s * 10).astype(int)
     values[23] += 0.0015 - 0.05
     assert len(simplify_waypoints(replace(DRIVE, **{column: values}))) == len(simplify_waypoints(DRIVE))
-
-
-# --- the report

@@ -15,10 +15,11 @@ from log2sim.datatypes import ImageLabels, Log, MapFrame, Stream, Sweep
 from log2sim.errors import LogError, RecordError
 from log2sim.geometry import PoseTrack, apply, inverse, rotation_from_rpy, transform, yaw_of
 from log2sim.localization.camera_motion import follow_camera
-from log2sim.localization.choice import localize
+from log2sim.localization.choice import localize, localize_like
+from log2sim.localization.given_poses import check_poses, list_faults
 from log2sim.localization.odometry import Odometry, densest_lidar, run_odometry
 from log2sim.localization.replaced import replace_poses
-from log2sim.localization.verdict import fit_to_given
+from log2sim.localization.verdict import bridge_by_lidar, fit_to_given
 from log2sim.perception.lidar.cloud import sweep_to_map
 
 LIDAR, AUTO = ({"source": name} for name in ("lidar", "auto"))
@@ -269,3 +270,37 @@ def test_an_empty_plain_keeps_the_given_poses() -> None:
     assert choice.source == "given"
     with pytest.raises(LogError, match="cannot tell how the ego moves"):
         localize(without_poses(log), Config())
+
+
+def frozen_log(buildings: list[dict[str, object]], waypoints: list[list[float]]) -> tuple[Log, PoseTrack]:
+    """Poses that stay from 2.4 s to the end at 4 s, and the true ones."""
+    log, true = drive(buildings, waypoints, duration_s=4.0)
+    poses = true.map_T_ego.copy()
+    from_row = int(np.searchsorted(true.t_ns, true.t_ns[0] + 2_400_000_000))
+    poses[from_row:] = poses[from_row]
+    return log.changed(ego=replace(true, map_T_ego=poses)), true
+
+
+def silent(done: int, total: int) -> None:
+    assert 0 < done <= total
+
+
+@pytest.mark.slow
+def test_odometry_goes_on_where_the_motion_before_does_not_tell_the_pose() -> None:
+    pytest.importorskip("small_gicp")
+    log, true = frozen_log(HOUSES, BEND)
+    assert log.ego is not None
+    checked = check_poses(log.ego)
+    found = bridge_by_lidar(log, checked, silent)
+    asked = true.t_ns[true.t_ns <= log.streams["top"].t_ns[-1]]
+    assert not checked.track.at(asked)[1].all()
+    poses, known = found.track.at(asked)
+    assert known.all()
+    off = np.linalg.norm(poses[:, :2, 3] - true.at(asked)[0][:, :2, 3], axis=1)
+    assert off.max() < 0.25
+    (fault,) = list_faults(log, found.stretches, int(true.t_ns[0]), int(true.t_ns[-1]))
+    assert fault.treatment == "corrected"
+    assert fault.other == "LiDAR odometry"
+    again = localize_like(log, {"poses": {"source": "given"}})
+    assert again.ego is not None
+    np.testing.assert_array_equal(again.ego.map_T_ego, found.track.map_T_ego)

@@ -170,14 +170,10 @@ def drop(name: str) -> Callable[[dict[str, Any]], None]:
     [
         (POSES, set_cell("qw", 3, 9.0), "row 3: position"),
         (POSES, set_cell("tx_m", 2, float("nan")), "row 2: position"),
-        (POSES, set_cell("tx_m", 2, 1e300), "row 2: position"),
-        (POSES, drop("tz_m"), "no column 'tz_m'"),
         (POSES, set_cell("timestamp_ns", 0, None), "column 'timestamp_ns': is int64 with 1 missing values"),
         (POSES, lambda c: c.update({k: [] for k in c}), "expected"),
         (MOUNTS, set_cell("sensor_name", 1, "roof"), "no sensor 'up_lidar'; expected up_lidar, down_lidar"),
-        (MOUNTS, drop("sensor_name"), "no column 'sensor_name'"),
         (INTRINSICS, set_cell("fx_px", 0, 0.0), "row 0 ('ring_front_center')"),
-        (INTRINSICS, set_cell("width_px", 0, 10**6), "row 0 ('ring_front_center')"),
         (ANNOTATIONS, set_cell("length_m", 4, 0.0), "row 4: size [0.0,"),
         (ANNOTATIONS, set_cell("category", 1, None), "row 1: no 'category'"),
         (ANNOTATIONS, set_cell("qz", 0, float("inf")), "row 0: position"),
@@ -200,7 +196,6 @@ def test_faults_of_tables_are_named(
     [
         (set_cell("laser_number", 5, 64), "column 'laser_number': 0 to 64, expected 0 to 63"),
         (set_cell("offset_ns", 5, -2_000_000_000), "column 'offset_ns': -2000000000 to"),
-        (drop("offset_ns"), "no column 'offset_ns'"),
         (lambda c: c.update(x=["far"] * len(c["y"])), "column 'x': is string, expected numbers"),
     ],
 )

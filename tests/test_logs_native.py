@@ -174,7 +174,6 @@ MANIFEST_FAULTS = {
     "focal length": (lambda m: first_sensor(m)["intrinsics"].update(fx_px=0), ["sensors[0].intrinsics.fx_px"]),
     "distortion": (lambda m: first_sensor(m)["intrinsics"].update(distortion=[1.0]), ["sensors[0]", "distortion has 1 values"]),
     "path": (lambda m: first_sensor(m).update(index="../elsewhere.csv"), ["sensors[0].index", "leaves the log folder"]),
-    "absolute path": (lambda m: m["ego"].update(poses="/etc/passwd"), ["ego.poses", "leaves the log folder"]),
     "name twice": (lambda m: m["sensors"][1].update(name="front"), ["sensors[1] 'front'", "occurs twice"]),
     "no ego": (lambda m: m.pop("ego"), ["sensors[0] 'front'", "mounted on the ego"]),
     "two egos": (lambda m: m["ego"].update(gnss="ego/gnss.csv"), ["log.json", "ego"]),
@@ -196,11 +195,8 @@ def test_a_fault_of_the_manifest_names_its_field(folder: Path, fault: str) -> No
 
 TABLE_FAULTS = {
     "not a number": ("ego/poses.csv", 3, f"{T0_NS},x,0,0,1,0,0,0", ["poses.csv, line 3", "'x_m'", "finite number"]),
-    "NaN": ("ego/poses.csv", 3, f"{T0_NS},1,nan,0,1,0,0,0", ["poses.csv, line 3", "'y_m'", "nan"]),
     "quaternion": ("ego/poses.csv", 3, f"{T0_NS + 5},1,1,0,0.5,0,0,0", ["poses.csv, line 3", "qw,qx,qy,qz", "0.5"]),
     "stamp": ("front/index.csv", 2, "1.5e9,front/000000.jpg", ["index.csv, line 2", "'t_ns'", "whole number"]),
-    "stamp too large": ("front/index.csv", 2, "99999999999999999999,front/000000.jpg", ["line 2", "'t_ns'"]),
-    "escape": ("front/index.csv", 2, f"{T0_NS},../../etc/passwd", ["index.csv, line 2", "'file'", "leaves the log folder"]),
     "few fields": ("front/index.csv", 2, f"{T0_NS}", ["index.csv, line 2", "1 fields"]),
     "header": ("front/index.csv", 1, "t_ns,files", ["index.csv, line 1", "'file'", "missing"]),
     "column": ("ego/poses.csv", 1, "t_ns,x_m,y_m,z_m,qw,qx,qy,qq", ["poses.csv, line 1", "'qz'"]),
@@ -256,12 +252,10 @@ def png(width: int, height: int) -> bytes:
 RECORD_FAULTS = {
     "truncated JPEG": ("front", lambda f: f.write_bytes(f.read_bytes()[:-200]), "JPEG"),
     "no image": ("front", lambda f: f.write_bytes(b"hello"), "neither a JPEG nor a PNG"),
-    "empty file": ("front", lambda f: f.write_bytes(b""), "neither a JPEG nor a PNG"),
     "wrong size": ("front", lambda f: f.write_bytes(png(61, 40)), "61x40 px, the calibration is for 60x40"),
     "truncated PNG": ("front", lambda f: f.write_bytes(png(60, 40)[:-1000]), "truncated"),
     "damaged PNG": ("front", lambda f: f.write_bytes(png(60, 40)[:-600] + b"?" + png(60, 40)[-599:]), "check sum"),
     "huge PNG": ("front", lambda f: f.write_bytes(png_header(65536, 65536)), "65536x65536 px, expected 1 to"),
-    "missing": ("front", lambda f: f.unlink(), "cannot be read"),
     "truncated npz": ("top", lambda f: f.write_bytes(f.read_bytes()[:100]), "not a readable sweep"),
     "no points": ("top", lambda f: np.savez(f, other=np.zeros(3)), "no array 'xyz_m'"),
     "pickled array": ("top", lambda f: np.savez(f, xyz_m=np.array([[None] * 3], dtype=object)), "object"),

@@ -19,7 +19,6 @@ from log2sim import open_log
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, transform
-from log2sim.logs.ros import bag
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.containers import ChunkedFile
 
@@ -218,18 +217,6 @@ def test_header_stamps_that_are_zero_or_of_another_clock_are_noted(tmp_path: Pat
     np.testing.assert_array_equal(told.streams["top"].t_ns, world_log().streams["top"].t_ns + ros.OTHER_DELAY_NS)
 
 
-def test_no_more_than_a_limit_is_kept_of_what_is_read_at_opening(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = bag_of(tmp_path, Style())
-    monkeypatch.setattr(bag, "MAX_COLLECTED_BYTES", 5000)
-    log = open_log(path)
-    assert any("have more than 5000 bytes; the rest is not read" in note for note in log.notes)
-    monkeypatch.setattr(bag, "MAX_INDEX_BYTES", 40)
-    damaged = open_log(path)
-    assert any("/tf_static: 1 of 1 messages are damaged" in note for note in damaged.notes)
-
-
 def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None:
     def turned(message: Message) -> Message:
         if message[2] == "/gnss/imu":
@@ -253,11 +240,9 @@ WRONG_SETTINGS = {
     '[cameras.front]\ntopic = "/front/image"': "'cameras.front.topic' is '/front/image', but .*did you mean '/front/image_raw/compressed'",
     '[lidars.top]\ntopic = "/front/camera_info"': "holds sensor_msgs/msg/CameraInfo, expected .*sensor_msgs/msg/PointCloud2",
     '[lidars.top]\ntopik = "/top/points"': "unknown key 'lidars.top.topik'; did you mean 'lidars.top.topic'",
-    '[lidars.top]\ntopic = "/top/points"\ntime_unit = "minutes"': "'lidars.top.time_unit' is 'minutes', expected one of",
     '[poses]\nsource = "gnss"': "asks for source 'gnss', which gives none",
     "[ego]\norigin_m = [1.0, 2.0]": "'ego.origin_m' has 2 values",
     'reference_camera = "rear"': "'reference_camera' is 'rear'; there are: front",
-    "[ego\n": "not valid TOML",
     '[[static_transforms]]\nparent = "a"\nchild = "b"\nrotation_wxyz = [1.0, 1.0, 0.0, 0.0]': "has norm 1.41421",
 }  # fmt: skip
 

@@ -64,33 +64,6 @@ def test_counts_equal_those_of_motmetrics(seed):
     assert mota(int(there(truth).sum()), missed, false, switched) == pytest.approx(expected["mota"], abs=1e-12)
 
 
-@pytest.mark.matrix
-@pytest.mark.parametrize("seed", range(5))
-def test_hota_equals_that_of_trackeval(seed):
-    reference = pytest.importorskip("trackeval.metrics.hota", exc_type=ImportError)
-    truth, other = random_tracks(seed)
-    gt_ids, ids, similarity = [], [], []
-    for t in range(truth.shape[1]):
-        a, b = np.flatnonzero(there(truth)[:, t]), np.flatnonzero(there(other)[:, t])
-        gt_ids.append(a)
-        ids.append(b)
-        similarity.append(np.maximum(0, 1 - np.linalg.norm(truth[a, None, t] - other[None, b, t], axis=-1) / 2.0))
-    data = {
-        "gt_ids": gt_ids,
-        "tracker_ids": ids,
-        "similarity_scores": similarity,
-        "num_gt_ids": len(truth),
-        "num_tracker_ids": len(other),
-        "num_gt_dets": sum(map(len, gt_ids)),
-        "num_tracker_dets": sum(map(len, ids)),
-    }
-    expected = reference.HOTA().eval_sequence(data)
-    found = hota(pairs_of(truth, other), there(truth), there(other))
-    assert found["hota"] == pytest.approx(expected["HOTA"].mean(), abs=1e-12)
-    assert found["det_a"] == pytest.approx(expected["DetA"].mean(), abs=1e-12)
-    assert found["ass_a"] == pytest.approx(expected["AssA"].mean(), abs=1e-12)
-
-
 def test_hota_matches_the_identity_that_is_right_most_often_though_another_is_nearer():
     """One object for ten ticks: x is 1.2 m off for the first seven, y 0.2 m for two more, and both are there at the last."""
     x, y = np.full((2, 10), np.nan)

@@ -172,37 +172,9 @@ def test_agents_are_drawn_where_their_labels_are(log: Log, scenario: Scenario) -
         assert size == pytest.approx(known.size_m[k])
 
 
-def test_what_holds_columns_shows_them_by_their_shapes(log: Log, scenario: Scenario) -> None:
-    agent = scenario.agents[0]
-    values = (agent, agent.waypoints, log.labels, log.ego, log.cameras["front"], log.streams["front"], log.lidars)
-    shown = [repr(value) for value in values]
-    assert max(map(len, shown)) < 500
-    assert not any("array(" in text or "\n" in text for text in shown)
-    assert repr(agent).startswith(f"<Agent {agent.id!r}: {agent.category}")
-    assert f"t_s=<({len(agent.waypoints)},) float64>" in shown[1]
-
-
 def test_a_log_without_cameras_shows_a_sweep(log: Log) -> None:
     blind = log.changed(cameras={})
     assert "top, from above" in Tags(blind._repr_html_() or "").text
-
-
-def test_a_failed_parquet_file_leaves_the_old_one(
-    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pq = pytest.importorskip("pyarrow.parquet")
-    path = tmp_path / "agents.parquet"
-    path.write_text("old")
-
-    def full(table: Any, target: Path) -> None:
-        target.write_text("half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pq, "write_table", full)
-    with pytest.raises(ConfigError, match=r"agents\.parquet: cannot be written: No space left"):
-        scenario.to_parquet(path)
-    assert [f.name for f in tmp_path.iterdir()] == ["agents.parquet"]
-    assert path.read_text() == "old"
 
 
 def test_a_log_shows_a_moment(log: Log, scenario: Scenario, tmp_path: Path) -> None:

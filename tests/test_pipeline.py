@@ -120,6 +120,3 @@ def test_nobody_in_sight_leaves_the_ego_alone() -> None:
     log, _ = tiny_log(agents=[PARKED | {"pose": [-60.0, 4.0, 0.0]}])
     scenario = run(log).scenario
     assert [a.id for a in scenario.agents] == ["ego"]
-
-
-# --- replay of what came out

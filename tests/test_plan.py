@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -52,17 +55,7 @@ def test_every_stage_is_decided_once_with_a_reason() -> None:
     in_sweeps = [Stage.DETECTION_IN_SWEEPS, Stage.FUSION_WITH_LIDAR, Stage.FUSION_OF_ENDS]
     assert [d.stage for d in plan_of().decisions] == [s for s in Stage if s not in in_sweeps]
     assert not plan_of().keeps(Stage.DETECTION_IN_SWEEPS)
-    assert all(len(d.reason) > 5 for d in decisions)
     assert decisions[0].to_dict() == {"stage": "use of every LiDAR", "kept": True, "reason": "1 within range"}
-
-
-def test_a_homography_is_kept_without_lidar_and_for_what_lidar_misses() -> None:
-    assert plan_of(make_log(lidars=())).homography is HomographyScope.CAMERAS_IN_NEED
-    assert plan_of().homography is HomographyScope.CAMERAS_IN_NEED
-    assert plan_of(config=Config.load(settings=["topdown.method=off"])).homography is HomographyScope.NONE
-    reasons = [decided(Stage.HOMOGRAPHY, log)[1] for log in (make_log(lidars=()), make_log())]
-    assert "without LiDAR" in reasons[0]
-    assert "without LiDAR points" in reasons[1]
 
 
 def test_a_variant_changes_one_decision() -> None:
@@ -73,55 +66,30 @@ def test_a_variant_changes_one_decision() -> None:
     assert [d for d in later.decisions if d.stage is not Stage.HOMOGRAPHY] == [
         d for d in plan.decisions if d.stage is not Stage.HOMOGRAPHY
     ]
-
-
-class Hand:
-    """A clock that stands until it is moved."""
-
-    def __init__(self):
-        self.now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-    def move(self, seconds):
-        self.now += seconds
+    assert plan.homography is HomographyScope.CAMERAS_IN_NEED
+    assert plan_of(config=Config.load(settings=["topdown.method=off"])).homography is HomographyScope.NONE
 
 
 @pytest.fixture
 def hand(monkeypatch):
-    made = Hand()
-    monkeypatch.setattr(stages.time, "perf_counter", made)
-    return made
+    """A clock that stands until it is moved."""
+    times = [1000.0]
+    monkeypatch.setattr(stages.time, "perf_counter", lambda: sum(times))
+    return SimpleNamespace(move=times.append)
 
 
-def test_an_inner_stage_stops_the_clock_of_the_outer_one(hand):
+def test_an_inner_stage_stops_the_clock_of_the_outer_one_also_where_it_fails(hand):
     watch = StageClock()
     with watch.stage("outer"):
         hand.move(1.0)
-        with watch.stage("inner"):
+        with suppress(RuntimeError), watch.stage("inner"):
             hand.move(4.0)
             with watch.stage("innermost"):
                 hand.move(16.0)
-            hand.move(32.0)
+                raise RuntimeError
         hand.move(2.0)
-    assert watch.seconds == {"outer": 3.0, "inner": 36.0, "innermost": 16.0}
+    assert watch.seconds == {"outer": 3.0, "inner": 4.0, "innermost": 16.0}
     assert sum(watch.seconds.values()) == watch.total()
-
-
-def fail(watch, hand):
-    with watch.stage("fails"):
-        hand.move(3.0)
-        raise RuntimeError
-
-
-def test_a_stage_that_fails_is_counted_and_the_outer_one_runs_on(hand):
-    watch = StageClock()
-    with watch.stage("outer"):
-        with pytest.raises(RuntimeError):
-            fail(watch, hand)
-        hand.move(5.0)
-    assert watch.seconds == {"fails": 3.0, "outer": 5.0}
 
 
 def test_the_table_holds_ticks_per_second_and_none_for_a_stage_that_took_no_time(hand):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -20,6 +21,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from command_line import run
 from entry import commands_in
 
 from log2sim.cli import entry
@@ -27,8 +29,10 @@ from log2sim.logs.ros.messages import read_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {path.stem: path.read_text(encoding="utf-8") for path in sorted((ROOT / "samples/cookbook").glob("*.md"))}
-README = "\n".join([(ROOT / "README.md").read_text(encoding="utf-8"), *PAGES.values()])
+FRONT = (ROOT / "README.md").read_text(encoding="utf-8")
+README = "\n".join([FRONT, *PAGES.values()])
 GROUP = typer.main.get_group(entry.app)
+SAMPLE_S = 3.6  # the latest moment that a line names, and a little more
 
 
 def test_documents_name_tools_that_exist() -> None:
@@ -50,10 +54,15 @@ def blocks() -> Iterator[str]:
             yield "\n".join(lines)
 
 
-def runnable_script() -> str:
-    """Blocks marked `sh` and `python` as one bash script that stops at the first line that fails and names it."""
+def runnable(page: str) -> list[tuple[str, str]]:
+    """Blocks marked `sh` and `python`."""
+    return re.findall(r"^```(sh|python)\n(.*?)^```", page, flags=re.MULTILINE | re.DOTALL)
+
+
+def script_of(page: str) -> str:
+    """The blocks as one bash script that stops at the first line that fails and names it."""
     lines = ["set -Eeo pipefail", """trap 'echo "failed: $BASH_COMMAND" >&2' ERR"""]
-    for language, block in re.findall(r"^```(sh|python)\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL):
+    for language, block in runnable(page):
         lines.append(block if language == "sh" else f"python - <<'END_OF_PYTHON'\n{block}END_OF_PYTHON")
     return "\n".join(lines)
 
@@ -138,7 +147,7 @@ def _imports(block: str) -> list[ast.ImportFrom]:
 
 @pytest.fixture
 def fresh_checkout(tmp_path: Path) -> Path:
-    """A copy of what a clone of this checkout with its uncommitted work would hold."""
+    """What a clone of this checkout with its uncommitted work would hold; of the sample every other record of its first seconds."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("needs git to tell the files of the checkout from others")
     listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
@@ -148,6 +157,17 @@ def fresh_checkout(tmp_path: Path) -> Path:
             target = tmp_path / "log2sim" / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, target)
+    sample, part = tmp_path / "log2sim/samples/crossing", tmp_path / "part"
+    assert run("convert", sample, "--stop", SAMPLE_S, "--out", part).code == 0
+    (sample / "truth.json").rename(part / "truth.json")
+    stamps = set[str]()
+    for table in (*part.glob("*/index.csv"), part / "labels/boxes_2d.csv"):
+        head, *rows = table.read_text().splitlines()
+        kept = rows[::2] if table.name == "index.csv" else [row for row in rows if row.split(",")[0] in stamps]
+        stamps.update(row.split(",")[0] for row in kept)
+        table.write_text("\n".join([head, *kept]) + "\n")
+    shutil.rmtree(sample)
+    part.rename(sample)
     return tmp_path / "log2sim"
 
 
@@ -173,12 +193,19 @@ def fresh_environment(tmp_path: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_every_line_of_the_readme_runs_for_a_new_user(fresh_checkout: Path, fresh_environment: dict[str, str]) -> None:
-    script = runnable_script()
-    ran = subprocess.run(
-        ["bash", "--norc", "-c", script],
-        cwd=fresh_checkout, env=fresh_environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert ran.returncode == 0, ran.stderr[-3000:]
+    """README.md in a shell, and then the cookbook in one process of the environment that README.md made."""
+    python = fresh_checkout / ".venv/bin/python"
+    inside = {**fresh_environment, "PATH": f"{python.parent}:{fresh_environment['PATH']}"}
+    pages = [block for page in PAGES.values() for block in runnable(page)]
+    for command, variables, given in (
+        (["bash", "--norc", "-c", script_of(FRONT)], fresh_environment, ""),
+        ([python, "tests/run_blocks.py"], inside, json.dumps(pages)),
+    ):
+        ran = subprocess.run(
+            command, cwd=fresh_checkout, env=variables, input=given, capture_output=True, text=True, check=False
+        )
+        assert ran.returncode == 0, ran.stderr[-3000:]
+    script = script_of(README)
     promised = set(re.findall(r"--(?:out|report) (\S+)", script)) | set(re.findall(r"""\.save\("([^"]+)"\)""", script))
     missing = sorted(name for name in promised if not (fresh_checkout / name).exists())
     assert promised, "the README writes no files"

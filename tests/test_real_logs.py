@@ -13,13 +13,14 @@ from log2sim.errors import LogError
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.truth import truth_from_log
 from log2sim.files.documents import check
+from log2sim.logs.excerpt import cut_log
 
 pytestmark = [pytest.mark.slow, pytest.mark.real]
 
 
 def figures(path: Path, **less: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """Metrics of vehicles within 30 m, and report, of a reconstruction from the log's own boxes."""
-    log = open_log(path)
+    log = cut_log(open_log(path), stop_s=4.0)
     result = reconstruct(log, Config.load(detect={"name": "labels"}, **less))
     check(result.report, "report-1", LogError)
     used = [str(c["name"]) for c in result.scenario.cameras if c["used"]]

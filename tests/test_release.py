@@ -202,30 +202,18 @@ def test_without_extras_every_command_works_or_names_the_one_it_needs(tiny_folde
 
 
 @pytest.mark.slow
-def test_examples_have_the_types_that_they_use(tmp_path: Path) -> None:
+def test_the_package_and_the_examples_have_the_types_that_they_use(tmp_path: Path) -> None:
     pages = [ROOT / "README.md", *sorted((ROOT / "samples/cookbook").glob("*.md"))]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     files = [tmp_path / f"readme_{k}.py" for k in range(len(blocks))]
     for file, block in zip(files, blocks):
         file.write_text(block, encoding="utf-8")
-    files += sorted((ROOT / "samples").glob("*.py"))
+    files += sorted(path.relative_to(ROOT) for path in (ROOT / "samples").glob("*.py"))
     assert len(files) > len(blocks) > 0
-    # The cache of the checkout: the run of mypy over the package, which follows, finds all that is done here.
-    command = [
-        sys.executable,
-        "-m",
-        "mypy",
-        "--config-file",
-        ROOT / "pyproject.toml",
-        "--cache-dir",
-        ROOT / ".mypy_cache",
-        *files,
-    ]
+    command = [sys.executable, "-m", "mypy", "--cache-dir", ROOT / ".mypy_cache", "log2sim", *files]
     ran = subprocess.run([str(c) for c in command], cwd=ROOT, capture_output=True, text=True, check=False)
-    examples = {str(file) for file in files} | {
-        str(file.relative_to(ROOT)) for file in files if file.is_relative_to(ROOT)
-    }
-    errors = [line for line in ran.stdout.splitlines() if ": error:" in line and line.split(":")[0] in examples]
-    assert [line for line in errors if not line.endswith(UNTYPED) or line.startswith("samples/")] == []
+    errors = [line for line in ran.stdout.splitlines() if ": error:" in line]
+    # By name: of what did not change since an earlier run, errors come with the folder of that run.
+    assert [line for line in errors if not (line.endswith(UNTYPED) and re.search(r"/readme_\d+\.py:", line))] == []
     assert ran.returncode in (0, 1), ran.stderr[-1000:]

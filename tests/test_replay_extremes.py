@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from replay_maneuvers import OFFSET_M, agent_from, driven, ramp, scenario_of
 
-from log2sim.errors import ScenarioError
 from log2sim.simulation.runner import replay
 from log2sim.simulation.vehicles.vehicle import parameters_for
 
@@ -95,19 +94,6 @@ def test_a_gap_of_ten_seconds_is_crossed_at_the_speed_on_its_sides(dt_s):
     r = followed(without(agent, (t > 3.0) & (t < 13.0)), dt_s=dt_s)
     np.testing.assert_allclose(r.x_m, 12 * r.t_s, atol=0.01)
     np.testing.assert_allclose(r.y_m, 0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("same_pose", [True, False])
-def test_duplicate_times_are_refused_by_agent_and_index(same_pose):
-    agent = on_circle(8.0, 30.0, 2.0)
-    w = agent.waypoints
-    t = w.t_s.copy()
-    t[7] = t[6]
-    x = w.x_m.copy()
-    if same_pose:
-        x[7] = x[6]
-    with pytest.raises(ScenarioError, match=r"agent 'a': waypoints.t_s does not increase at index 7"):
-        followed(changed(agent, waypoints=changed(w, t_s=t, x_m=x)))
 
 
 # Invariances.

@@ -22,17 +22,6 @@ SAMPLE = ROOT / "samples" / "crossing" / "truth.json"
 EGOS = ROOT / "samples" / "egos.py"
 
 
-class Recorder:
-    """A driver that holds its controls and keeps what it saw."""
-
-    def __init__(self, controls=Controls(0.0, 0.0)):  # noqa: B008
-        self.controls, self.seen = controls, []
-
-    def __call__(self, seen):
-        self.seen.append(seen)
-        return self.controls
-
-
 # Stepping.
 
 
@@ -70,23 +59,23 @@ def test_the_path_ahead_begins_beside_the_ego_however_late_it_is():
 
 
 def test_a_policy_with_reset_is_told_the_scenario_before_each_replay():
-    class Counter(Recorder):
+    class Twice:
         scenarios: list = []  # noqa: RUF012
 
+        def __call__(self, seen):
+            return Controls(0.0, 0.0)
+
         def reset(self, scenario):
+            if len(self.scenarios) == 2:
+                raise RuntimeError("no map")
             self.scenarios.append(scenario.name)
 
-    driver, scene = Counter(), scenario_of(line("ego", 0, duration_s=0.5))
+    driver, scene = Twice(), scenario_of(line("ego", 0, duration_s=0.5))
     for _ in range(2):
         replay(scene, ego=driver, dt_s=0.05)
     assert driver.scenarios == ["maneuver", "maneuver"]
-
-    class Fails(Recorder):
-        def reset(self, scenario):
-            raise RuntimeError("no map")
-
     with pytest.raises(ConfigError, match="reset raised RuntimeError: no map"):
-        replay(scene, ego=Fails())
+        replay(scene, ego=driver)
 
 
 def test_policies_are_found_in_files_and_classes_are_made(tmp_path):
@@ -107,9 +96,6 @@ def test_policies_are_found_in_files_and_classes_are_made(tmp_path):
     ):
         with pytest.raises(ConfigError, match=said):
             load_policy(name)
-
-
-# The command line.
 
 
 # The example egos.

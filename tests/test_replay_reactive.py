@@ -37,10 +37,9 @@ def stops_at(t_s, speed=25.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("leader_mps", [12.0, 18.0])
-def test_behind_a_constant_leader_the_gap_is_that_of_the_model_in_equilibrium(leader_mps):
+def test_behind_a_constant_leader_the_gap_is_that_of_the_model_in_equilibrium():
     # Acceleration 0 and equal speeds: 1 - (v / v0)^4 = ((s0 + v T) / s)^2, with the values of town traffic.
-    s0, time_gap, v0 = 2.0, 1.0, 25.0
+    leader_mps, s0, time_gap, v0 = 18.0, 2.0, 1.0, 25.0
     expected = (s0 + leader_mps * time_gap) / np.sqrt(1 - (leader_mps / v0) ** 4)
     scene = scenario_of(line("ego", 70, duration_s=60), line("f", 0, duration_s=60))
     result = replay(scene, ego=Speed(lambda t: leader_mps), agents="reactive", dt_s=0.1)
@@ -76,7 +75,7 @@ def test_a_free_agent_goes_on_at_the_logs_rate_and_accelerates_to_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("distance_m", [6.0, 10.0, 20.0, 40.0])
+@pytest.mark.parametrize("distance_m", [6.0, 40.0])
 def test_a_follower_at_25_mps_stops_behind_an_ego_that_brakes_hard(distance_m):
     scene = scenario_of(line("ego", distance_m + LENGTH_M, duration_s=16), line("f", 0, duration_s=16))
     result = replay(scene, ego=stops_at(3.0), agents="reactive", dt_s=0.05)
@@ -217,9 +216,6 @@ def test_what_the_log_drives_into_is_braked_for():
     assert 1.0 < 80 - result.agent("f").x_m[-1] - LENGTH_M < 4.0
     grazing = scenario_of(line("f", 0, speed=12, duration_s=12), parked("p", 80, 1.6))
     assert departure(replay(grazing, agents="reactive"), replay(grazing), "f") < 1e-9
-
-
-# Choice, invariance, extremes.
 
 
 # Geometry.

@@ -11,7 +11,6 @@ from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 
 from log2sim.errors import ScenarioError
 from log2sim.files.documents import check, write_json
-from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 
@@ -72,7 +71,6 @@ def test_a_replay_reads_back_as_it_was_written(tmp_path):
         (lambda d: d.pop("metrics"), "metrics"),
         (lambda d: d["agents"][0]["states"]["x_m"].pop(), "states.x_m has"),
         (lambda d: d["agents"][0].update(driver="ghost"), "driver"),
-        (lambda d: d["agents"][0]["states"].update(y_m=["a"]), "y_m"),
     ],
 )
 def test_broken_replay_files_are_refused_by_field(tmp_path, change, said):
@@ -83,35 +81,6 @@ def test_broken_replay_files_are_refused_by_field(tmp_path, change, said):
     with pytest.raises(ScenarioError, match=said) as caught:
         Replay.load(path)
     assert "broken.json" in str(caught.value)
-
-
-# Policies.
-
-
-class Recorder:
-    """A driver that holds its controls and keeps what it saw."""
-
-    def __init__(self, controls):
-        self.controls, self.seen = controls, []
-
-    def __call__(self, observation):
-        self.seen.append(observation)
-        return self.controls
-
-
-def test_a_policy_drives_the_ego_from_its_first_state():
-    ego = straight("ego", speed=10.0, duration_s=4.0)
-    driver = Recorder(Controls(-4.0, 0.0))
-    result = replay(scenario_of(ego, straight("b", y=8)), ego=driver)
-    r = result.agent("ego")
-    assert r.driver == "policy"
-    assert r.speed_mps[0] == pytest.approx(10.0)
-    assert r.speed_mps[-1] == 0.0
-    # 10 m/s stop within v^2 / 2a and what is driven while the pedal takes hold.
-    assert 12.5 < r.x_m[-1] - r.x_m[0] < 12.5 + 10 * 0.15
-    assert result.agent("b").driver == "pid"
-    assert result.metrics["followers"] == 1
-    assert "ego" in result.metrics["by_agent"]
 
 
 # Degenerate scenarios.
@@ -125,7 +94,6 @@ def test_one_waypoint_is_one_state():
     assert len(r) == 1
 
 
-@pytest.mark.matrix
 @pytest.mark.matrix
 @pytest.mark.parametrize("seed", range(6))
 def test_nonsense_gives_finite_states(seed):

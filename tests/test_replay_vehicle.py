@@ -73,17 +73,6 @@ def test_the_wheels_turn_no_faster_than_their_rate_and_no_further_than_the_lock(
     assert np.all(CAR.steer_lag_s == STEER_LAG_S)
 
 
-def test_a_step_in_one_or_in_two_halves_is_the_same_while_the_steering_is_constant():
-    state = at_rest(speed=20.0, steer=0.05, pedal=2.0)
-    controls = command(pedal=2.0, steer=0.05)
-    one = step_bicycle(state, controls, CAR, 0.02)
-    half = step_bicycle(state, controls, CAR, 0.01)
-    two = step_bicycle(half, controls, CAR, 0.01)
-    for key in ("x_m", "y_m", "yaw_rad", "speed_mps"):
-        assert getattr(one, key)[0] == pytest.approx(getattr(two, key)[0], abs=1e-5)
-    assert half.x_m[0] == pytest.approx(20.0 * 0.01, rel=1e-2)
-
-
 def test_a_point_follows_the_parabola_and_its_acceleration_is_limited():
     state = PointState(column(1), column(2), column(3), column(-1))
     for _ in range(100):

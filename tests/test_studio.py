@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,20 +40,15 @@ def world() -> Scenario:
     whole = straight("car-1", y_m=6.0)
     w = whole.waypoints
     first, last = (
-        type(whole)(**{**vars_of(whole), "id": name, "waypoints": w.take(part)})
-        for name, part in (("car-1", w.t_s < 1.5), ("car-2", w.t_s > 2.0))
+        replace(whole, id=f"car-{k}", waypoints=w.take(part)) for k, part in ((1, w.t_s < 1.5), (2, w.t_s > 2.0))
     )
-    doubtful = type(whole)(**{**vars_of(parked("car-3")), "doubts": (Finding("heading_ambiguous"),)})
+    doubtful = replace(parked("car-3"), doubts=(Finding("heading_ambiguous"),))
     return scenario(straight("ego", speed_mps=5.0), first, last, doubtful)
 
 
-def vars_of(agent: Any) -> dict[str, Any]:
-    return {name: getattr(agent, name) for name in type(agent).__dataclass_fields__}
-
-
 @contextlib.contextmanager
-def serving(path: Path) -> Iterator[Studio]:
-    studio = Studio(world(), path)
+def serving(path: Path, source: Scenario | None = None, **options: Any) -> Iterator[Studio]:
+    studio = Studio(source or world(), path, **options)
     thread = threading.Thread(target=studio.serve, daemon=True)
     thread.start()
     try:
@@ -374,20 +370,18 @@ def test_a_box_is_sized_in_the_map_and_the_other_end_stays(chromium: Browser, st
     np.testing.assert_allclose(rear[1], rear[0], atol=0.1)
 
 
+SHOW_FRONT = "[...document.querySelectorAll('#cameras button')].find((b) => b.textContent === 'front').click()"
+
+
 def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, tmp_path: Path) -> None:
     """The picture's pixels are those of log2sim's own projection, and a drag there moves the box on the ground."""
     log = open_log(ROOT / "samples/crossing")
     scenario = Scenario.load(ROOT / "samples/crossing/truth.json")
-    served = Studio(scenario, tmp_path / "c.json", recorded=Recorded(log, max_bytes=3_000_000))
-    thread = threading.Thread(target=served.serve, daemon=True)
-    thread.start()
     browser = chromium
-    try:
+    with serving(tmp_path / "c.json", scenario, recorded=Recorded(log, max_bytes=3_000_000)) as served:
         browser.open(served.address)
         name = "car_parked"
-        browser.run(
-            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
-        )
+        browser.run(SHOW_FRONT)
         browser.run("log2sim.time = 1.0; log2sim.choose(arguments[0])", name)
         browser.wait("log2sim.pictures.front !== null")
         browser.press("E")
@@ -399,7 +393,6 @@ def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, 
         box = browser.run(
             "const r = document.querySelector('[aria-label=\"Picture of front\"]').getBoundingClientRect(); return [r.left, r.top, r.width]"
         )
-        assert expected is not None
         np.testing.assert_allclose(
             (np.array(pixel) - box[:2]) * log.cameras["front"].width_px / box[2], expected, atol=0.5
         )
@@ -415,9 +408,7 @@ def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, 
         np.testing.assert_allclose(moved, [-2.0, 2.0], atol=0.8)
         # Loaded again, its box is in the picture where it is now.
         browser.open(served.address)
-        browser.run(
-            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
-        )
+        browser.run(SHOW_FRONT)
         browser.run("log2sim.time = arguments[0]", t_s)
         browser.wait("log2sim.pictures.front !== null")
         now = served.result.scenario[name].at(t_s)
@@ -433,32 +424,19 @@ def test_a_box_is_moved_in_a_picture_through_its_calibration(chromium: Browser, 
         browser.open(served.address, size=(420, 800))
         browser.run("log2sim.choose(arguments[0])", name)
         click(browser, "move")
-        browser.run(
-            "[...document.querySelectorAll('#cameras button')].find((button) => button.textContent === 'front').click()"
-        )
+        browser.run(SHOW_FRONT)
         shape = "const c = document.querySelector('[aria-label=\"Picture of front\"]'); return c.clientWidth / c.clientHeight"
         camera = log.cameras["front"]
         assert browser.run(shape) == pytest.approx(camera.width_px / camera.height_px, rel=0.01)
         assert [line for line in browser.log("browser") if line["level"] == "SEVERE"] == []
-    finally:
-        served.close()
-        thread.join(10)
 
 
-def in_view(log: Log, scenario: Scenario, agent: Agent, t_s: float) -> np.ndarray | None:
-    """Pixel of the ground below an agent in the front camera; None where it is not in the picture."""
-    stamps = log.streams["front"].t_ns
+def in_view(log: Log, scenario: Scenario, agent: Agent, t_s: float) -> np.ndarray:
+    """Pixel of the ground below an agent in the front camera."""
+    stamps, at = log.streams["front"].t_ns, agent.at(t_s)
     t_ns = int(stamps[np.argmin(np.abs(stamps - scenario.t0_ns - t_s * 1e9))])
-    at = agent.at(t_s)
-    if not at.valid[0]:
-        return None
-    map_T_cam, _ = log.map_T_sensor("front", t_ns)
-    camera = log.cameras["front"]
-    uv, seen = project(
-        camera, apply(inverse(map_T_cam[0]), np.array([[at.x_m[0], at.y_m[0], at.z_m[0] - agent.size_m[2] / 2]]))
-    )
-    inside = seen[0] and 0 < uv[0, 0] < camera.width_px and 0 < uv[0, 1] < camera.height_px
-    return uv[0] if inside else None
+    ground = np.array([[at.x_m[0], at.y_m[0], at.z_m[0] - agent.size_m[2] / 2]])
+    return project(log.cameras["front"], apply(inverse(log.map_T_sensor("front", t_ns)[0][0]), ground))[0][0]
 
 
 def test_paints_have_the_colors_of_their_names() -> None:

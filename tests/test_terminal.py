@@ -67,6 +67,7 @@ def braked_at(wall_m: float, decel: float = 3.0, speed: float = 10.0):
 def test_the_figures_of_a_braking_ego_are_those_of_the_closed_form() -> None:
     result = braked_at(40.0)
     ego, figures = result.agent("ego"), result.metrics["ego"]
+    assert (ego.driver, result.metrics["followers"]) == ("policy", 0)
     assert figures["path_m"] == pytest.approx(80.0, abs=0.01)
     assert figures["progress_m"] == pytest.approx(float(ego.x_m[-1] - ego.x_m[0]), abs=0.01)
     assert figures["progress_m"] == pytest.approx(10.0**2 / (2 * 3.0), rel=0.15)  # and the delay of the brakes

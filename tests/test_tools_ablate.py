@@ -6,7 +6,6 @@ import importlib
 import sys
 
 import ablate
-import numpy as np
 import pytest
 
 from log2sim.config import Config
@@ -77,38 +76,9 @@ def test_changes_reach_all_that_is_derived_from_what_is_changed(toy):
     assert answer() == 7.0
 
 
-def test_whole_numbers_change_by_one_and_shares_stay_below_one():
-    assert [ablate.scaled(2, f) for f in (0.7, 1.3)] == [1, 3]
-    assert ablate.scaled(10, 1.3) == 13
-    assert [ablate.scaled(v, 1.3, share=True) for v in (0.9, 0.2)] == pytest.approx([0.95, 0.26])
-    doubled = ablate.mapped({"a": (0.9, True, "x"), "b": np.array([1.0, 2.0])}, lambda v: 2 * v)
-    assert doubled["a"] == (1.8, True, "x")
-    np.testing.assert_array_equal(doubled["b"], [2.0, 4.0])
-    changes = {v.change: v.value for v in ablate.scalings(ablate.Variation("", "m", "MAX_GAP_M", "", 2.0))}
-    assert changes == {"x0.7": pytest.approx(1.4), "x1.3": pytest.approx(2.6), "off": np.inf}
-
-
 def test_stages_are_functions_of_the_pipeline_and_everything_belongs_to_one():
     assert all(hasattr(*ablate.place_of(name)) for functions, _, _ in ablate.STAGES.values() for name in functions)
     found = list(ablate.variations(Config()))
     assert {v.stage for v in found} == set(ablate.STAGES)
     labels = {v.label for v in found}
     assert {"track.max_gap_s", "agents.judge.TOUCHING", "datatypes.categories.CATEGORY.max_size_m"} <= labels
-
-
-def test_rows_are_worse_better_or_equal_beyond_the_noise_of_seeds():
-    def row(label: str, change: str, outcome: str, **figures: float) -> dict:
-        figures = dict.fromkeys(ablate.FIGURES, 1.0) | figures
-        told = {"label": label, "change": change, "figures": figures, "outcome": outcome}
-        return {"case": "log", "stage": "tracking", "unit": "", "value": "2", **told}
-
-    rows = [row("seed", str(k), "abc", recall=1.0 + 0.01 * k) for k in range(3)]
-    rows += [
-        row("A", "x0.7", "d", recall=0.9), row("B", "x0.7", "d", recall=1.01), row("C", "off", "ab"), row("D", "x1.3", "d", invented=0.5),
-    ]  # fmt: skip
-    usual, noise = ablate.usual_and_noise(rows)
-    told = {r["label"]: ablate.effect({"log": r}, usual, noise)[1].split()[0] for r in rows[3:]}
-    assert told == {"A": "worse", "B": "equal", "C": "same", "D": "better"}
-    assert ablate.matters(rows) == {"A", "D"}
-    text = ablate.tables(rows)
-    assert "The same scenarios without: C." in text

@@ -29,15 +29,15 @@ def torch() -> Any:
 
 
 def test_a_toy_learns_to_find_riders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half a minute from nothing: centers of riders on fresh scenes are found first; chance finds one in hundreds."""
+    """Ten seconds from nothing: centers of riders on fresh scenes are found first; chance finds one in hundreds."""
     import train_lidar
 
-    monkeypatch.setattr(train_lidar, "PER_SHARD", 60)
+    monkeypatch.setattr(train_lidar, "PER_SHARD", 40)
     monkeypatch.setitem(train_lidar.CELLS, "roadside", 128)
-    rounds = [train_lidar.Round(5, 60, 240)]
-    train_lidar.generate("roadside", tmp_path / "data", 60, 5)
+    rounds = [train_lidar.Round(5, 40, 160)]
+    train_lidar.generate("roadside", tmp_path / "data", 40, 5)
     train_lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
-    train_lidar.finish("roadside", tmp_path, rounds, examples=8)
+    train_lidar.finish("roadside", tmp_path, rounds, examples=6)
     card = json.loads((tmp_path / "roadside.json").read_text())
     assert card["simulated"]["two_wheeler"]["average_precision"] > 0.08
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_000_000
@@ -66,28 +66,6 @@ def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any)
         # In training a layer is normalized by the batch, whose moments are those that were put in.
         np.testing.assert_allclose(again.train()(grids[:4]), network.eval()(grids[:4]), rtol=0, atol=error)
     assert (tmp_path / "x.onnx").stat().st_size < 0.55 * (tmp_path / "x.pt").stat().st_size
-
-
-def test_blended_weights_compute_what_lies_between(tmp_path: Path, torch: Any) -> None:
-    from lidar_training.export import blend, description, export_onnx
-    from lidar_training.network import BevNetwork
-
-    paths = [tmp_path / f"{k}.onnx" for k in range(2)]
-    for seed, path in enumerate(paths):
-        torch.manual_seed(seed)
-        network = BevNetwork().eval()
-        # What the head gets is the same for any input, so that the maps are linear in the weights that differ.
-        for layer in (network.merge2[0], network.merge2[1]):
-            layer.weight.data.zero_()
-        network.merge2[1].bias.data.fill_(1.0)
-        torch.save({"mean": network.state_dict()}, tmp_path / "r.pt")
-        export_onnx(tmp_path / "r.pt", path, description("vehicle", 0.25, 40.0))
-    grid = np.random.default_rng(0).random((12, 64, 64), np.float32)
-    one, other = (load_network(path).run(grid) for path in paths)
-    blend(paths[0], paths[1], 0.25)
-    mean = load_network(paths[0]).run(grid)
-    assert np.abs(one - other).max() > 0.1
-    np.testing.assert_allclose(mean, 0.75 * one + 0.25 * other, atol=2e-3)
 
 
 def test_a_bicycle_without_rider_is_no_person_but_may_be_a_two_wheeler(torch: Any) -> None:

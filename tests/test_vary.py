@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from command_line import run
 from log2sim.datatypes import Scenario
 from log2sim.errors import ConfigError
 from log2sim.scenarios.index import open_index
-from log2sim.scenarios.logical import SAMPLERS, TIMING, Base, Logical, choose_base, concrete, fit, write_openscenario
+from log2sim.scenarios.logical import SAMPLERS, Base, Logical, choose_base, concrete, fit, write_openscenario
 from log2sim.scenarios.query import ask
 from log2sim.scenarios.tagging import find_tags
 
@@ -181,13 +180,3 @@ def test_the_command(folder, tmp_path) -> None:
     closest = run("vary", folder, "cut_in and gap_m < 0.001", "-o", tmp_path / "w").line
     assert "without 'gap_m < 0.001' there are" in closest
     assert not (tmp_path / "w").exists()
-
-
-def test_every_tag_that_can_be_varied_has_speeds(found) -> None:
-    _, base = found
-    still = replace(
-        base.scenario, agents=tuple(replace(a, id=f"other-{k}") for k, a in enumerate(base.scenario.agents))
-    )
-    with pytest.raises(ConfigError, match="has no agents"):
-        Base.of(still, base.row)
-    assert set(TIMING) >= {"cut_in", "crossing_path", "overtaking"}

@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,15 +14,19 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from browser import Browser
+from browser import Browser, opened
 from command_line import names, run
+from replay_maneuvers import scenario_of
+from test_replay_warnings import crossing_walker, seen, town_ego
 from worlds import waypoints
 
 from log2sim.datatypes import Agent, Finding, Scenario
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev, wrap_angle
 from log2sim.road.ground_map import GroundMap
+from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
+from log2sim.simulation.warnings import warn
 from log2sim.visualization.page.document import SCALES, page_document, second_differences
 from log2sim.visualization.page.writer import page_html, write_page
 from log2sim.visualization.plot import style
@@ -144,14 +147,6 @@ def test_a_page_that_cannot_be_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 # What it does
 
 
-@pytest.fixture
-def browser(chromium: Browser) -> Iterator[Browser]:
-    """The browser, whose pages must neither log an error nor ask for anything but themselves."""
-    yield chromium
-    assert chromium.log("browser") == []
-    assert {address.split("#")[0].rpartition("/")[2] for address in chromium.requests()} <= {"page.html"}
-
-
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the sample with all layers."""
@@ -159,11 +154,6 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario = Scenario.load(TRUTH)
     write_page(scenario, path, truth=scenario, replay=replay(scenario, dt_s=0.1))
     return path
-
-
-def opened(browser: Browser, page: Path, hash: str = "", **window: Any) -> Browser:
-    browser.open(page.as_uri() + hash, **window)
-    return browser
 
 
 def page_with(tmp_path: Path, *agents: Agent, name: str = "made") -> Path:
@@ -179,15 +169,20 @@ def place_of(browser: Browser, id: str) -> Array:
     return np.array(browser.run("return log2sim.placeOf(arguments[0])", id), dtype=np.float64)
 
 
-def pixel(browser: Browser, place: Array) -> tuple[int, ...]:
-    """Color of the canvas at a place after the next frame."""
-    script = """const [x, y, done] = arguments;
+def pixels(browser: Browser, place: Array, width: int) -> list[tuple[int, ...]]:
+    """Colors of the canvas from a place on to the right after the next frame."""
+    script = """const [x, y, width, done] = arguments;
         requestAnimationFrame(() => requestAnimationFrame(() => {
-            const pen = new OffscreenCanvas(1, 1).getContext("2d", {willReadFrequently: true});
+            const pen = new OffscreenCanvas(width, 1).getContext("2d", {willReadFrequently: true});
             pen.drawImage(document.getElementById("map"), -Math.round(x), -Math.round(y));
-            done([...pen.getImageData(0, 0, 1, 1).data]);
+            done([...pen.getImageData(0, 0, width, 1).data]);
         }));"""
-    return tuple(browser.run_async(script, float(place[0]), float(place[1])))[:3]
+    row = browser.run_async(script, float(place[0]), float(place[1]), width)
+    return [tuple(row[k : k + 3]) for k in range(0, len(row), 4)]
+
+
+def pixel(browser: Browser, place: Array) -> tuple[int, ...]:
+    return pixels(browser, place, 1)[0]
 
 
 def rgb(hex: str) -> tuple[int, ...]:
@@ -270,15 +265,7 @@ def doubtful_scene() -> Scenario:
 def striped(browser: Browser, id: str) -> list[tuple[int, ...]]:
     """Colors along the middle line of an agent that heads east, behind its heading mark."""
     scale = browser.run("return log2sim.pixelsPerMeter")
-    script = """const [x, y, width, done] = arguments;
-        requestAnimationFrame(() => requestAnimationFrame(() => {
-            const pen = new OffscreenCanvas(width, 1).getContext("2d", {willReadFrequently: true});
-            pen.drawImage(document.getElementById("map"), -Math.round(x), -Math.round(y));
-            done([...pen.getImageData(0, 0, width, 1).data]);
-        }));"""
-    x, y = place_of(browser, id)
-    row = browser.run_async(script, x - 1.8 * scale, y, int(1.6 * scale))
-    return sorted({tuple(row[k : k + 3]) for k in range(0, len(row), 4)}, key=sum)
+    return sorted(set(pixels(browser, place_of(browser, id) - [1.8 * scale, 0.0], int(1.6 * scale))), key=sum)
 
 
 def test_doubtful_agents_are_hatched_while_the_doubt_holds(browser: Browser, tmp_path: Path) -> None:
@@ -559,3 +546,60 @@ def test_a_map_of_the_ground_is_embedded_where_it_lies_and_stays_small(monkeypat
     assert shown.shape[1] / shown.shape[0] == pytest.approx(390 / 380, rel=0.02)
     blank = GroundMap(color[:5, :5], alpha[:5, :5], nothing[:5, :5], nothing[:5, :5], 0.5, (0.0, 2.5, 0.0, 2.5))
     assert page_document(made(agent("a", np.arange(5.0), 0.0)), background=blank)["background"] is None
+
+
+WARN_LIGHT = (179, 92, 0)
+
+
+def scene() -> Scenario:
+    return scenario_of(town_ego(8.0), seen(crossing_walker(6.0, 8.0), vehicle=(5.0, 8.0), road=(1.0, 8.0)))
+
+
+def warned(world: Scenario) -> Replay:
+    result = replay(world, mode="exact", dt_s=0.1)
+    return replace(result, warnings=warn(world, result))
+
+
+def test_the_document_tells_of_warnings_and_of_ends() -> None:
+    world = scene()
+    document = page_document(world, replay=warned(world))
+    entries = {e["id"]: e for e in document["layers"]["scenario"]}
+    assert entries["p"]["observed_by"] == {"vehicle": [[5.0, 8.0]], "road": [[1.0, 8.0]]}
+    assert "observed_by" not in entries["ego"]
+    assert document["warnings"]["title"] == "1 warning"
+    (event,) = document["warnings"]["events"]
+    assert event["agent"] == "p"
+    assert event["t_s"] == event["spans"][0][0]
+    assert event["brief"].startswith("p: warning at ")
+
+
+def test_the_page_lists_marks_and_draws_a_warning(chromium: Browser, tmp_path: Path) -> None:
+    browser, world = chromium, scene()
+    write_page(world, tmp_path / "w.html", replay=warned(world))
+    browser.open(f"file://{tmp_path}/w.html")
+    assert browser.run("return document.getElementById('warned-count').textContent") == "1 warning"
+    assert browser.run("return document.querySelectorAll('#events .warned').length") == 1
+    browser.run("document.querySelector('#warned-agents button').click()")
+    assert browser.run("return log2sim.chosen") == "p"
+    begins = warned(world).warnings.events[0].begin_s
+    assert browser.run("return log2sim.time") == pytest.approx(begins)
+    assert "braking suffices" in browser.run("return document.getElementById('agent-warning').textContent")
+    browser.run("log2sim.choose(null)")
+    colored = {t: orange(browser, t) for t in (begins - 0.5, begins + 0.3)}
+    assert colored[begins - 0.5] == 0
+    assert colored[begins + 0.3] > 50
+    assert not [entry for entry in browser.log("browser") if entry["level"] == "SEVERE"]
+
+
+def orange(browser: Browser, t: float) -> int:
+    """Pixels of the map in the color of warnings at a time."""
+    browser.run("log2sim.time = arguments[0]", t)
+    return browser.run_async(
+        """const [color, done] = arguments; requestAnimationFrame(() => requestAnimationFrame(() => {
+        const map = document.getElementById("map"), { data } = map.getContext("2d").getImageData(0, 0, map.width, map.height);
+        let count = 0;
+        for (let k = 0; k < data.length; k += 4) if (color.every((c, i) => Math.abs(data[k + i] - c) < 8)) count++;
+        done(count);
+        }));""",
+        WARN_LIGHT,
+    )

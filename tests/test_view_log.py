@@ -6,14 +6,13 @@ import base64
 import json
 import re
 import zlib
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import Browser
+from browser import Browser, opened
 from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -167,22 +166,6 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorded = Recorded(log, 3_000_000)
     write_page(scene(), path, recorded=recorded, metrics=[("Metrics", "<b>recall</b> 0.9")])
     return path
-
-
-@pytest.fixture
-def browser(chromium: Browser) -> Iterator[Browser]:
-    """The browser, whose pages must neither log an error nor ask for anything but themselves."""
-    yield chromium
-    assert chromium.log("browser") == []
-    asked = {
-        address.split("#")[0].rpartition("/")[2] for address in chromium.requests() if not address.startswith("blob:")
-    }
-    assert asked <= {"page.html"}
-
-
-def opened(browser: Browser, page: Path, hash: str = "", **window: Any) -> Browser:
-    browser.open(page.as_uri() + hash, **window)
-    return browser
 
 
 def colors(browser: Browser, canvas: str, x: float, y: float, reach: int = 1) -> np.ndarray:
