@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
+from log2sim import config as config_module
 from log2sim.config import Config, TrackConfig
 from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files import documents
@@ -113,6 +114,15 @@ def test_files_that_are_no_toml(tmp_path: Path, content: bytes, message: str) ->
     path = tmp_path / "run.toml"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=rf"run\.toml: {message}"):
+        Config.load(path)
+
+
+def test_a_file_larger_than_any_config_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path, "seed = 1\n")
+    monkeypatch.setattr(config_module, "CONFIG_LIMIT_BYTES", 9)
+    assert Config.load(path).seed == 1
+    monkeypatch.setattr(config_module, "CONFIG_LIMIT_BYTES", 8)
+    with pytest.raises(ConfigError, match="9 bytes, more than the 8 that it may have"):
         Config.load(path)
 
 

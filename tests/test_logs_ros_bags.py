@@ -19,6 +19,7 @@ from log2sim import open_log
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import ConfigError, LogError, RecordError
 from log2sim.geometry import NS_PER_S, transform
+from log2sim.logs.ros import bag
 from log2sim.logs.ros.bag import open_container
 from log2sim.logs.ros.containers import ChunkedFile
 
@@ -215,6 +216,18 @@ def test_header_stamps_that_are_zero_or_of_another_clock_are_noted(tmp_path: Pat
     settings = '[lidars.top]\ntopic = "/top/points"\nstamps = "recorded"\n'
     told = open_log(with_settings(path, settings))
     np.testing.assert_array_equal(told.streams["top"].t_ns, world_log().streams["top"].t_ns + ros.OTHER_DELAY_NS)
+
+
+def test_no_more_than_a_limit_is_kept_of_what_is_read_at_opening(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_of(tmp_path, Style())
+    monkeypatch.setattr(bag, "MAX_COLLECTED_BYTES", 5000)
+    log = open_log(path)
+    assert any("have more than 5000 bytes; the rest is not read" in note for note in log.notes)
+    monkeypatch.setattr(bag, "MAX_INDEX_BYTES", 40)
+    damaged = open_log(path)
+    assert any("/tf_static: 1 of 1 messages are damaged" in note for note in damaged.notes)
 
 
 def test_an_imu_whose_heading_is_not_the_course_is_noted(tmp_path: Path) -> None:
