@@ -93,6 +93,15 @@ def test_a_car_park_is_decided_by_each_car_alone_with_a_weak_say_of_its_neighbor
     assert headings == [90, 90, 270, 90, 90, 90, 90]
 
 
+@pytest.mark.parametrize(("score", "heading"), [(0.9, 180), (0.2, 0)])
+def test_what_may_be_clutter_tells_nothing_of_traffic(score, heading):
+    """Oncoming traffic passes on the right, so that it keeps left: cars at the curb there point against the ego."""
+    oncoming = candidate(40.0, -3.5, np.pi, 9.0)
+    measured = replace(oncoming.track.measurements, score=np.full(20, score))
+    oncoming = replace(oncoming, track=replace(oncoming.track, measurements=measured))
+    assert decided(oncoming, *[candidate(8.0 * k, -6.5, 0.0) for k in range(2)])[0][1:] == [heading] * 2
+
+
 def cut(c, rows):
     """The candidate at some of its waypoints."""
     return replace(c, agent=replace(c.agent, waypoints=c.agent.waypoints.take(rows)))
