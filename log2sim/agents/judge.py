@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents, spans_of
-from log2sim.agents.evidence import MIN_THERE, MIN_TICK_RAYS, Recording, Table, gather
+from log2sim.agents.evidence import MIN_THERE, MIN_TICK_RAYS, MIN_WEAK_THERE, Recording, Table, gather
 from log2sim.agents.rays import count_at
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
 from log2sim.agents.weights import RIGHT, THERE, VARIANCES
@@ -277,12 +277,19 @@ def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[A
     return there, np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY)
 
 
+def suffices(there: float, *, confirmed: bool, lidar: bool) -> bool:
+    """Return whether the probability that something is there suffices; `confirmed`: whether its detections alone make it likely."""
+    if confirmed:
+        return there >= MIN_THERE[lidar]
+    return lidar and there >= MIN_WEAK_THERE
+
+
 def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: bool) -> list[Finding] | None:
     """Return what is doubtful about a candidate, None if it is dropped: nothing is there, or something else.
 
     `evidence`: its row of the table. `there`: probability that something is there, from `probabilities`.
     """
-    if there < MIN_THERE[lidar] or not (lidar or evidence["confirmed"]):
+    if not suffices(there, confirmed=bool(evidence["confirmed"]), lidar=lidar):
         return None
     counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
     weights = THERE[lidar]

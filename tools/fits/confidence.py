@@ -27,7 +27,7 @@ from log2sim.agents import estimate
 from log2sim.agents import judge as judging
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import SIGNS, Table, gather
-from log2sim.agents.judge import MIN_THERE, variance_terms
+from log2sim.agents.judge import MIN_THERE, suffices, variance_terms
 from log2sim.datatypes import CATEGORIES, GROUP_OF
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, probability_of
 from log2sim.errors import NothingToReconstruct
@@ -226,7 +226,7 @@ def say(text: str) -> None:
 def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
     """Print what is kept, and of this reliability and what is doubted: by a probability below one half, or by a doubt."""
     kept = np.array(
-        [(a.lidar or bool(a.evidence["confirmed"])) and p >= MIN_THERE[a.lidar] for a, p in zip(agents, there)]
+        [suffices(p, confirmed=bool(a.evidence["confirmed"]), lidar=a.lidar) for a, p in zip(agents, there)], dtype=bool
     )
     ticks, exists = np.array([a.ticks for a in agents]), np.array([a.there for a in agents])
     recall = (ticks * exists)[kept].sum() / max((ticks * exists).sum(), 1)
