@@ -77,8 +77,8 @@ def agents_of(case: Case, log: str) -> list[Rated]:
         gathered.append((list(candidates), gather(candidates, recording, jobs)))
         return gathered[-1][1] | {"confirmed": np.ones(len(candidates))}
 
-    def keep_candidates(*arguments: Any, jobs: int) -> Any:
-        judged.extend(judging.judge(*arguments, jobs=jobs))
+    def keep_candidates(*arguments: Any, **options: Any) -> Any:
+        judged.extend(judging.judge(*arguments, **options))
         return judged
 
     with (
