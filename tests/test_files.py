@@ -307,7 +307,7 @@ def test_a_map_on_disk_is_a_dictionary_whatever_waits_in_its_file(steps: list[tu
         elif changing:
             kept_things[key][0] += 1
             known[key] = kept_things[key].copy()
-        assert sum(a.nbytes for a in kept_things._near.values()) <= 2 * 24
+        assert sum(a.nbytes for a in kept_things._loaded.values()) <= 2 * 24
         assert set(kept_things) == set(known)
         assert len(kept_things) == len(known)
     for key, array in known.items():
@@ -322,6 +322,6 @@ def test_what_was_just_used_stays_in_memory() -> None:
         kept_things[key] = np.zeros(3)
     for round, waiting in ((1, 0), (2, 2), (3, 2)):
         kept_things[0][0] += 1
-        kept_things.put_away()
-        assert len(kept_things._far) == waiting, round
+        kept_things.spill()
+        assert len(kept_things._stored) == waiting, round
     assert kept_things[0][0] == 3

@@ -11,8 +11,8 @@ from worlds import rows_at
 
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import (
+    MIN_TENTATIVE_THERE,
     MIN_THERE,
-    MIN_WEAK_THERE,
     SIGNS,
     Recording,
     clutter_nats,
@@ -114,8 +114,8 @@ def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
     assert decide(agent(5.0), row, MIN_THERE[True] - 0.01, lidar=True) is None
     assert decide(agent(5.0), row, MIN_THERE[True], lidar=True) == []
     weak = row | {"confirmed": 0.0}
-    assert decide(agent(5.0), weak, MIN_WEAK_THERE, lidar=True) == []
-    assert decide(agent(5.0), weak, MIN_WEAK_THERE - 0.01, lidar=True) is None
+    assert decide(agent(5.0), weak, MIN_TENTATIVE_THERE, lidar=True) == []
+    assert decide(agent(5.0), weak, MIN_TENTATIVE_THERE - 0.01, lidar=True) is None
     assert decide(agent(5.0), weak, 0.9, lidar=False) is None
     (doubt,) = decide(agent(5.0), row | {"through": np.log(10)}, 0.9, lidar=True)
     assert (doubt.kind, doubt.values["through_share"]) == ("empty", pytest.approx(0.9))

@@ -46,8 +46,7 @@ def estimate_agents(
     """Make a candidate of every object that the tracks show and that may suffice (`may_suffice`), moving ones first.
 
     `obstacles`: T clouds, None at ticks without LiDAR. `smooth`: whether trajectories are smoothed. `clutter`: from
-    `evidence.clutter_nats`. `jobs`: processes that
-    share the tracks; the result is the same for any number.
+    `evidence.clutter_nats`. `jobs`: processes that share the tracks; the result is the same for any number.
     """
 
     def estimate(numbers: Sequence[int]) -> list[tuple[int, AgentCandidate]]:

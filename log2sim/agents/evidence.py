@@ -183,62 +183,57 @@ MIN_WIDE_POINTS, EXTENT_ERROR_M = 5, 0.05
 MIN_IMAGE_CONFIDENCE, MIN_SURE_IMAGE_CONFIDENCE, MIN_SWEEP_LOG_ODDS, DRIFT_M = 0.3, 0.6, float(np.log(2.0)), 2.0
 
 
-# What is less likely there is dropped. Without a LiDAR, what is not there is mostly placed wrong, which is for doubts. What detections alone
-# do not make likely rests on all other evidence: to invent such an agent is as bad as to miss four.
-MIN_THERE, MIN_WEAK_THERE = {True: 0.5, False: 0.25}, 0.8
+# What is less likely there is dropped. Without a LiDAR, what is not there is mostly placed wrong, which is for doubts. A tentative track,
+# whose detections alone do not make it likely, rests on all other evidence: to invent such an agent is as bad as to miss four.
+MIN_THERE, MIN_TENTATIVE_THERE = {True: 0.5, False: 0.25}, 0.8
 # Points show a person or rider who moves on a way of so many times that of the detections at most.
 MOST_FOLLOWED = 3.0
-# For each track of simulated logs whose detections alone make it likely, so many of others are there, which is this share of those others
-# (136 logs). Half and twice as many for each change recall / precision of agents on 70 of them from .501 / .951 to .496 / .953 and .505 / .947.
-WEAK_FOR_EACH_SURE, WEAK_SHARE = 0.43, 0.46
-# What the way and the rays of something that is there add to its log-odds at most: of all but one in a hundred in simulated logs.
+# Tentative tracks of simulated logs that are objects, for each confirmed one and as a share of all tentative ones (136 logs). Half and twice as
+# many for each change recall / precision of agents on 70 of them from .501 / .951 to .496 / .953 and .505 / .947.
+TENTATIVE_PER_CONFIRMED, TENTATIVE_SHARE = 0.43, 0.46
+# What the way and the rays of an object add to its log-odds at most: of all but one in a hundred in simulated logs.
 MOST_ADDED = 0.6
 
 
-def is_sure(track: Track) -> bool:
-    """Return whether a track is likely something by its detections alone: twice as likely as not, in sweeps, or by images."""
+def is_confirmed(track: Track) -> bool:
+    """Return whether a track is likely an object by its detections alone: twice as likely as not, in sweeps, or by images."""
     if image_confidence(track) >= MIN_IMAGE_CONFIDENCE:
         return True
     return bool(np.isfinite(track.measurements.box_yaw_rad).any()) and sweep_log_odds(track) >= MIN_SWEEP_LOG_ODDS
 
 
 def clutter_nats(tracks: Sequence[Track]) -> float:
-    """Return by how much what is detected weakly is less likely something in this log than in those that the weights were fitted on.
+    """Return by how much tentative tracks are less likely objects in this log than in those that the weights were fitted on.
 
-    Streets with hedges, fences and trees give many times as many weak tracks for each sure one, but what is there is detected as well as
-    elsewhere: so many more weak ones than sure ones are clutter. Weights correct for another share of what is there by adding the
-    difference of its log-odds (Saerens, Latinne, Decaestecker, Neural Computation 14, 2002).
+    Streets with hedges, fences and trees give many times as many tentative tracks for each confirmed one, but objects are detected as well as
+    elsewhere, so that the excess is clutter. A prior that changes adds the difference of its log-odds to those of a classifier
+    (Saerens, Latinne, Decaestecker, Neural Computation 14, 2002).
     """
-    sure = sum(map(is_sure, tracks))
-    share = (WEAK_FOR_EACH_SURE * sure + 1) / (len(tracks) - sure + 1 / WEAK_SHARE)
-    return float(log_odds_of(WEAK_SHARE) - log_odds_of(min(share, WEAK_SHARE)))
+    confirmed = sum(map(is_confirmed, tracks))
+    share = (TENTATIVE_PER_CONFIRMED * confirmed + 1) / (len(tracks) - confirmed + 1 / TENTATIVE_SHARE)
+    return float(log_odds_of(TENTATIVE_SHARE) - log_odds_of(min(share, TENTATIVE_SHARE)))
 
 
 def may_suffice(track: Track, *, static: bool, clutter: float = 0.0) -> bool:
-    """Return whether what is known of a track may suffice once its way is known: most clutter is not worth the smoothing.
+    """Return whether the evidence of a track may suffice once its way is estimated: most clutter is not worth the smoothing.
 
     `clutter`: from `clutter_nats`.
     """
     m, group = track.measurements, GROUP_OF[track.category]
-    if image_confidence(track) >= MIN_IMAGE_CONFIDENCE or (group == "vehicle" and not static):
+    if is_confirmed(track) or (group == "vehicle" and not static):
         return True
     if not np.isfinite(m.box_yaw_rad).any():
         return False
-    odds = sweep_log_odds(track)
-    way_m = 0.0 if static else MOST_FOLLOWED * float(np.hypot(*np.ptp(m.center_m[:, :2], axis=0)))
+    odds, way_m = sweep_log_odds(track), 0.0
+    if not static:
+        way_m = MOST_FOLLOWED * float(np.hypot(*np.ptp(m.center_m[:, :2], axis=0)))
     if odds + np.log1p(way_m / DRIFT_M) >= MIN_SWEEP_LOG_ODDS:
         return True
-    known = {
-        "bias": 1.0,
-        "sweep": max(odds, 0.0),
-        "weak_sweep": min(odds, 0.0),
-        "few": 1 / len(m),
-        "moving": not static,
-        group: 1.0,
-    }
-    known["travel"] = np.log1p(way_m / TYPICAL_SIZE_M[track.category][0])
-    most = sum(weight * known.get(name, 0.0) for name, weight in THERE[True].items()) + MOST_ADDED
-    return bool(most - clutter >= log_odds_of(MIN_WEAK_THERE))
+    travel = np.log1p(way_m / TYPICAL_SIZE_M[track.category][0])
+    columns = {"bias": 1.0, "sweep": max(odds, 0.0), "weak_sweep": min(odds, 0.0), "few": 1 / len(m), "travel": travel}
+    columns |= {"moving": float(not static), group: 1.0}
+    most = sum(weight * columns.get(name, 0.0) for name, weight in THERE[True].items()) + MOST_ADDED
+    return bool(most - clutter >= log_odds_of(MIN_TENTATIVE_THERE))
 
 
 # Number of the best detections whose mean score is the confidence. Independent detections would multiply; those of a video

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
-from log2sim.agents.evidence import is_sure
+from log2sim.agents.evidence import is_confirmed
 from log2sim.agents.moving import course_log_odds, heading_log_odds, motion_doubts
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, Finding, Track, Waypoints
@@ -395,13 +395,13 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
             odds = NETWORK_WEIGHT * odds + OUTLINE_WEIGHT * outline if both else odds + outline
         alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0]))
     own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
-    # What is detected weakly may be clutter, which tells nothing of traffic and of rows.
-    sure = [is_sure(c.track) for c in road_users]
+    # Tentative tracks may be clutter, which tells nothing of traffic and of rows.
+    confirmed = [is_confirmed(c.track) for c in road_users]
     paths = []  # x, y and heading at the waypoints at which each shows the direction of traffic
-    for c, known, is_witness in zip(road_users, own.tolist(), sure):
+    for c, odds, trusted in zip(road_users, own.tolist(), confirmed):
         w = c.agent.waypoints
-        moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & (abs(known) > MIN_FLOW_LOG_ODDS) & is_witness
-        yaw = w.yaw_rad[moving] + (0.0 if known > 0 else np.pi)
+        moving = (np.abs(w.speed_mps) > MIN_FLOW_SPEED_MPS) & (abs(odds) > MIN_FLOW_LOG_ODDS) & trusted
+        yaw = w.yaw_rad[moving] + (0.0 if odds > 0 else np.pi)
         paths.append(np.stack([w.x_m[moving], w.y_m[moving], yaw], axis=1))
     for k, c in enumerate(road_users):
         # What stands and of whose yaw nothing is known is laid along the street.
@@ -426,7 +426,7 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
         away_m = np.maximum(low - pose[:2], pose[:2] - high).max(axis=1)
         away_m[k + 1] = np.inf
         street[:, k] = street_log_odds(pose, [ways[i] for i in np.flatnonzero(away_m <= FAR_M).tolist()])
-    stands = np.flatnonzero([c.agent.static and is_witness for c, is_witness in zip(road_users, sure)])
+    stands = np.flatnonzero([c.agent.static and trusted for c, trusted in zip(road_users, confirmed)])
     rows = find_rows(poses, np.array([c.agent.size_m[0] for c in road_users]), stands)
     chance = headings_of(rows, own, street, side_log_odds([ego_path, *paths]))
     decided = list(candidates)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents, spans_of
-from log2sim.agents.evidence import MIN_THERE, MIN_TICK_RAYS, MIN_WEAK_THERE, Recording, Table, gather
+from log2sim.agents.evidence import MIN_TENTATIVE_THERE, MIN_THERE, MIN_TICK_RAYS, Recording, Table, gather
 from log2sim.agents.rays import count_at
 from log2sim.agents.size import MAX_ROAD_WIDTH_M, WHOLE_SIDE_SIGMA_M
 from log2sim.agents.weights import RIGHT, THERE, VARIANCES
@@ -263,7 +263,7 @@ def judge(
 def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[Array, Array]:
     """Return the probabilities (C,) that something is where each candidate is, and that the candidate is right.
 
-    `clutter`: nats by which those whose detections alone do not make them likely are less likely in this log than in others.
+    `clutter`: nats by which tentative candidates are less likely in this log than in others.
 
     Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
     speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
@@ -281,7 +281,7 @@ def suffices(there: float, *, confirmed: bool, lidar: bool) -> bool:
     """Return whether the probability that something is there suffices; `confirmed`: whether its detections alone make it likely."""
     if confirmed:
         return there >= MIN_THERE[lidar]
-    return lidar and there >= MIN_WEAK_THERE
+    return lidar and there >= MIN_TENTATIVE_THERE
 
 
 def decide(agent: Agent, evidence: Mapping[str, float], there: float, *, lidar: bool) -> list[Finding] | None:

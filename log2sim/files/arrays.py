@@ -131,105 +131,110 @@ class ArrayList(Sequence[NDArray[Any]]):
         return item.read() if isinstance(item, StoredArray) else item
 
 
-class Sized(Protocol):
-    """What takes memory."""
+class SupportsNbytes(Protocol):
+    """An object that states its memory."""
 
     @property
     def nbytes(self) -> int:
-        """Return how much."""
+        """Return the bytes that it takes."""
         ...
 
 
 Key = TypeVar("Key", bound=Hashable)
-Thing = TypeVar("Thing", bound=Sized)
+Value = TypeVar("Value", bound=SupportsNbytes)
 
 
-class DiskBackedMap(MutableMapping[Key, Thing], Generic[Key, Thing]):
-    """Things made of arrays, by key: those that were used last are in memory, the others in a file.
+class DiskBackedMap(MutableMapping[Key, Value], Generic[Key, Value]):
+    """A mapping with values made of arrays: the most recently used ones are in memory, the others in a file.
 
     Parameters
     ----------
-    arrays, made : callable
-        Take a thing apart into arrays, and make it of them.
+    to_arrays, from_arrays : callable
+        Convert a value to arrays and back.
     memory_bytes : int
-        What the arrays of those in memory may take; the one used last always stays.
+        Limit of the values in memory; the one used last always stays.
     changing : bool
-        Whether things change while they are in memory; others are written once. A changed thing takes new room in the file.
+        Whether values change while they are in memory; others are written once. A changed value is appended to the file.
     rounds : int
-        Things that were used in so many rounds before stay in memory, whatever they take; `put_away` ends a round.
+        Values that were used in so many rounds before stay in memory, whatever they take; `spill` ends a round.
     """
 
     def __init__(
         self,
-        arrays: Callable[[Thing], Sequence[NDArray[Any]]],
-        made: Callable[..., Thing],
+        to_arrays: Callable[[Value], Sequence[NDArray[Any]]],
+        from_arrays: Callable[..., Value],
         memory_bytes: int,
         *,
         changing: bool = False,
         rounds: int = 0,
     ) -> None:
-        self._apart, self._made, self.memory_bytes, self._changing = arrays, made, memory_bytes, changing
+        self._to_arrays, self._from_arrays, self.memory_bytes, self._changing = (
+            to_arrays,
+            from_arrays,
+            memory_bytes,
+            changing,
+        )
         self._rounds, self._round = rounds, 0
         self._used: dict[Key, int] = {}
         self._file = ArrayFile(0)
-        self._near: OrderedDict[Key, Thing] = OrderedDict()
-        self._sizes: dict[Key, int] = {}  # of those in memory, when they were last looked at
+        self._loaded: OrderedDict[Key, Value] = OrderedDict()
+        self._sizes: dict[Key, int] = {}  # of those in memory, as last measured
         self._total = 0
-        self._far: dict[Key, list[NDArray[Any] | StoredArray]] = {}
+        self._stored: dict[Key, list[NDArray[Any] | StoredArray]] = {}
 
-    def __getitem__(self, key: Key) -> Thing:
-        """Return a thing, and keep it in memory for now."""
-        if key not in self._near:
-            stored = self._far.pop(key) if self._changing else self._far[key]
-            self._put(key, self._made(*(a.read() if isinstance(a, StoredArray) else a for a in stored)))
-        self._near.move_to_end(key)
+    def __getitem__(self, key: Key) -> Value:
+        """Return a value, which is loaded if it is not in memory."""
+        if key not in self._loaded:
+            stored = self._stored.pop(key) if self._changing else self._stored[key]
+            self._put(key, self._from_arrays(*(a.read() if isinstance(a, StoredArray) else a for a in stored)))
+        self._loaded.move_to_end(key)
         self._used[key] = self._round
-        return self._near[key]
+        return self._loaded[key]
 
-    def __setitem__(self, key: Key, thing: Thing) -> None:
-        """Keep a thing."""
-        self._far.pop(key, None)
-        self._put(key, thing)
+    def __setitem__(self, key: Key, value: Value) -> None:
+        """Store a value."""
+        self._stored.pop(key, None)
+        self._put(key, value)
 
     def __delitem__(self, key: Key) -> None:
-        """Forget a thing."""
-        if self._far.pop(key, None) is None and key not in self._near:
+        """Delete a value."""
+        if self._stored.pop(key, None) is None and key not in self._loaded:
             raise KeyError(key)
-        self._near.pop(key, None)
+        self._loaded.pop(key, None)
         self._used.pop(key, None)
         self._total -= self._sizes.pop(key, 0)
 
     def __iter__(self) -> Iterator[Key]:
-        """Go over the keys, those in the file first."""
-        return iter([*(k for k in self._far if k not in self._near), *self._near])
+        """Iterate over the keys, those in the file first."""
+        return iter([*(k for k in self._stored if k not in self._loaded), *self._loaded])
 
     def __len__(self) -> int:
-        """Return how many there are."""
-        return len(self._far.keys() | self._near.keys())
+        """Return the number of values."""
+        return len(self._stored.keys() | self._loaded.keys())
 
-    def put_away(self) -> None:
-        """End a round: write to the file what memory has no room for, as things may have grown since they were asked for."""
+    def spill(self) -> None:
+        """End a round: write to the file what exceeds the limit, as values may have grown since they were returned."""
         self._round += 1
-        self._sizes = {key: thing.nbytes for key, thing in self._near.items()}
+        self._sizes = {key: value.nbytes for key, value in self._loaded.items()}
         self._total = sum(self._sizes.values())
         self._make_room()
 
-    def _put(self, key: Key, thing: Thing) -> None:
-        self._total += thing.nbytes - self._sizes.get(key, 0)
-        self._near[key], self._sizes[key] = thing, thing.nbytes
-        self._near.move_to_end(key)
+    def _put(self, key: Key, value: Value) -> None:
+        self._total += value.nbytes - self._sizes.get(key, 0)
+        self._loaded[key], self._sizes[key] = value, value.nbytes
+        self._loaded.move_to_end(key)
         self._used[key] = self._round
         self._make_room()
 
     def _make_room(self) -> None:
-        while self._total > self.memory_bytes and len(self._near) > 1:
-            key, thing = next(iter(self._near.items()))
+        while self._total > self.memory_bytes and len(self._loaded) > 1:
+            key, value = next(iter(self._loaded.items()))
             if self._used[key] > self._round - self._rounds:
                 return
-            del self._near[key], self._used[key]
+            del self._loaded[key], self._used[key]
             self._total -= self._sizes.pop(key)
-            if key not in self._far:
-                self._far[key] = [self._file.keep(a) for a in self._apart(thing)]
+            if key not in self._stored:
+                self._stored[key] = [self._file.keep(a) for a in self._to_arrays(value)]
 
 
 def take_arrays(arrays: Sequence[NDArray[Any]], rows: Iterable[int]) -> Sequence[NDArray[Any]]:

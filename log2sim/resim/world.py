@@ -263,7 +263,7 @@ def build_world(
                 top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
             far = max(far, float(shots.range_m.max()))
             noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, grids, seen))
-            grids.put_away()
+            grids.spill()
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
             if done % SIGHTINGS_EVERY == 0:
                 gone += thinned(sightings, MOST_SIGHTINGS_BYTES)

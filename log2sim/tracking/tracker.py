@@ -211,7 +211,7 @@ def _ends(m: Measurements, tracks: Sequence[tuple[str, NDArray[np.intp]]], *, wh
     orders = [*(rows[:END_MEASUREMENTS][::-1] for rows in parts), *(rows[-END_MEASUREMENTS:] for rows in parts)]
     mean, covariance = _filtered(m, orders, np.tile(group, 2), whole_boxes=whole_boxes)
     begin_ns, n = m.t_ns[[rows[0] for rows in parts]], len(parts)
-    # Two ticks may see an object in one sweep, the later one by a camera that looks there earlier; no track ends before it begins.
+    # Stamps may run backward where two ticks share a sweep; no track ends before it begins, so that none continues itself.
     end_ns = np.maximum(begin_ns, m.t_ns[[rows[-1] for rows in parts]])
     return _Ends(begin_ns, end_ns, mean[:n], covariance[:n], mean[n:], covariance[n:], group)
 
