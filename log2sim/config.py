@@ -95,7 +95,8 @@ class DetectConfig(Section):
     )
     tiles: int = setting(
         0,
-        "Overlapping tiles that are searched besides the whole image, as one strip where the detector can; 0: chosen from the image size.",
+        "Overlapping tiles that are searched besides the whole image; 0: chosen from the image size, and every second in turn where sweeps "
+        "are searched, too, and people are not near.",
         ge=0,
         le=64,
     )

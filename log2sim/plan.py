@@ -259,6 +259,8 @@ class Plan:
     fusion: FusionLevel | None = None  # what of the two ends is joined; None where not both have LiDARs
     # Ticks from one search of a camera's frames to the next, where LiDAR sweeps are searched at every tick.
     picture_stride: int = 1
+    # Whether every second tile of a picture is searched in turn, where sweeps are searched at every tick.
+    tiles_by_turns: bool = False
 
     def decision(self, stage: Stage) -> Decision:
         """Return the decision about a stage."""
@@ -293,6 +295,9 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     # A track needs `min_hits` measurements. An object that is visible for fewer ticks is not confirmed, so between two
     # frames that many ticks apart in which the detector found nothing, the others need not be decoded.
     stride = max(min_hits(t_ns, config.track.min_life_s), 1) if decodes and every == 1 else 1
+    # A part of a picture is searched at one of two ticks, if that is often enough for what is visible as long as a track has to be.
+    often = every == 1 and len(t_ns) > 1 and 2 * period_of(t_ns) <= config.track.min_life_s
+    turns = decodes and bool(sweeps) and often and not config.detect.tiles
     moved_m, turned_rad = (0.0, 0.0) if log.ego is None else _ego_motion(log.ego, t_ns)
     stands = moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD
     level, why_level = fusion_level(sensors.only(log), config)
@@ -320,7 +325,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         ),
         _decide(
             Stage.IMAGE_DECODING,
-            "the detector needs images",
+            f"the detector needs images{', of large ones every second tile in turn' if turns else ''}",
             no_camera,
             (not decodes, "boxes come from the log; detection needs no image"),
         ),
@@ -377,7 +382,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         ),
     ]
     scope = HomographyScope.CAMERAS_IN_NEED if homography.kept else HomographyScope.NONE
-    return Plan(cameras, tuple(decisions), scope, stride, level, every)
+    return Plan(cameras, tuple(decisions), scope, stride, level, every, turns)
 
 
 def _decide(stage: Stage, reason: str, *against: tuple[bool, str]) -> Decision:

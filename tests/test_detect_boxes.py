@@ -7,10 +7,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from log2sim.datatypes import GROUP_OF, Detections
+from log2sim.datatypes import GROUP_OF, Detections, Turn
 from log2sim.geometry import box_iou
 from log2sim.perception.detect.layouts import InputSpec, Preprocessing
-from log2sim.perception.detect.onnx_detector import OVERLAP, Tile, join_riders, merge, plan_tiles, suppress
+from log2sim.perception.detect.onnx_detector import (
+    OVERLAP,
+    Tile,
+    join_riders,
+    merge,
+    plan_tiles,
+    suppress,
+    tiles_of_turn,
+)
 
 
 def detections(*rows: tuple[str, float, tuple[float, float, float, float]]) -> Detections:
@@ -61,6 +69,22 @@ def test_tiles_cover_every_column_and_overlap(width: int, height: int, tiles: in
         assert tile.v1 - tile.v0 <= tile.u1 - tile.u0
     for left, right in pairwise(row):
         assert left.u1 - right.u0 >= (OVERLAP - 0.05) * (left.u1 - left.u0)
+
+
+@pytest.mark.parametrize("tiles", [2, 3, 5])
+def test_two_turns_search_every_tile_and_both_search_what_is_watched(tiles: int) -> None:
+    planned = plan_tiles(1920, 1080, tiles, None)
+    nothing = np.zeros((0, 4))
+    even, odd = (tiles_of_turn(planned, Turn(number, nothing)) for number in (6, 7))
+    assert sorted([*even[1:], *odd[1:]], key=lambda tile: tile.u0) == planned[1:]
+    assert even[0] == odd[0] == planned[0]
+    rng = np.random.default_rng(tiles)
+    u0, v0 = rng.uniform(0, 1900, 20), rng.uniform(400, 700, 20)
+    for watched in np.stack([u0, v0, u0 + 20, v0 + 60], axis=1):
+        for number in (0, 1):
+            chosen = tiles_of_turn(planned, Turn(number, watched[None]))
+            assert any(tile.u0 <= watched[0] and watched[2] <= tile.u1 for tile in chosen[1:])
+    assert tiles_of_turn(planned[:2], Turn(1, nothing)) == planned[:2]  # one tile has nothing to take turns with
 
 
 def test_boxes_cut_by_an_inner_border_are_dropped_and_those_at_the_picture_border_stay() -> None:

@@ -13,7 +13,7 @@ from plain_settings import AGENTS_ALONE
 from worlds import camera_ahead, cloud_at, outline_px, scan, standing
 
 from log2sim.config import Config
-from log2sim.datatypes import Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
+from log2sim.datatypes import Boxes3D, Detections, Frame, ImageLabels, Lidar, Log, Stream, Sweep
 from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
@@ -94,7 +94,7 @@ def driving_log(*, far=(0.0, 0.0, 0.0), broken=(), cameras=("front",), empty=(),
     return log, reads
 
 
-def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", labels=False, reads=None):
+def run(log, detector=None, *, sweeps=None, config=None, max_range_m=80.0, mode="robust", labels=False, reads=None):
     reads = {} if reads is None else reads
     config = config or Config.load(settings=["detect.name=labels"] if labels else [])
     sensors = select_sensors(log, config)
@@ -102,7 +102,7 @@ def run(log, detector=None, *, config=None, max_range_m=80.0, mode="robust", lab
     plan = make_plan(log, config, sensors, schedule.t_ns)
     reads.clear()  # synchronization looks into a sweep
     out = observe(
-        log, schedule, plan, detectors=Detectors(detector or Truth(log), None),
+        log, schedule, plan, detectors=Detectors(detector or Truth(log), sweeps),
         config=config.changed(measure={"mode": mode, "max_range_m": max_range_m}), clock=StageClock(),
         progress=lambda done, total: ticks.append((done, total)),
     )  # fmt: skip
@@ -123,6 +123,40 @@ def test_every_tick_has_every_object_at_its_place_in_the_map(far):
             assert row.bottom_m[0] == pytest.approx(far[2], abs=0.1)
             assert row.t_ns[0] == STAMPS[k]
     assert out.detections == {"front": TICKS * 2}
+
+
+class Sweeps:
+    """A detector in sweeps that finds the solids, with the same score for all."""
+
+    name = "lidar:truth"
+
+    def __init__(self, score):
+        self.score = score
+
+    def detect(self, cloud, earlier):
+        n = len(SOLIDS)
+        rows = [np.array([getattr(s, field) for s in SOLIDS]) for field in ("center_m", "size_m", "yaw_rad")]
+        some = np.full(n, 50), None
+        return Boxes3D(
+            np.full(n, cloud.stamp_ns), *rows, np.ones(n), np.array(CATEGORIES), np.full(n, self.score), *some
+        )
+
+
+@pytest.mark.parametrize("score", [0.4, 0.6])
+def test_tiles_take_turns_and_pictures_are_watched_where_sweeps_show_a_person(score):
+    log, _ = driving_log(cameras=("front", "left"))
+    detector, turns = Truth(log), []
+    inner = detector.detect
+    detector.detect = lambda frame: turns.append((frame.camera.name, frame.t_ns, frame.turn)) or inner(frame)
+    run(log, detector, sweeps=Sweeps(score), config=Config.load(detect={"name": "truth.onnx+lidar:vehicle"}))
+    assert [turn.number for camera, _, turn in turns if camera == "front"] == [0, 1, 3, 4]
+    # The stride is two, and frames between ticks 0 and 2 may be skipped: these two are of different turns.
+    for camera, t_ns, turn in turns:
+        seen = outline_px(log.cameras[camera], log.map_T_sensor(camera, t_ns)[0][0], SOLIDS[1])
+        np.testing.assert_allclose(turn.watched_px, seen[None][: int(score > 0.5)], atol=2)
+    turns.clear()
+    run(log, detector, config=Config.load(detect={"name": "truth.onnx"}))
+    assert {turn for *_, turn in turns} == {None}  # nothing but the pictures shows what is there
 
 
 def test_obstacles_are_the_points_above_the_ground_at_their_places():

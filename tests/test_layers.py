@@ -13,6 +13,7 @@ from pathlib import Path
 
 import imports
 import pytest
+from mutants import MUTANTS
 
 import log2sim
 from log2sim.cli import app
@@ -148,3 +149,10 @@ def test_one_door_leads_to_the_records() -> None:
     around = {name for name, path in files.items() if reading.search(path.read_text(encoding="utf-8"))}
     assert not [name for name in around if not name.startswith(doors)]
     assert "perception/records.py" in around
+
+
+def test_every_mutant_changes_what_is_there_once() -> None:
+    for name, file, old, new, tests in MUTANTS:
+        assert (ROOT / "log2sim" / file).read_text(encoding="utf-8").count(old) == 1, name
+        assert new != old
+        assert all((ROOT / f"tests/test_{of}.py").is_file() for of in tests.split()), name

@@ -210,6 +210,18 @@ def test_looks_are_nearer_than_a_track_is_long(ticks: int, stride: int, tiny: Lo
     assert plan_of(tiny, LABELS, t_ns).detector_stride == 1
 
 
+@pytest.mark.parametrize(("name", "period_s", "turns"), [
+    ("some.onnx+lidar:vehicle", 0.1, True), ("some.onnx+lidar:vehicle", 0.2, False), ("some.onnx", 0.1, False),
+    ("labels+lidar:vehicle", 0.1, False),
+])  # fmt: skip
+def test_tiles_take_turns_where_sweeps_show_the_same_and_often_enough(
+    name: str, period_s: float, turns: bool, tiny: Log
+) -> None:
+    t_ns = np.round(np.arange(20) * period_s * 1e9).astype(np.int64)
+    assert plan_of(tiny, Config.load(detect={"name": name}), t_ns).tiles_by_turns == turns
+    assert not plan_of(tiny, Config.load(detect={"name": name, "tiles": 3}), t_ns).tiles_by_turns  # all are asked for
+
+
 # --- homography
 
 

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.evidence import is_confirmed
-from log2sim.agents.moving import course_log_odds, heading_log_odds, motion_doubts
+from log2sim.agents.moving import (
+    COURSE_LOG_ODDS_PER_DETECTION,
+    MAX_COURSE_LOG_ODDS,
+    course_log_odds,
+    heading_log_odds,
+    motion_doubts,
+)
 from log2sim.agents.smooth.motion_model import UNKNOWN_YAW_RAD
 from log2sim.datatypes import GROUP_OF, Finding, Track, Waypoints
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
@@ -388,12 +394,13 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     for c in road_users:
         w, m = c.agent.waypoints, c.track.measurements
         t_s = timeline.seconds(m.t_ns)
-        odds = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad)))
+        odds, most = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad))), MAX_COURSE_LOG_ODDS
         if GROUP_OF[c.agent.category] == "vehicle":
             outline = outline_log_odds(c.track, w, t_s, c.agent.size_m)
             both = bool(odds and outline)
             odds = NETWORK_WEIGHT * odds + OUTLINE_WEIGHT * outline if both else odds + outline
-        alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0]))
+            most = min(COURSE_LOG_ODDS_PER_DETECTION * len(m), most)
+        alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0], most))
     own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
     # Tentative tracks may be clutter, which tells nothing of traffic and of rows.
     confirmed = [is_confirmed(c.track) for c in road_users]

@@ -59,6 +59,7 @@ from log2sim.datatypes.log import (
     Stream,
     Sweep,
     Tick,
+    Turn,
     end_of,
     retime_spans,
     seen_from,
@@ -91,6 +92,6 @@ __all__ = [
     "EgoVehicle", "Finding", "Frame", "IgnoreRegions", "ImageLabels", "ImageRegions", "LabelView", "Labels", "Lidar",
     "Log", "MapFeatures", "MapFrame", "MapLane", "Marking", "Measurements", "Obstacles", "OtherView", "Rays",
     "RoadBorder", "Scenario", "Signal", "Span", "Stream", "Sweep", "Tag", "Tick", "Track", "Trajectory", "Treatment",
-    "Waypoints", "count_agents", "count_categories", "end_of", "explain_doubt", "format_confidence", "list_doubtful",
+    "Turn", "Waypoints", "count_agents", "count_categories", "end_of", "explain_doubt", "format_confidence", "list_doubtful",
     "retime_spans", "seen_from",
 ]  # fmt: skip

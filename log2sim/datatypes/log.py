@@ -394,6 +394,14 @@ class Log:
 
 
 @dataclass(frozen=True, eq=False)
+class Turn:
+    """Which tiles of a picture a detector of tiles may leave out: those of the other turn that hold none of some boxes."""
+
+    number: int  # of this picture among those of its camera: every second tile belongs to its even or odd ones
+    watched_px: Array  # (K, 4): u0, v0, u1, v1 of boxes whose tiles are searched at every turn
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One camera frame as a detector gets it."""
 
@@ -402,6 +410,7 @@ class Frame:
     image: Callable[[], NDArray[np.uint8]]  # decodes the frame when called: (H, W, 3) uint8 BGR
     # Returns the file that `image` decodes, where the log holds one. Raises `RecordError` for one that cannot be read.
     encoded: Callable[[], bytes] | None = None
+    turn: Turn | None = None  # None: the whole picture is to be searched
 
 
 VEHICLE, ROAD = "vehicle", "road"

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Detections, Frame, Log
+from log2sim.datatypes import Detections, Frame, Log, Turn
 from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Array
@@ -122,6 +122,8 @@ def add_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[Lig
     return out
 
 
+NO_BOXES = np.zeros((0, 4))
+
 # What a run takes from a picture: objects, the small copy (h, w) by which it is compared with other pictures, None where it was not
 # decoded, and traffic lights, cut out.
 PictureFindings = tuple[Detections, Thumbnail | None, tuple[LightBox, ...]]
@@ -140,14 +142,17 @@ class FrameDetector:
         self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
         self._empty = set[str]()
         self._known: dict[tuple[str, int], PictureFindings | None] = {}
+        self._watched_px: Mapping[str, Array] = {}
 
-    def search(self, tick: int, reader: RecordSource, clock: StageClock) -> dict[str, PictureFindings | None]:
+    def search(
+        self, tick: int, reader: RecordSource, clock: StageClock, watched_px: Mapping[str, Array]
+    ) -> dict[str, PictureFindings | None]:
         """Search the frames of a tick by camera; None for one that is skipped.
 
-        Ticks come in order, from one that a stride divides. A camera is left out where it has no frame or its frame cannot be
-        read.
+        Ticks come in order, from one that a stride divides. `watched_px`: boxes (K, 4) by camera whose tiles are searched at
+        every tick. A camera is left out where it has no frame or its frame cannot be read.
         """
-        plan, last = self._plan, len(self._schedule) - 1
+        plan, last, self._watched_px = self._plan, len(self._schedule) - 1, watched_px
         self._known = {key: found for key, found in self._known.items() if key[1] >= tick}
         recorded = [camera for camera in plan.cameras if self._schedule.frames[camera][tick] >= 0]
         if plan.picture_stride > 1:  # cameras take turns, so that each tick takes as long
@@ -168,12 +173,16 @@ class FrameDetector:
     ) -> dict[str, PictureFindings]:
         """Search a tick's frames of some cameras, each once; those that have none or cannot be read are left out."""
         frames, thumbnails = dict[str, Frame](), dict[str, Thumbnail]()
+        # Where the stride is even, its multiples take turns, too: between them frames may be skipped.
+        stride = self._plan.detector_stride
+        number = tick if stride % 2 else tick + tick // stride
         for name in cameras:
             index, stream = int(self._schedule.frames[name][tick]), self._log.streams[name]
             if index >= 0 and (name, tick) not in self._known:
                 encoded = None if stream.encoded is None else partial(stream.encoded, index)
                 image = cache(partial(reader.require, name, index))  # decoded at the first call
-                frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded)
+                turn = Turn(number, self._watched_px.get(name, NO_BOXES)) if self._plan.tiles_by_turns else None
+                frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded, turn)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with clock.stage("decode"):
                 for name, frame in frames.items():

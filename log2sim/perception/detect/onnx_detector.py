@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Detections, Frame
+from log2sim.datatypes import Detections, Frame, Turn
 from log2sim.errors import ConfigError
 from log2sim.files.inputs import read_file
 from log2sim.geometry import Array, box_iou
@@ -155,6 +155,18 @@ def plan_tiles(width_px: int, height_px: int, tiles: Literal["auto"] | int, inpu
     return [whole, *(Tile(u, v0, u + tile_width, v0 + tile_height) for u in starts)]
 
 
+def tiles_of_turn(planned: list[Tile], turn: Turn) -> list[Tile]:
+    """Return the whole image, every second tile of its row, and those whose middle is nearest to a watched box."""
+    whole, row = planned[0], planned[1:]
+    if len(row) < 2:
+        return planned
+    middle = np.array([(tile.u0 + tile.u1) / 2 for tile in row])
+    chosen = (np.arange(len(row)) + turn.number) % 2 == 0
+    u = (turn.watched_px[:, 0] + turn.watched_px[:, 2]) / 2
+    chosen[np.abs(u[:, None] - middle).argmin(axis=1)] = True
+    return [whole, *(tile for tile, kept in zip(row, chosen) if kept)]
+
+
 def merge(found: list[tuple[Tile, Detections]], width_px: int, height_px: int, max_overlap: float) -> Detections:
     """Merge the boxes of all tiles, in px of the whole image, into one set.
 
@@ -275,16 +287,14 @@ class OnnxDetector:
 
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame, best score first."""
-        return self.detect_images([frame.image()])[0]
+        return self.detect_many([frame])[0]
 
     def detect_many(self, frames: Sequence[Frame]) -> list[Detections]:
-        """Detect road users in each of several frames, see `detect_images`."""
-        return self.detect_images([frame.image() for frame in frames])
-
-    def detect_images(self, images: Sequence[NDArray[np.uint8]]) -> list[Detections]:
-        """Detect road users and traffic lights in each of several images (H, W, 3) uint8 BGR."""
+        """Detect road users and traffic lights in each of several frames."""
         input_px = self.model.spec.width_px or self.layout.preprocessing.default_px
+        images = [frame.image() for frame in frames]
         tiles = [plan_tiles(image.shape[1], image.shape[0], self.tiles, input_px) for image in images]
+        tiles = [planned if f.turn is None else tiles_of_turn(planned, f.turn) for planned, f in zip(tiles, frames)]
         jobs, found = [(image, tile) for image, planned in zip(images, tiles) for tile in planned], list[Detections]()
         for first in range(0, len(jobs), self.together):
             run = jobs[first : first + self.together]
