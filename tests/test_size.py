@@ -227,6 +227,19 @@ def test_a_low_hood_that_no_ray_meets_does_not_make_a_long_car_short(size, box, 
     assert shape.size_m[0] == pytest.approx(size[0], abs=0.5)
 
 
+@pytest.mark.parametrize(("category", "share"), [("cyclist", 0.5), ("car", 1.0)])
+def test_of_a_length_that_is_not_seen_boxes_of_riders_tell_half_and_others_all(category, share):
+    size, typical = np.array((1.75, 0.65, 1.7) if category != "car" else CAR), TYPICAL_SIZE_M[category][0]
+    box = (0.8 * typical, *TYPICAL_SIZE_M[category][1:])
+    track = measured([(12, 0, 0.0)] * 12, size, category, sensors=[(0.0, 0.0, 0.9)] * 12)
+    boxes = replace(
+        track.measurements, box_size_m=np.tile(box, (12, 1)), box_yaw_rad=np.zeros(12),
+        box_center_m=np.tile([12.0, 0.0, 0.8], (12, 1)),
+    )  # fmt: skip
+    length_m = moving_geometry(replace(track, measurements=boxes), np.zeros(12)).size_m[0]
+    assert length_m == pytest.approx(box[0] ** share * typical ** (1 - share), rel=0.05)
+
+
 def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():
     states = oncoming(start_m=15.0)
     yaw = np.full(len(states), np.pi)
