@@ -123,7 +123,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
             fused, schedule.t_ns, birth_score=limits.birth_score, max_gap_s=limits.max_gap_s, min_life_s=limits.min_life_s,
             flow_mps=estimate.ego_velocity(log, schedule),
         )  # fmt: skip
-        tracks = mark_unrecorded(tracks, observations.recorded(schedule))
+        tracks = mark_unrecorded(tracks, observations.recorded(schedule), 2 if plan.tiles_by_turns else 1)
     with clock.stage("smooth", run.progress):
         clutter = clutter_nats(tracks)
         candidates = estimate.estimate_agents(

@@ -123,5 +123,9 @@ def test_ticks_at_which_no_picture_was_searched_do_not_count_against_what_pictur
     everywhere = replace(track, measurements=replace(rows, camera=np.full(60, "front")))
     [certain] = mark_unrecorded([everywhere], {"front": np.ones(60, dtype=bool)})
     assert image_confidence(third) == pytest.approx(image_confidence(certain))
+    # Shown by tiles that are searched at every second tick.
+    by_turns = replace(track, measurements=replace(rows, camera=np.where(np.arange(60) % 2, "front", "")))
+    [turns] = mark_unrecorded([by_turns], {"front": np.ones(60, dtype=bool)}, 2)
+    assert image_confidence(turns) == pytest.approx(image_confidence(certain))
     [sweeps] = mark_unrecorded([whole], {"": np.ones(60, dtype=bool), "front": shown})
     assert sweeps.searched == 1.0

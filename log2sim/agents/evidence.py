@@ -245,10 +245,15 @@ MIN_PERIOD_S = 0.01
 
 
 def image_confidence(track: Track) -> float:
-    """Return the share of its searched ticks at which a track is detected in images, times the mean of the best scores there."""
+    """Return the share of its searched ticks at which a track is detected in images, times the mean of the best scores there.
+
+    Where tiles take turns, the ticks within which all are searched count as one.
+    """
     m = track.measurements
     in_image = np.isnan(m.box_yaw_rad) | (m.camera != "")
-    rate = detection_rate(m.t_ns, track.tick, track.unrecorded) * min(in_image.mean() / track.searched, 1.0)
+    search = track.tick // track.ticks_a_search
+    share = len(np.unique(search[in_image])) / len(np.unique(search))
+    rate = detection_rate(m.t_ns, track.tick, track.unrecorded) * min(share / track.searched, 1.0)
     return float(rate * np.sort(m.score[in_image])[-CONFIDENCE_DETECTIONS:].mean()) if in_image.any() else 0.0
 
 
