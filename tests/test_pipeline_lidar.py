@@ -106,9 +106,9 @@ def test_a_false_image_box_is_doubted_where_the_lidar_sees_something_else() -> N
     assert len(both.scenario.others) == 1
 
 
-def test_a_moving_car_points_where_it_goes_whatever_the_boxes_say(world: tuple[Log, Scenario]) -> None:
+def test_a_moving_car_points_where_it_goes_though_boxes_say_the_opposite(world: tuple[Log, Scenario]) -> None:
     log, _ = world
-    backward = Sweeps(log, lambda boxes: replace(boxes, yaw_rad=boxes.yaw_rad + np.pi))
+    backward = Sweeps(log, lambda b: replace(b, yaw_rad=b.yaw_rad + np.pi, heading_score=np.full(len(b), 0.9)))
     car = next(a for a in run_with(log, None, backward).scenario.others if not a.static and a.category == "car")
     assert abs(wrap_angle(car.waypoints.yaw_rad)).max() < np.deg2rad(10)
     assert (car.waypoints.speed_mps > 2).all()
