@@ -44,6 +44,7 @@ MUTANTS = (
     ("standing vehicles roll", "agents/smooth/fixed_interval.py", "still = np.isfinite(sigma)", "still = np.isfinite(sigma) & False", "smooth"),
     ("sizes of whole sides", "agents/size.py", "(1 - partial) * np.exp", "0 * np.exp", "size"),
     ("persons in one place", "agents/judge.py", "< SAME_PERSON_M", "< 0 * SAME_PERSON_M", "plausibility_conflicts"),
+    ("turns of tiles", "perception/detect/onnx_detector.py", "+ turn.number) % 2", "+ 0 * turn.number) % 2", "detect_boxes"),
     ("front and back", "agents/heading.py", "(0.0 if odds > 0 else np.pi)", "(0.0 if odds < 0 else np.pi)", "heading"),
     ("anti-windup", "simulation/reference.py", "(given == asked) | (error * wanted <= 0)", "(given == given)", "replay_follow"),
     ("feed-forward of curvature", "simulation/reference.py", "wanted = row[4:6] + pull", "wanted = 0.5 * row[4:6] + pull", "replay_follow replay_extremes"),
