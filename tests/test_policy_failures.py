@@ -119,6 +119,10 @@ def test_runs_are_judged_by_what_the_ego_did(folder, monkeypatch) -> None:
     assert "<b> in" not in page
     assert "of my own" in page
     assert page.count('class="failed"') + page.count("class=failed") >= 2
+    # Of many runs that fail alike, those with a page are in the table.
+    many = report_page("alike", logical, np.tile(near, (50, 1)), [hit] * 50, estimate, {45: "run/view.html"})
+    assert 'href="run/view.html"' in many
+    assert many.count("<tr>") == 1 + failure.TABLE_ROWS + 1
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,9 @@ circle { fill: #1565C0; fill-opacity: .5; } circle.failed { fill: #C62828; fill-
 """
 
 
+TABLE_ROWS = 30  # of the runs nearest to a failure; those with a page of their own beside
+
+
 def report_page(
     title: str,
     logical: Logical,
@@ -209,7 +212,8 @@ def report_page(
     """Return the page of a test: the probability, the parameters with failures in red, and the worst runs; `links` by run."""
     failed = np.array([o.margin <= 0 for o in outcomes])
     plots = [_scatter(logical.names, values, failed, i, j) for i in range(len(logical.names)) for j in range(i)]
-    worst = sorted(range(len(outcomes)), key=lambda k: outcomes[k].margin)[:30]
+    by_margin = sorted(range(len(outcomes)), key=lambda k: outcomes[k].margin)
+    worst = [k for place, k in enumerate(by_margin) if place < TABLE_ROWS or k in links]
     keys = sorted({key for k in worst for key in outcomes[k].values})
     head = "".join(f"<th>{html.escape(name)}</th>" for name in ("run", "margin", *logical.names, *keys))
     rows = []
