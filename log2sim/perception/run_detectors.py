@@ -27,8 +27,15 @@ from log2sim.files.cache import DiskCache, detection_folder
 from log2sim.files.packing import digest_of, pack, unpack
 from log2sim.files.plugins import DETECT_IN_CLOUD, find_call_defect
 from log2sim.files.stages import StageClock
+from log2sim.geometry import Camera
 from log2sim.perception.cooperative import create_for_ends
-from log2sim.perception.detect.detectors import CheckedDetector, Detector, FunctionDetector, create_detector
+from log2sim.perception.detect.detectors import (
+    CheckedDetector,
+    Detector,
+    FunctionDetector,
+    TilingDetector,
+    create_detector,
+)
 from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
 
 KEY_BYTES = 16
@@ -302,6 +309,13 @@ class Detectors:
     def own(self) -> bool:
         """Whether both are detectors of log2sim itself."""
         return not isinstance(self.images, CheckedDetector) and not isinstance(self.sweeps, CheckedLidarDetector)
+
+    def search_tiles(self, cameras: Iterable[Camera]) -> bool:
+        """Whether several tiles of the pictures of one of the cameras are searched besides the whole picture."""
+        images = self.images
+        return isinstance(images, TilingDetector) and any(
+            len(images.tiles_of(c.width_px, c.height_px)) > 2 for c in cameras
+        )
 
     @property
     def name(self) -> str:

@@ -368,6 +368,15 @@ class BatchDetector(Protocol):
         ...
 
 
+@runtime_checkable
+class TilingDetector(Protocol):
+    """Detector that searches tiles of large pictures, and leaves out those that `Frame.turn` lets wait."""
+
+    def tiles_of(self, width_px: int, height_px: int) -> list[Any]:
+        """Return the tiles of an image that are searched, the whole image first."""
+        ...
+
+
 def detect_all(detector: Detector, frames: Sequence[Frame]) -> list[Detections]:
     """Detect road users in several frames, at once where the detector can."""
     if isinstance(detector, BatchDetector):

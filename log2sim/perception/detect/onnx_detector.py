@@ -285,15 +285,19 @@ class OnnxDetector:
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model", "together")}
         return None if digest is None else f"{digest} onnxruntime {onnxruntime.__version__} {settings!r}"
 
+    def tiles_of(self, width_px: int, height_px: int) -> list[Tile]:
+        """Return the tiles of an image that are searched, the whole image first."""
+        input_px = self.model.spec.width_px or self.layout.preprocessing.default_px
+        return plan_tiles(width_px, height_px, self.tiles, input_px)
+
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame, best score first."""
         return self.detect_many([frame])[0]
 
     def detect_many(self, frames: Sequence[Frame]) -> list[Detections]:
         """Detect road users and traffic lights in each of several frames."""
-        input_px = self.model.spec.width_px or self.layout.preprocessing.default_px
         images = [frame.image() for frame in frames]
-        tiles = [plan_tiles(image.shape[1], image.shape[0], self.tiles, input_px) for image in images]
+        tiles = [self.tiles_of(image.shape[1], image.shape[0]) for image in images]
         tiles = [planned if f.turn is None else tiles_of_turn(planned, f.turn) for planned, f in zip(tiles, frames)]
         jobs, found = [(image, tile) for image, planned in zip(images, tiles) for tile in planned], list[Detections]()
         for first in range(0, len(jobs), self.together):
