@@ -95,8 +95,8 @@ class DetectConfig(Section):
     )
     tiles: int = setting(
         0,
-        "Overlapping tiles that are searched besides the whole image; 0: chosen from the image size, and every second in turn where sweeps "
-        "are searched, too, and people are not near.",
+        "Overlapping tiles that are searched besides the whole image; 0: chosen from the image size; where sweeps are "
+        "searched, too, every second of these in turn, unless a sweep shows a person or a two-wheeler there.",
         ge=0,
         le=64,
     )

@@ -251,7 +251,7 @@ def image_confidence(track: Track) -> float:
     """
     m = track.measurements
     in_image = np.isnan(m.box_yaw_rad) | (m.camera != "")
-    search = track.tick // track.ticks_a_search
+    search = track.tick // track.ticks_per_search
     share = len(np.unique(search[in_image])) / len(np.unique(search))
     rate = detection_rate(m.t_ns, track.tick, track.unrecorded) * min(share / track.searched, 1.0)
     return float(rate * np.sort(m.score[in_image])[-CONFIDENCE_DETECTIONS:].mean()) if in_image.any() else 0.0

@@ -394,13 +394,13 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
     for c in road_users:
         w, m = c.agent.waypoints, c.track.measurements
         t_s = timeline.seconds(m.t_ns)
-        odds, most = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad))), MAX_COURSE_LOG_ODDS
+        odds, limit = heading_log_odds(m, np.interp(t_s, w.t_s, np.unwrap(w.yaw_rad))), MAX_COURSE_LOG_ODDS
         if GROUP_OF[c.agent.category] == "vehicle":
             outline = outline_log_odds(c.track, w, t_s, c.agent.size_m)
             both = bool(odds and outline)
             odds = NETWORK_WEIGHT * odds + OUTLINE_WEIGHT * outline if both else odds + outline
-            most = min(COURSE_LOG_ODDS_PER_DETECTION * len(m), most)
-        alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0], most))
+            limit = min(COURSE_LOG_ODDS_PER_DETECTION * len(m), limit)
+        alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0], limit))
     own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
     # Tentative tracks may be clutter, which tells nothing of traffic and of rows.
     confirmed = [is_confirmed(c.track) for c in road_users]

@@ -60,7 +60,7 @@ FORWARD_LOG_ODDS, FORWARD_LOG_ODDS_PER_MPS, MAX_FORWARD_LOG_ODDS = 1.4, 2.0, 9.0
 # in fifty mixes up several objects, or stands (simulated logs with LiDAR).
 MAX_COURSE_LOG_ODDS = 7.0
 # Few detections of a vehicle may be of several that stand: of tracks of fewer than ten that move, one in ten points the wrong way, of longer
-# ones, and of two-wheelers, one in a hundred. From 608 vehicles of 150 simulated logs; 0.25 and 0.5 tell chances nearly as well.
+# ones, and of two-wheelers, one in a hundred. From 608 vehicles of 150 simulated logs; 0.25 and 0.5 fit nearly as well.
 COURSE_LOG_ODDS_PER_DETECTION = 0.35
 # A way shorter than so many standard deviations of its ends may be noise.
 CERTAIN_SIGMAS = 4.0
@@ -71,10 +71,10 @@ def forward_log_odds(speed_mps: float) -> float:
     return FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * speed_mps
 
 
-def course_log_odds(w: Waypoints, length_m: float, most: float) -> float:
+def course_log_odds(w: Waypoints, length_m: float, limit: float = MAX_COURSE_LOG_ODDS) -> float:
     """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way.
 
-    `most`: what a way can tell at most.
+    `limit`: greatest log-odds of the way in one direction.
 
     The center of a standing vehicle seems to move by up to its length while more and more of it comes into view.
     """
@@ -85,7 +85,7 @@ def course_log_odds(w: Waypoints, length_m: float, most: float) -> float:
         speed_mps = np.maximum(sign * w.speed_mps, 0.0)
         distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
         if time_s > 0:
-            one_way = min(forward_log_odds(distance_m / time_s), most)
+            one_way = min(forward_log_odds(distance_m / time_s), limit)
             odds += sign * one_way * min(distance_m / certain_m, 1.0)
     return odds
 

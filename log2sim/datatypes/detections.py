@@ -311,7 +311,7 @@ class Track:
     unrecorded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     # Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone
     searched: float = 1.0
-    ticks_a_search: int = 1  # within which a picture is searched in all its tiles
+    ticks_per_search: int = 1  # within which a picture is searched in all its tiles
 
     def __len__(self) -> int:
         """Return the number of measurements."""

@@ -395,9 +395,9 @@ class Log:
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """Which tiles of a picture a detector of tiles may leave out: those of the other turn that hold none of some boxes."""
+    """Which tiles of a picture are to be searched: every second one, those between at the next turn, and those of some boxes."""
 
-    number: int  # of this picture among those of its camera: every second tile belongs to its even or odd ones
+    number: int  # whether even or odd decides which tiles are due
     watched_px: Array  # (K, 4): u0, v0, u1, v1 of boxes whose tiles are searched at every turn
 
 

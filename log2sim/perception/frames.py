@@ -122,8 +122,6 @@ def add_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[Lig
     return out
 
 
-NO_BOXES = np.zeros((0, 4))
-
 # What a run takes from a picture: objects, the small copy (h, w) by which it is compared with other pictures, None where it was not
 # decoded, and traffic lights, cut out.
 PictureFindings = tuple[Detections, Thumbnail | None, tuple[LightBox, ...]]
@@ -142,7 +140,6 @@ class FrameDetector:
         self._log, self._schedule, self._detector, self._plan = log, schedule, detector, plan
         self._empty = set[str]()
         self._known: dict[tuple[str, int], PictureFindings | None] = {}
-        self._watched_px: Mapping[str, Array] = {}
 
     def search(
         self, tick: int, reader: RecordSource, clock: StageClock, watched_px: Mapping[str, Array]
@@ -152,24 +149,31 @@ class FrameDetector:
         Ticks come in order, from one that a stride divides. `watched_px`: boxes (K, 4) by camera whose tiles are searched at
         every tick. A camera is left out where it has no frame or its frame cannot be read.
         """
-        plan, last, self._watched_px = self._plan, len(self._schedule) - 1, watched_px
+        plan, last = self._plan, len(self._schedule) - 1
+        look = partial(self._look, reader=reader, clock=clock, watched_px=watched_px)
         self._known = {key: found for key, found in self._known.items() if key[1] >= tick}
         recorded = [camera for camera in plan.cameras if self._schedule.frames[camera][tick] >= 0]
         if plan.picture_stride > 1:  # cameras take turns, so that each tick takes as long
             turn = (tick + np.arange(len(plan.cameras))) % plan.picture_stride == 0
             self._empty = {camera for camera, due in zip(plan.cameras, turn) if not due}
         elif plan.detector_stride > 1 and tick % plan.detector_stride == 0:
-            empty = [c for c, found in self._look(tick, recorded, reader, clock).items() if not len(found[0])]
+            empty = [c for c, found in look(tick, recorded).items() if not len(found[0])]
             ahead = min(tick + plan.detector_stride, last)
-            seen = self._look(ahead, empty, reader, clock) if ahead > tick + 1 else {}
+            seen = look(ahead, empty) if ahead > tick + 1 else {}
             self._empty = {camera for camera, found in seen.items() if not len(found[0])}
         starts = plan.picture_stride == 1 and (tick % plan.detector_stride == 0 or tick == last)
         skipped = [] if starts else [camera for camera in recorded if camera in self._empty]
-        found = self._look(tick, [camera for camera in recorded if camera not in skipped], reader, clock)
+        found = look(tick, [camera for camera in recorded if camera not in skipped])
         return {camera: found.get(camera) for camera in recorded if camera in found or camera in skipped}
 
     def _look(
-        self, tick: int, cameras: Iterable[str], reader: RecordSource, clock: StageClock
+        self,
+        tick: int,
+        cameras: Iterable[str],
+        *,
+        reader: RecordSource,
+        clock: StageClock,
+        watched_px: Mapping[str, Array],
     ) -> dict[str, PictureFindings]:
         """Search a tick's frames of some cameras, each once; those that have none or cannot be read are left out."""
         frames, thumbnails = dict[str, Frame](), dict[str, Thumbnail]()
@@ -181,7 +185,8 @@ class FrameDetector:
             if index >= 0 and (name, tick) not in self._known:
                 encoded = None if stream.encoded is None else partial(stream.encoded, index)
                 image = cache(partial(reader.require, name, index))  # decoded at the first call
-                turn = Turn(number, self._watched_px.get(name, NO_BOXES)) if self._plan.tiles_by_turns else None
+                watched = watched_px.get(name, np.zeros((0, 4)))
+                turn = Turn(number, watched) if self._plan.tiles_by_turns else None
                 frames[name] = Frame(self._log.cameras[name], int(stream.t_ns[index]), image, encoded, turn)
         if self._plan.keeps(Stage.IMAGE_DECODING):
             with clock.stage("decode"):

@@ -198,7 +198,7 @@ circle { fill: #1565C0; fill-opacity: .5; } circle.failed { fill: #C62828; fill-
 """
 
 
-TABLE_ROWS = 30  # of the runs nearest to a failure; those with a page of their own beside
+TABLE_ROWS = 30  # runs nearest to a failure that are listed, with those that have a page of their own
 
 
 def report_page(

@@ -243,11 +243,11 @@ SWEEPS = ""
 
 
 def mark_unrecorded(
-    tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]], ticks_a_search: int = 1
+    tracks: Sequence[Track], recorded: Mapping[str, NDArray[np.bool_]], ticks_per_search: int = 1
 ) -> list[Track]:
     """Return tracks that know at which ticks none of the sensors that measured them recorded, and how often pictures were searched.
 
-    `recorded`: (T,) each: whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick. `ticks_a_search`: within
+    `recorded`: (T,) each: whether a camera, or `SWEEPS` any LiDAR, recorded something usable at each tick. `ticks_per_search`: within
     which all tiles of a picture are searched.
     """
     marked = []
@@ -258,7 +258,7 @@ def mark_unrecorded(
         by_any = [*by_camera, recorded[SWEEPS]] if in_sweeps else by_camera
         unrecorded = np.flatnonzero(~np.any(by_any, axis=0)) if by_any else np.zeros(0, dtype=np.int64)
         searched = float(np.any(by_camera, axis=0)[one.tick].mean()) if by_camera else 1.0
-        marked.append(replace(one, unrecorded=unrecorded, searched=searched, ticks_a_search=ticks_a_search))
+        marked.append(replace(one, unrecorded=unrecorded, searched=searched, ticks_per_search=ticks_per_search))
     return marked
 
 
