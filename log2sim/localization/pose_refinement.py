@@ -5,11 +5,13 @@ Poses of a log follow GNSS: over seconds some drift by decimeters, which smears 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Log, Sweep
@@ -28,9 +30,9 @@ from log2sim.localization.surfaces import (
 from log2sim.perception.frames import work_ahead
 from log2sim.perception.records import RecordSource
 
-# Poses between sweeps that are registered are interpolated: so many cover braking and curves of a log, unless they are farther
-# apart than errors of GNSS last.
-MAX_KEYFRAMES, MAX_SPACING_S = 30, 3.0
+# Corrections between keyframes are interpolated: so many cover braking and curves of a short log, and in a long one they are
+# so near to each other that errors of GNSS last from one to the next.
+USUAL_KEYFRAMES, MAX_SPACING_S = 30, 1.0
 # An ego that stands has one pose.
 MIN_WAY_M = 0.5
 # Each is registered to those before it at these distances in their order: near ones are precise, far ones hold the drift.
@@ -48,43 +50,45 @@ MAX_SLIDE_M = 0.1
 ROUNDS = 5
 
 
-@dataclass(frozen=True, eq=False)
-class Keyframe:
-    """A sweep that is registered."""
-
-    t_ns: int
-    map_T_ego: Array  # (4, 4)
-    surfaces: Surfaces
+Link = tuple[int, int, Registration]  # of the second one of two keyframes to the first
 
 
-def refine_poses(log: Log, during_ns: tuple[int, int] | None = None) -> PoseTrack | None:
+def refine_poses(log: Log, during_ns: tuple[int, int] | None = None, *, every_sweep: bool = False) -> PoseTrack | None:
     """Return poses of the ego by which surfaces in the sweeps of a time lie on each other.
 
-    None without LiDAR on the ego, with too few sweeps, or over too long a time.
+    Corrections of keyframes are interpolated, which takes drift out; with `every_sweep`, where all sweeps are keyframes, pitch
+    and roll lose their jitter, too. Memory does not grow with the log: surfaces of the last `max(LAGS)` keyframes are kept.
+
+    None without LiDAR on the ego, where the ego stands, and with too few sweeps.
     """
     lidar = densest_lidar(log)
     if log.ego is None or lidar is None:
         return None
-    chosen = _choose(log, lidar, during_ns)
-    records = RecordSource(log)
+    chosen, records = _choose(log, lidar, during_ns, every_sweep), RecordSource(log)
+    t_ns, poses = list[int](), list[Array]()
 
     def surfaces_at(index: int) -> tuple[int, Array, Surfaces] | None:
         sweep: Sweep | None = records.get(lidar, index)
         return None if sweep is None else surfaces_of_sweep(log, lidar, sweep)
 
-    keyframes = [Keyframe(*found) for found in work_ahead(surfaces_at, chosen.tolist()) if found is not None]
-    if len(keyframes) < MIN_KEYFRAMES:
+    def neighbors() -> Iterator[list[tuple[int, int, Surfaces, Surfaces]]]:
+        recent = deque[Surfaces](maxlen=max(LAGS) + 1)
+        for stamp_ns, pose, surfaces in filter(None, work_ahead(surfaces_at, chosen.tolist())):
+            j = len(poses)
+            t_ns.append(stamp_ns)
+            poses.append(pose)
+            recent.append(surfaces)
+            yield [(j - lag, j, recent[-1 - lag], surfaces) for lag in LAGS if lag <= j]
+
+    def registered(pairs: list[tuple[int, int, Surfaces, Surfaces]]) -> list[Link]:
+        found = [(i, j, register(first, second, inverse(poses[i]) @ poses[j])) for i, j, first, second in pairs]
+        return [(i, j, registration) for i, j, registration in found if registration is not None]
+
+    links = [link for some in work_ahead(registered, neighbors()) for link in some]
+    if len(poses) < MIN_KEYFRAMES:
         return None
-    pairs = [(j - lag, j) for j in range(len(keyframes)) for lag in LAGS if j >= lag]
-
-    def registered(pair: tuple[int, int]) -> Registration | None:
-        first, second = (keyframes[k] for k in pair)
-        return register(first.surfaces, second.surfaces, inverse(first.map_T_ego) @ second.map_T_ego)
-
-    found = work_ahead(registered, pairs)
-    links = [(*pair, registration) for pair, registration in zip(pairs, found, strict=True) if registration is not None]
-    twists = solve_twists(keyframes, links)
-    return corrected(log.ego, np.array([k.t_ns for k in keyframes]), twists)
+    stamps_ns = np.array(t_ns)
+    return corrected(log.ego, stamps_ns, solve_twists(stamps_ns, np.array(poses), links))
 
 
 def place_as_given(points_m: Array, refined: Log, given: Log) -> Array:
@@ -115,22 +119,22 @@ def _told(covariance: Array, measured: Array) -> Array | None:
     return np.asarray(length @ (directions * known) @ directions.T @ length)
 
 
-def _choose(log: Log, lidar: str, during_ns: tuple[int, int] | None) -> NDArray[np.int64]:
+def _choose(log: Log, lidar: str, during_ns: tuple[int, int] | None, every_sweep: bool) -> NDArray[np.int64]:
     """Choose sweeps evenly by the way and by the time of the ego: poses err along both."""
     t_ns = log.streams[lidar].t_ns
     pose, known = log.map_T_sensor(lidar, t_ns)
     known &= is_during(t_ns, during_ns)
-    usable = np.flatnonzero(known)
+    usable = np.flatnonzero(known).astype(np.int64)
     if len(usable) <= MIN_KEYFRAMES:
-        return usable.astype(np.int64)
+        return usable
     moved = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(pose[usable, :3, 3], axis=0), axis=1))])
     span_s = (t_ns[usable[-1]] - t_ns[usable[0]]) / NS_PER_S
-    if moved[-1] < MIN_WAY_M or span_s > MAX_KEYFRAMES * MAX_SPACING_S:
-        return usable[:0].astype(np.int64)
+    if moved[-1] < MIN_WAY_M:
+        return usable[:0]
     since = (t_ns[usable] - t_ns[usable[0]]) / float(t_ns[usable[-1]] - t_ns[usable[0]])
     progress = (moved / moved[-1] + since) / 2
-    at = np.linspace(0, 1, min(MAX_KEYFRAMES, len(usable)))
-    return usable[np.unique(np.searchsorted(progress, at - 1e-9))].astype(np.int64)
+    count = len(usable) if every_sweep else min(max(USUAL_KEYFRAMES, round(span_s / MAX_SPACING_S)), len(usable))
+    return usable if every_sweep else usable[np.unique(np.searchsorted(progress, np.linspace(0, 1, count) - 1e-9))]
 
 
 def corrected(track: PoseTrack, t_ns: NDArray[np.int64], twists: Array) -> PoseTrack:
@@ -141,38 +145,49 @@ def corrected(track: PoseTrack, t_ns: NDArray[np.int64], twists: Array) -> PoseT
     return replace(track, map_T_ego=track.map_T_ego @ np.stack([exp_of(twist) for twist in between]))
 
 
-def solve_twists(keyframes: list[Keyframe], links: list[tuple[int, int, Registration]]) -> Array:
-    """Solve for the twists (K, 6), m and rad, of keyframes in their own frames that fit all registrations best.
+def solve_twists(t_ns: NDArray[np.int64], map_T_ego: Array, links: Sequence[Link]) -> Array:
+    """Solve for the twists (K, 6), m and rad, of keyframes at stamps (K,) and poses (K, 4, 4), in their own frames, that fit all registrations best.
 
     With poses P and a registration M of j to i, exp(-x_i) G exp(x_j) = M with G = P_i^-1 P_j, which is linear in small
     twists: x_j - Ad(G^-1) x_i = log(G^-1 M). Cauchy weights on the Mahalanobis distance of each registration.
     """
-    count = 6 * len(keyframes)
-    twists: Array = np.zeros(count)
-    prior = np.diag(np.tile(PRIOR_SIGMA**-2.0, len(keyframes)))
-    for k, (one, other) in enumerate(pairwise(keyframes)):
-        drift = np.diag(DRIFT_SIGMA**-2.0 * NS_PER_S / (other.t_ns - one.t_ns))
-        rows = slice(6 * k, 6 * k + 12)
-        prior[rows, rows] += np.block([[drift, -drift], [-drift, drift]])
-    equations = []
-    for i, j, registration in links:
-        j_T_i = inverse(keyframes[j].map_T_ego) @ keyframes[i].map_T_ego
-        measured = log_of(j_T_i @ registration.first_T_second)
-        information = _told(registration.covariance, measured)
-        if information is not None:
-            equations.append((6 * i, 6 * j, -adjoint_of(j_T_i), measured, information))
+    count = len(t_ns)
+    drift = DRIFT_SIGMA**-2.0 * NS_PER_S / np.diff(t_ns)[:, None]
+    prior = np.tile(PRIOR_SIGMA**-2.0, (count, 1))
+    prior[:-1] += drift
+    prior[1:] += drift
+    every, diagonal = np.arange(count), np.eye(6)
+    fixed = [(every, every, prior[:, :, None] * diagonal), (every[1:], every[:-1], -drift[:, :, None] * diagonal)]
+    firsts, seconds, equations = list[int](), list[int](), list[tuple[Array, Array, Array]]()
+    for first, second, registration in links:
+        j_T_i = inverse(map_T_ego[second]) @ map_T_ego[first]
+        twist = log_of(j_T_i @ registration.first_T_second)
+        held = _told(registration.covariance, twist)
+        if held is not None:
+            firsts.append(first)
+            seconds.append(second)
+            equations.append((-adjoint_of(j_T_i), twist, held))
+    twists = np.zeros((count, 6))
+    if not equations:
+        return twists
+    i, j = np.array(firsts), np.array(seconds)
+    of_i, measured, information = (np.array(column) for column in zip(*equations, strict=True))
+    # Lower triangle of the normal equations, by diagonals: keyframes are tied to those at most `max(LAGS)` before them.
+    offset = np.arange(6)
     for _ in range(ROUNDS):
-        normal: Array = prior.copy()
-        right: Array = np.zeros(count)
-        for i, j, of_i, measured, information in equations:
-            residual = twists[j : j + 6] + of_i @ twists[i : i + 6] - measured
-            weight = 1 / (1 + float(residual @ information @ residual) / (6 * CAUCHY**2))
-            scaled = weight * information
-            normal[j : j + 6, j : j + 6] += scaled
-            normal[i : i + 6, i : i + 6] += of_i.T @ scaled @ of_i
-            normal[i : i + 6, j : j + 6] += of_i.T @ scaled
-            normal[j : j + 6, i : i + 6] += scaled @ of_i
-            right[j : j + 6] += scaled @ measured
-            right[i : i + 6] += of_i.T @ scaled @ measured
-        twists = np.asarray(np.linalg.solve(normal, right))
-    return twists.reshape(-1, 6)
+        residual = twists[j] + np.einsum("nij,nj->ni", of_i, twists[i]) - measured
+        square = np.einsum("ni,nij,nj->n", residual, information, residual)
+        scaled = information / (1 + square / (6 * CAUCHY**2))[:, None, None]
+        to_i = of_i.transpose(0, 2, 1) @ scaled
+        blocks = [*fixed, (j, j, scaled), (i, i, to_i @ of_i), (j, i, scaled @ of_i)]
+        band, right = np.zeros((6 * int((j - i).max() + 1), 6 * count)), np.zeros((count, 6))
+        for of_row, of_column, block in blocks:
+            row, column = np.broadcast_arrays(
+                6 * of_row[:, None, None] + offset[:, None], 6 * of_column[:, None, None] + offset
+            )
+            lower = row >= column
+            np.add.at(band, ((row - column)[lower], column[lower]), block[lower])
+        np.add.at(right, j, np.einsum("nij,nj->ni", scaled, measured))
+        np.add.at(right, i, np.einsum("nij,nj->ni", to_i, measured))
+        twists = solveh_banded(band, right.ravel(), lower=True).reshape(count, 6)
+    return np.asarray(twists)

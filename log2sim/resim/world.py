@@ -243,7 +243,7 @@ def build_world(
     )
     seen = {agent.id: Seen(Alignment(agent), []) for agent in scenario.others}
     sightings = {id: s.sightings for id, s in seen.items()}
-    refined = refine_poses(log)
+    refined = refine_poses(log, every_sweep=True)
     surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
     done, gone, total = 0, 0, sum(len(log.streams[name].t_ns) for name in lidars)
