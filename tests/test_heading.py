@@ -121,7 +121,9 @@ def test_what_drives_off_or_stops_had_its_front_where_it_has_it_then(yaw):
     assert decided(cut(candidate(31.0, 44.0, yaw), slice(0, 5)), driving)[1][0].quality["heading_confidence"] < 0.6
 
 
-@pytest.mark.parametrize(("category", "detections", "heading"), [("car", 20, 0), ("car", 3, 180), ("cyclist", 3, 0), ("truck", 11, 0)])
+@pytest.mark.parametrize(
+    ("category", "detections", "heading"), [("car", 20, 0), ("car", 3, 180), ("cyclist", 3, 0), ("truck", 11, 0)]
+)
 def test_a_motion_seen_in_few_detections_of_a_car_may_be_of_several_that_stand(category, detections, heading):
     """Of trucks, whose ends look alike, sure boxes may all be wrong."""
     sure = 0.999 if category == "truck" else 0.9

@@ -57,14 +57,19 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
     wall = np.stack(np.meshgrid(np.arange(-10, 10, 0.1), np.arange(-1.8, 2, 0.1)), -1).reshape(-1, 2)
     wall = np.column_stack([0 * wall[:, 0] + 8, wall])  # across the way, so that every start counts
     plane = joined([plane, disc_surfels(wall, np.tile([-1.0, 0, 0], (len(wall), 1)), 0.1)])
+    truck = np.stack(np.meshgrid(np.arange(-10, 13, 0.06), np.arange(-1.8, 2, 0.06)), -1).reshape(-1, 2)
+    truck = np.column_stack(
+        [truck[:, 0], 0 * truck[:, 0] - 2.4, truck[:, 1]]
+    )  # so near that the ego passes it within a sweep
+    both = joined([plane, disc_surfels(truck, np.tile([0.0, 1, 0], (len(truck), 1)), 0.05)])
     rng = np.random.default_rng(2)
     azimuth, elevation = rng.uniform(-np.pi, np.pi, 3000), rng.uniform(-0.6, 0.1, 3000)
     ray = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], 1)
     spinning = (azimuth + np.pi) / (2 * np.pi) * 0.1
-    for speed_mps, t_s, tolerance_m in (
-        (15, spinning, 0.01),
-        (30, spinning, 1e-4),
-        (30, rng.uniform(0, 0.1, 3000), 1e-4),
+    for speed_mps, t_s, surfaces, beside_m, tolerance_m in (
+        (15, spinning, both, -2.4, 0.01),
+        (30, spinning, both, -2.4, 1e-4),
+        (30, rng.uniform(0, 0.1, 3000), plane, -np.inf, 1e-4),
     ):
         moment = (t_s / 0.0002).astype(int)
         poses = np.tile(np.eye(4), (501, 1, 1))
@@ -72,12 +77,12 @@ def test_rays_that_start_apart_meet_a_plane_as_those_that_start_where_others_do(
         poses[:, :3, :3], poses[:, 0, 3] = rotation_from_rpy(0.0, 0.0, yaw), x
         shots = replace(shots_toward(ray), t_ns=(t_s * NS_PER_S).astype(np.int64))
         rays = rays_in_map(shots, poses, moment)
-        shifted = replace(plane, center_m=plane.center_m - rays.shift_m.astype(np.float32))
-        found = first_hits(meetings(rays, grid_of(rays), shifted), plane.material, len(ray), rng).range_m
+        shifted = replace(surfaces, center_m=surfaces.center_m - rays.shift_m.astype(np.float32))
+        found = first_hits(meetings(rays, grid_of(rays), shifted), surfaces.material, len(ray), rng).range_m
         world = np.einsum("nij,nj->ni", poses[moment, :3, :3], ray)
         with np.errstate(divide="ignore"):
-            down, ahead = -1.8 / world[:, 2], (8 - x[moment]) / world[:, 0]
-        expected = np.minimum(np.where(down > 0, down, np.inf), np.where(ahead > 0, ahead, np.inf))
+            ways = -1.8 / world[:, 2], (8 - x[moment]) / world[:, 0], beside_m / world[:, 1]
+        expected = np.min([np.where(way > 0, way, np.inf) for way in ways], axis=0)
         there = expected < 12
         there &= np.abs(azimuth) < np.deg2rad(178)  # what the first and the last rays see has two places
         assert there.sum() > 1000

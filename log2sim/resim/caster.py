@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.files.arrays import Columns
-from log2sim.resim.rays import Floats, Rays, bin_of
+from log2sim.resim.rays import Floats, Rays
 from log2sim.resim.surfels import Material, Surfels
 
 CELL_RAD, ROW_RAD = np.float32(np.deg2rad(0.1)), np.float32(np.deg2rad(0.2))  # of azimuth and of elevation
@@ -96,8 +96,7 @@ def meetings(rays: Rays, grid: RayGrid, surfels: Surfels) -> list[Meetings]:
 
 def _met(rays: Rays, grid: RayGrid, to_sensor: Floats, start: Floats, discs: Surfels, first: int) -> Iterator[Meetings]:
     center, radius, spread = discs.center_m.T, discs.radius_m, np.float32(rays.spread_m)
-    middle = to_sensor[len(to_sensor) // 2]
-    bins = bin_of(np.arctan2(_row(middle, 1, center), _row(middle, 0, center)))
+    bins = rays.bins_toward(len(discs), lambda _: center)
     offset = [center[axis] - start[:, axis].take(bins) for axis in range(3)]
     turn = [[to_sensor[:, i, j].take(bins) for j in range(3)] for i in range(3)]
     x, y, z = (_dot(turn[axis], offset) for axis in range(3))
@@ -195,12 +194,6 @@ def _expanded(
 def _dot(a: Any, b: Any) -> Floats:
     """Return the products (N,) of vectors whose three columns are given."""
     out: Floats = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return out
-
-
-def _row(pose: Floats, axis: int, points: Any) -> Floats:
-    """Return a coordinate (N,) of points, whose three columns are given, moved by a pose (4, 4)."""
-    out: Floats = _dot(pose[axis], points) + pose[axis, 3]
     return out
 
 

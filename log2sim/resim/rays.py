@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -274,8 +275,25 @@ class Rays:
     bin_ns: NDArray[np.int64]
     spread_m: float
 
+    def bins_toward(self, count: int, points: Callable[[NDArray[np.int64]], Any]) -> NDArray[np.int64]:
+        """Return the bins (N,) in which the sensor looks at `count` points, which `points` (3, N), m, gives in the shifted map for bins (N,).
+
+        Points and sensor move while it turns, so each round takes both where they are in the bin of the round before: of a surface 2 m
+        beside an ego at 30 m/s a fourth of the error is left each time.
+        """
+        pose, bins = self.bin_T_map.astype(np.float32), np.full(count, len(self.bin_ns) // 2)
+        for _ in range(BIN_ROUNDS):
+            at = points(bins)
+            ahead, left = (
+                sum(pose[:, axis, j].take(bins) * at[j] for j in range(3)) + pose[:, axis, 3].take(bins)
+                for axis in range(2)
+            )
+            bins = bin_of(np.arctan2(left, ahead))
+        return bins
+
 
 TIME_BINS = 720
+BIN_ROUNDS = 3
 
 
 def bin_of(azimuth: NDArray[Any]) -> NDArray[np.int64]:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.resim.caster import Meetings
-from log2sim.resim.rays import Floats, Rays, bin_of
+from log2sim.resim.rays import Floats, Rays
 from log2sim.resim.surfels import Material
 
 # Turned by 20 degrees a person shows a third of a width that was hidden. From 1.5 times as far the gaps are half as wide again.
@@ -180,19 +180,19 @@ def with_sightings(
     parts, discs = list(parts), [material, Material(*(np.zeros(1, np.float32) for _ in range(3)))]
     # By disc whether its agent is seen as in a sighting, and by agent the rays that end on its discs nevertheless.
     seen, behind = np.zeros(passed + 1, bool), dict[int, NDArray[np.bool_]]()
+    t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
     for k, id in enumerate(ids):
         some = sightings.get(id, ())
         if not some:
             continue
         agent = scenario[id]
-        # Where the agent is when the sensor looks there.
-        t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
-        bin = len(t_s) // 2
-        for _ in range(2):
-            agent_R_map, center = frame_at(agent, float(t_s[bin]))
-            center -= rays.shift_m
-            ahead = rays.bin_T_map[bin, :3, :3] @ center + rays.bin_T_map[bin, :3, 3]
-            bin = int(bin_of(np.arctan2(ahead[1:2], ahead[:1]))[0])
+
+        def center_at(bins: NDArray[np.int64], agent: Agent = agent) -> Array:
+            return (frame_at(agent, float(t_s[bins[0]]))[1] - rays.shift_m)[:, None]
+
+        bin = int(rays.bins_toward(1, center_at)[0])
+        agent_R_map, center = frame_at(agent, float(t_s[bin]))
+        center -= rays.shift_m
         sensor = -rays.bin_T_map[bin, :3, :3].T @ rays.bin_T_map[bin, :3, 3]
         view = agent_R_map @ (sensor - center)
         away, reach = float(np.linalg.norm(view)), float(np.linalg.norm(np.array(agent.size_m) / 2 + AROUND_M))

@@ -23,12 +23,12 @@ from log2sim.perception.records import RecordSource
 from log2sim.resim.alignment import Alignment, moved
 from log2sim.resim.caster import grid_of, meetings
 from log2sim.resim.rays import (
+    Floats,
     Pattern,
     Rays,
     Shots,
     all_shots,
     angles_of,
-    bin_of,
     find_pattern,
     poses_of,
     rays_in_map,
@@ -166,8 +166,6 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
     center = [rotation @ part.center_m.T + offset[:, None] for part in parts]
     normal = [rotation @ part.normal.T for part in parts]
     t_s = (rays.bin_ns - scenario.t0_ns) / NS_PER_S
-    middle = len(t_s) // 2
-    sensor = rays.bin_T_map[middle].astype(np.float32)
     for agent in scenario.others:
         if agent.id not in agents or not _is_near(agent, t_s, here, reach_m):
             continue
@@ -179,13 +177,14 @@ def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Sur
             pose = np.column_stack([moved(np.column_stack([fit[:, :2], z]), pose)[:, :2], pose[:, 2] + fit[:, 2]])
         cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         table = np.stack([pose[:, 0], pose[:, 1], z - rays.shift_m[2], cos, sin]).astype(np.float32)
-        px, py, pz = surfels.center_m.T
-        x, y, up, c, s = table[:, middle]
-        for _ in range(2):
-            points = np.stack([c * px - s * py + x, s * px + c * py + y, pz + up])
-            ahead, left, _ = sensor[:3, :3] @ points + sensor[:3, 3:]
-            bins = bin_of(np.arctan2(left, ahead))
+        local = surfels.center_m.T
+
+        def placed(bins: NDArray[np.int64], table: Floats = table, local: Floats = local) -> Floats:
             x, y, up, c, s = table.take(bins, axis=1)
+            return np.stack([c * local[0] - s * local[1] + x, s * local[0] + c * local[1] + y, local[2] + up])
+
+        bins = rays.bins_toward(len(surfels), placed)
+        points, (c, s) = placed(bins), table[3:].take(bins, axis=1)
         nx, ny, nz = surfels.normal.T
         turned, own = np.stack([c * nx - s * ny, s * nx + c * ny, nz]), there[bins]
         if not own.all():
