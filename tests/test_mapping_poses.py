@@ -45,18 +45,20 @@ def street(rng: np.random.Generator, count: int) -> Array:
     return np.concatenate([np.column_stack([u, v, zero]), *walls])
 
 
-def street_log(poses: Array, frame: str = "lidar") -> Log:
-    """Sweeps from the true poses in a log that states others."""
+def street_log(poses: Array, frame: str = "lidar", slower: int = 1) -> Log:
+    """Sweeps from the true poses in a log that states others, and that takes so many times as long."""
+    stamps_ns = T_NS[0] + slower * (T_NS - T_NS[0])
 
     def read(i: int) -> Sweep:
         rng = np.random.default_rng(i)
         world = street(rng, 4000)
         local = apply(inverse(true_poses()[i] @ MOUNT), world) + rng.normal(0, 0.01, (len(world), 3))
         points = local if frame == "lidar" else apply(poses[i] @ MOUNT, local)
-        return Sweep(int(T_NS[i]), points, frame)  # type: ignore[arg-type]
+        return Sweep(int(stamps_ns[i]), points, frame)  # type: ignore[arg-type]
 
-    streams = {"top": Stream("top", T_NS, read)}
-    return Log("street", "log2sim", {}, {"top": Lidar("top", "ego", MOUNT)}, streams, PoseTrack(T_NS, poses))
+    streams = {"top": Stream("top", stamps_ns, read)}
+    track = PoseTrack(stamps_ns, poses, max_gap_s=1.0 * slower)
+    return Log("street", "log2sim", {}, {"top": Lidar("top", "ego", MOUNT)}, streams, track)
 
 
 def relative_errors(poses: Array) -> Array:
@@ -66,14 +68,27 @@ def relative_errors(poses: Array) -> Array:
 
 
 @pytest.mark.matrix
-@pytest.mark.parametrize("frame", ["lidar", "map"])
-def test_drift_is_taken_out(frame: str) -> None:
-    refined = refine_poses(street_log(drifted(), frame))
+@pytest.mark.parametrize(("frame", "slower"), [("lidar", 1), ("map", 1), ("lidar", 30)])
+def test_drift_is_taken_out_of_short_logs_and_of_long_ones(frame: str, slower: int) -> None:
+    refined = refine_poses(street_log(drifted(), frame, slower))
     assert refined is not None
     before, after = (np.abs(relative_errors(p)).max(axis=0) for p in (drifted(), refined.map_T_ego))
     assert before[:3].max() > 0.5
     assert after[:3].max() < 0.04
     assert np.degrees(after[3:]).max() < 0.15
+
+
+def test_with_every_sweep_jitter_is_taken_out() -> None:
+    """Of pitch and roll, which no other sweep shows."""
+    jitter = np.random.default_rng(4).normal(0, [0, 0, 0, 0.001, 0.001, 0], (len(T_NS), 6))
+    given = true_poses() @ np.stack([exp_of(twist) for twist in jitter])
+    off = []
+    for every_sweep in (False, True):
+        refined = refine_poses(street_log(given), every_sweep=every_sweep)
+        assert refined is not None
+        off.append(np.sqrt((relative_errors(refined.map_T_ego)[:, 3:5] ** 2).mean()))
+    assert off[1] < 0.0005
+    assert off[1] < 0.6 * off[0]
 
 
 @pytest.mark.slow
