@@ -74,10 +74,6 @@ FIGURES = {
 }  # fmt: skip
 NOISE_SIGMAS, SEEDS = 2.0, 3  # further runs of each log measure its noise
 FAILURE = -100.0
-UNITS = {
-    "M": "m", "S": "s", "MPS": "m/s", "MPS2": "m/s2", "MPS3": "m/s3", "PX": "px", "RAD": "rad", "DEG": "deg", "HZ": "Hz",
-    "NS": "ns", "1PM": "1/m", "M2": "m2", "SIGMAS": "sigma",
-}  # fmt: skip
 UPPER_LIMIT = re.compile(r"(^|_)(MAX|LIMIT|GATE|LONGEST|LARGEST|FARTHEST|UNTIL)(_|$)")
 # Types that are handed on by arithmetic and not by rules.
 PLAIN = re.compile(r"^(Array|Mask|float|int|str|NDArray.*|np\..*|Any|None|bytes|Path)$")
@@ -101,11 +97,6 @@ class Variation:
     def label(self) -> str:
         """Short name for tables."""
         return ".".join(p for p in (self.module.removeprefix("log2sim."), self.name, self.column) if p)
-
-    @property
-    def unit(self) -> str:
-        """Unit, read off the end of the name; empty for counts and shares."""
-        return UNITS.get((self.column or self.name).upper().rsplit("_", 1)[-1], "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +134,7 @@ def main(
         ):
             for index, figures, outcome in pool.imap_unordered(run_one, range(len(tasks))):
                 case, v = tasks[index]
-                row = {"case": case.name, "label": v.label, "change": v.change, "stage": v.stage, "unit": v.unit}
+                row = {"case": case.name, "label": v.label, "change": v.change, "stage": v.stage}
                 rows.append({**row, "value": short(v.before), "figures": figures, "outcome": outcome})
                 print(json.dumps(rows[-1]), file=file, flush=True)
     print(tables(rows))
@@ -467,9 +458,9 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
                 continue
             off = told.pop("off", (0.0, ""))[1]
             others = "; ".join(f"{change}: {text}" for change, (_, text) in told.items())
-            lines.append((score, [label, one["unit"], one["value"], off, others]))
+            lines.append((score, [label, one["value"], off, others]))
         if lines or idle:
-            table = markdown(["name", "unit", "value", "off", "other"], [row for _, row in sorted(lines)])
+            table = markdown(["name", "value", "off", "other"], [row for _, row in sorted(lines)])
             out.append(f"## {stage}\n\n{table}\n\nThe same scenarios without: {', '.join(idle) or 'none'}.")
     return "\n\n".join(out)
 
