@@ -23,9 +23,6 @@ IMAGE_PX = np.array([1242.0, 375.0])
 NEAR_M = 1.0
 # Spread of the detected centers of labeled cars as a line over the range, taken twice as wide for what is partly hidden.
 SIGMA_M, SIGMA_PER_M = 0.1, 0.004
-# Boxes are looked at through a grid of so many points on each side to tell how much of them is hidden.
-GRID = 8
-NEARER_M = 1.0
 NEIGHBORS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX = 2, 0, 25.0
 DONT_CARE_SHARE = 0.5
@@ -231,23 +228,3 @@ def project(boxes: Boxes, P: Array) -> Array:
     cut_low, cut_high = np.clip(low, 0, IMAGE_PX - 1), np.clip(high, 0, IMAGE_PX - 1)
     inside = ahead & ((cut_high - cut_low).prod(1) >= 0.5 * (high - low).prod(1))
     return np.where(inside[:, None], np.concatenate([cut_low, cut_high], axis=1), np.nan)
-
-
-def hidden_share(boxes: Boxes, hides: Mask) -> Array:
-    """Share (N,) of every image box that lies behind those of the rows `hides` (N,) of its frame that are nearer to the camera."""
-    depth, out = np.linalg.norm(boxes.bottom_m, axis=1), np.zeros(len(boxes))
-    (u0, v0, u1, v1), front = boxes.box_px.T, np.flatnonzero(hides)
-    front = front[np.argsort(boxes.frame[front], kind="stable")]
-    i, j = same_frame(boxes, boxes.take(front), reach_m=False)
-    j = front[j]
-    for nearer, farther in ((depth + NEARER_M, depth), (u0, u1), (-u1, -u0), (v0, v1), (-v1, -v0)):
-        kept = nearer[j] < farther[i]
-        i, j = i[kept], j[kept]
-    if len(i):
-        low, high = boxes.box_px[:, :2], boxes.box_px[:, 2:]
-        grid = low[:, None] + (high - low)[:, None] * ((np.arange(GRID) + 0.5) / GRID)[:, None]
-        covered = (grid[i] > low[j, None]) & (grid[i] < high[j, None])
-        cells = covered[:, :, None, 0] & covered[:, None, :, 1]
-        begin = np.flatnonzero(np.diff(i, prepend=-1))
-        out[i[begin]] = np.logical_or.reduceat(cells, begin, axis=0).mean(axis=(1, 2))
-    return out
