@@ -31,7 +31,7 @@ from kitti.tracks import (
     sum_so_far,
 )
 from log2sim.datatypes import Measurements
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, choose_pairs
 from log2sim.tracking.tracker import MAX_PEDESTRIAN_SPEED_MPS
 
 # Log-odds that a box of a car lies on a labeled one, of detected and of predicted boxes, with all frames at hand and with those
@@ -65,13 +65,11 @@ def _cars(d: Described, *, online: bool) -> tuple[Mask, Array]:
     # What cannot be an error says nothing against its track.
     seen = np.where(small, 1.0, labeled_probability(d.features, SEEN_ONLINE if online else SEEN))
     predicted = labeled_probability(d.features, PREDICTED_ONLINE if online else PREDICTED)
-    soon = d.distance <= SMALL_FRAMES
-    likely = small & soon | (predicted >= MIN_PREDICTED)
+    keep = np.where(d.seen, seen >= MIN_SEEN, small & (d.distance <= SMALL_FRAMES) | (predicted >= MIN_PREDICTED))
     if online:
         # What is only predicted is believed as much as the last detection.
         before, _ = neighbors(d.seen, d.boxes.track_id)
-        return np.where(d.seen, seen >= MIN_SEEN, likely), seen[before]
-    keep = np.where(d.seen, seen >= MIN_SEEN, likely)
+        return keep, seen[before]
     return keep, _mean_of_track(d, seen, d.seen & keep & ~small)
 
 
@@ -281,18 +279,15 @@ class Pairs:
 
 
 def find_pairs(boxes: Boxes) -> Pairs:
-    """Pair each pedestrian with the nearest rider in its place; the likelier one is tracked."""
+    """Pair pedestrians with riders in their places; the likelier one of each pair is tracked."""
     boxes = boxes.take(np.argsort(boxes.frame, kind="stable"))
     pedestrian, rider = (np.flatnonzero(boxes.category == c) for c in (PEDESTRIAN, RIDER))
     i, j = same_frame(boxes.take(pedestrian), boxes.take(rider), reach_m=False)
     i, j = pedestrian[i], rider[j]
     apart_m = np.hypot(*(boxes.bottom_m[i] - boxes.bottom_m[j])[:, [0, 2]].T)
-    order = np.flatnonzero(apart_m < SAME_OBJECT_M)
-    order = order[np.argsort(apart_m[order], kind="stable")]
+    one = choose_pairs(i, j, apart_m, SAME_OBJECT_M)
     pair = np.full(len(boxes), -1, dtype=np.int64)
-    for a, b in zip(i[order].tolist(), j[order].tolist()):
-        if pair[a] < 0 and pair[b] < 0:
-            pair[a], pair[b] = b, a
+    pair[i[one]], pair[j[one]] = j[one], i[one]
     opposite = np.where(pair >= 0, boxes.score[pair], MISSED_SCORE)
     lead = np.where(boxes.category == RIDER, 1, -1) * (boxes.score - opposite) - RIDER_LEAD
     second = (pair >= 0) & np.where(boxes.category == RIDER, lead <= 0, lead > 0)
