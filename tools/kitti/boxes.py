@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import VEHICLE, Measurements, seen_from
 from log2sim.files.arrays import Columns
-from log2sim.geometry import Array, apply, box_corners, inverse, rectangle_overlap, rotation_from_quaternion, transform
+from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform, upright_box_iou
 from log2sim.logs.kitti import labels
 
 PERIOD_NS = 100_000_000
@@ -73,18 +73,16 @@ def read_tracks(path: Path) -> Boxes:
     )  # fmt: skip
 
 
+def upright(boxes: Boxes) -> Array:
+    """Boxes (N, 7) on axes x right, z forward, y up: center, length, width, height and yaw, which is counter-clockwise on them."""
+    height = boxes.size_hwl_m[:, 0]
+    x, y, z = boxes.bottom_m.T
+    return np.column_stack([x, z, height / 2 - y, boxes.size_hwl_m[:, ::-1], -boxes.yaw_rad])
+
+
 def overlap_3d(a: Boxes, b: Boxes) -> Array:
     """IoU (N,) in 3D of boxes with each other, row by row."""
-    top = np.maximum(a.bottom_m[:, 1] - a.size_hwl_m[:, 0], b.bottom_m[:, 1] - b.size_hwl_m[:, 0])
-    height = np.clip(np.minimum(a.bottom_m[:, 1], b.bottom_m[:, 1]) - top, 0, None)
-    common = rectangle_overlap(_from_above(a), _from_above(b)) * height
-    union = a.size_hwl_m.prod(1) + b.size_hwl_m.prod(1) - common
-    return np.divide(common, union, out=np.zeros(len(a)), where=union > 0)
-
-
-def _from_above(boxes: Boxes) -> Array:
-    """Rectangles (N, 5) on the camera's x-z plane, on which rotation_y, from z toward x, is clockwise."""
-    return np.column_stack([boxes.bottom_m[:, [0, 2]], boxes.size_hwl_m[:, :0:-1], -boxes.yaw_rad])
+    return upright_box_iou(upright(a), upright(b))
 
 
 def same_frame(a: Boxes, b: Boxes, *, reach_m: bool) -> tuple[Index, Index]:
@@ -158,17 +156,21 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     return View(map_T_imu @ inverse(rect_T_cam @ cam_T_velo @ velo_T_imu), P)
 
 
+def in_map(boxes: Boxes, view: View) -> tuple[Array, Array]:
+    """Centers (N, 3) and yaws (N,) of boxes in the map."""
+    pose, off = view.map_T_cam[boxes.frame], np.zeros((len(boxes), 3))
+    off[:, 1] = boxes.size_hwl_m[:, 0] / 2
+    ahead = np.column_stack([np.cos(boxes.yaw_rad), np.zeros(len(boxes)), -np.sin(boxes.yaw_rad)])
+    heading = np.einsum("nij,nj->ni", pose[:, :3, :3], ahead)
+    return apply(pose, boxes.bottom_m - off), np.arctan2(heading[:, 1], heading[:, 0])
+
+
 def to_measurements(boxes: Boxes, view: View) -> Measurements:
     """Boxes as measurements in the map; `points`, which the tracker does not read, is the row."""
     n = len(boxes)
-    center = boxes.bottom_m.copy()
-    center[:, 1] -= boxes.size_hwl_m[:, 0] / 2
-    pose = view.map_T_cam[boxes.frame]
-    ahead = np.column_stack([np.cos(boxes.yaw_rad), np.zeros(n), -np.sin(boxes.yaw_rad)])
-    heading = np.einsum("nij,nj->ni", pose[:, :3, :3], ahead)
-    sigma = SIGMA_M + SIGMA_PER_M * np.hypot(center[:, 0], center[:, 2])
+    map_center, yaw_rad = in_map(boxes, view)
+    sigma = SIGMA_M + SIGMA_PER_M * np.hypot(boxes.bottom_m[:, 0], boxes.bottom_m[:, 2])
     half_m = boxes.size_hwl_m[:, :0:-1] / 2
-    map_center = apply(pose, center)
     return Measurements(
         t_ns=boxes.frame * PERIOD_NS,
         category=np.array([CATEGORY_OF[c] for c in boxes.category.tolist()], dtype="<U16"),
@@ -182,7 +184,7 @@ def to_measurements(boxes: Boxes, view: View) -> Measurements:
         bottom_m=map_center[:, 2] - boxes.size_hwl_m[:, 0] / 2,
         top_m=map_center[:, 2] + boxes.size_hwl_m[:, 0] / 2,
         center_m=map_center,
-        yaw_rad=np.arctan2(heading[:, 1], heading[:, 0]),
+        yaw_rad=yaw_rad,
         covariance=sigma[:, None, None] ** 2 * np.eye(2),
         points=np.arange(n),
         source=np.full(n, "lidar", dtype="<U16"),
@@ -217,9 +219,8 @@ def from_map(center_m: Array, size_m: Array, yaw_rad: Array, frame: NDArray[np.i
 
 def project(boxes: Boxes, P: Array) -> Array:
     """Image boxes (N, 4) around 3D boxes, cut at the border; NaN where less than half lies inside or a corner is too near."""
-    center = boxes.bottom_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    center[:, 2] += boxes.size_hwl_m[:, 0] / 2
-    corners = box_corners(center, boxes.size_hwl_m[:, ::-1], -boxes.yaw_rad)  # on axes x right, z forward, y up
+    box = upright(boxes)
+    corners = box_corners(box[:, :3], box[:, 3:6], box[:, 6])
     xyz = np.stack([corners[..., 0], -corners[..., 2], corners[..., 1], np.ones(corners.shape[:2])], axis=-1)
     uvw = xyz @ P.T
     ahead = (uvw[..., 2] > NEAR_M).all(axis=1)
