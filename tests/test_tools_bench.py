@@ -100,7 +100,11 @@ def test_a_logistic_regression_has_the_weights_of_a_minimizer() -> None:
     assert logistic_regression(x[:0], right[:0], precision, prior).tolist() == prior
 
 
-def test_pairs_of_labels_that_late_fusion_is_fitted_to_are_right(tmp_path: Path) -> None:
+def test_pairs_of_labels_that_late_fusion_is_fitted_to_are_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On several cores, too, whose processes would keep their pairs to themselves."""
+    monkeypatch.setattr("log2sim.pipeline.default_jobs", lambda: 2)
     scene = tmp_path / "tiny.toml"
     scene.write_text(tiny_toml(), encoding="utf-8")
     x, right = late_fusion.pairs_of(scene, "labels", "lidar:labels", 1)

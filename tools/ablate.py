@@ -1,10 +1,10 @@
 """Switch off every rule, option and constant of the method, one at a time, and measure what becomes of the results.
 
-    python tools/ablate.py LOG|SCENE.toml ... --out FILE.jsonl [--stages tracking,agents] [--idle] [--off] [--workers 8] [--detector labels]
+    python tools/ablate.py LOG|SCENE.toml ... --out FILE.jsonl [--stages tracking,agents] [--idle] [--workers 8] [--detector labels]
     python tools/ablate.py --out FILE.jsonl           # tables of what was measured so far
 
-Constants are numbers, or tables of numbers, that modules assign to names in capitals, and numeric settings: each is taken 0.7
-and 1.3 times, and at the value that switches it off (0, infinite for an upper limit). Options are the other choices of settings.
+Constants are numbers, or tables of numbers, that modules assign to names in capitals, and numeric settings: each is taken at the
+value that switches it off (0, infinite for an upper limit). Options are the other choices of settings.
 Rules are functions that are replaced by their neutral result: one that returns what it gets (`Track -> Track`) hands it on, one
 that answers yes or no always says no, and always yes, one that may find nothing (`X | None`) finds nothing, and one that returns a list an
 empty one. Each variation runs in a process of its own; stages before the one that it belongs to are computed once. The noise of a figure
@@ -28,11 +28,13 @@ import signal
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Annotated, Any, Literal, get_args, get_origin
+from unittest.mock import patch
 
 import numpy as np
 import typer
@@ -72,10 +74,6 @@ FIGURES = {
 }  # fmt: skip
 NOISE_SIGMAS, SEEDS = 2.0, 3  # further runs of each log measure its noise
 FAILURE = -100.0
-UNITS = {
-    "M": "m", "S": "s", "MPS": "m/s", "MPS2": "m/s2", "MPS3": "m/s3", "PX": "px", "RAD": "rad", "DEG": "deg", "HZ": "Hz",
-    "NS": "ns", "1PM": "1/m", "M2": "m2", "SIGMAS": "sigma",
-}  # fmt: skip
 UPPER_LIMIT = re.compile(r"(^|_)(MAX|LIMIT|GATE|LONGEST|LARGEST|FARTHEST|UNTIL)(_|$)")
 # Types that are handed on by arithmetic and not by rules.
 PLAIN = re.compile(r"^(Array|Mask|float|int|str|NDArray.*|np\..*|Any|None|bytes|Path)$")
@@ -100,11 +98,6 @@ class Variation:
         """Short name for tables."""
         return ".".join(p for p in (self.module.removeprefix("log2sim."), self.name, self.column) if p)
 
-    @property
-    def unit(self) -> str:
-        """Unit, read off the end of the name; empty for counts and shares."""
-        return UNITS.get((self.column or self.name).upper().rsplit("_", 1)[-1], "")
-
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -122,18 +115,14 @@ WORK: list[Any] = []
 
 def main(
     logs: Annotated[list[str] | None, typer.Argument(metavar="LOG|SCENE.toml")] = None, out: Path = Path("ablation.jsonl"),
-    stages: str = ",".join(STAGES), idle: bool = False, off: bool = False, workers: int | None = None, detector: str = "labels",
+    stages: str = ",".join(STAGES), idle: bool = False, workers: int | None = None, detector: str = "labels",
 ) -> None:  # fmt: skip
-    """Measure what is missing in the file, with `idle` only of what changes nothing beyond noise so far, and print its tables.
-
-    With `off`, numbers are not scaled but only switched off.
-    """
+    """Measure what is missing in the file, with `idle` only of what changes nothing beyond noise so far, and print its tables."""
     rows = rows_of(out)
     if logs:
         config = Config.load(detect={"name": detector})
         matter, done = matters(rows) if idle else set(), {(r["case"], r["label"], r["change"]) for r in rows}
         chosen = [v for v in variations(config) if v.stage in stages.split(",") and v.label not in matter]
-        chosen = [v for v in chosen if not (off and v.change in ("x0.7", "x1.3"))]
         seeds = [Variation("localization", "", "seed", str(k), k) for k in range(SEEDS + 1)]
         cases = [recorded(case_of(name, detector), config) for name in logs]
         tasks = [(c, v) for v in (*seeds, *chosen) for c in cases if (c.name, v.label, v.change) not in done]
@@ -145,7 +134,7 @@ def main(
         ):
             for index, figures, outcome in pool.imap_unordered(run_one, range(len(tasks))):
                 case, v = tasks[index]
-                row = {"case": case.name, "label": v.label, "change": v.change, "stage": v.stage, "unit": v.unit}
+                row = {"case": case.name, "label": v.label, "change": v.change, "stage": v.stage}
                 rows.append({**row, "value": short(v.before), "figures": figures, "outcome": outcome})
                 print(json.dumps(rows[-1]), file=file, flush=True)
     print(tables(rows))
@@ -208,20 +197,16 @@ def place_of(name: str) -> tuple[Any, str]:
 
 def recorded(case: Case, config: Config) -> Case:
     """The case with what the stages return in it."""
-    usual = {name: getattr(*place_of(name)) for functions, _, _ in STAGES.values() for name in functions}
 
-    def recording(name: str) -> Any:
-        def call(*arguments: Any, **named: Any) -> Any:
-            case.recorded.setdefault(name, []).append(out := usual[name](*arguments, **named))
-            return out
+    def recording(name: str, usual: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        case.recorded.setdefault(name, []).append(out := usual(*arguments, **named))
+        return out
 
-        return call
-
-    for name in usual:
-        setattr(*place_of(name), recording(name))
-    pipeline.reconstruct(case.log, config, cache=False)
-    for name, function in usual.items():
-        setattr(*place_of(name), function)
+    with ExitStack() as patches:
+        for name in (name for functions, _, _ in STAGES.values() for name in functions):
+            place = place_of(name)
+            patches.enter_context(patch.object(*place, partial(recording, name, getattr(*place))))
+        pipeline.reconstruct(case.log, config, cache=False)
     return case
 
 
@@ -287,7 +272,7 @@ def variations(config: Config) -> Iterator[Variation]:
     """Everything that can be changed."""
     for module in method_modules():
         stage = stage_of(module.__name__)
-        yield from (v for c in constants_in(module, stage) for v in scalings(c))
+        yield from map(switched_off, constants_in(module, stage))
         yield from rules_in(module, stage)
     yield from settings(config)
 
@@ -329,25 +314,14 @@ def numbers_in(value: Any) -> Iterator[float]:
         yield float(value)
 
 
-def scalings(constant: Variation) -> Iterator[Variation]:
-    """A constant 0.7 and 1.3 times as large, and off."""
+def switched_off(constant: Variation) -> Variation:
+    """A constant that takes no effect."""
     upper = UPPER_LIMIT.search((constant.column or constant.name).upper())
-    for change, factor in (("x0.7", 0.7), ("x1.3", 1.3), ("off", None)):
 
-        def number(v: float, factor: float | None = factor) -> float:
-            if factor is not None:
-                return scaled(v, factor, share=not constant.unit)
-            return type(v)((10**6 if isinstance(v, int) else math.inf) if upper else 0)
+    def number(v: float) -> float:
+        return type(v)((10**6 if isinstance(v, int) else math.inf) if upper else 0)
 
-        yield replace(constant, change=change, value=mapped(constant.value, number, constant.column))
-
-
-def scaled(value: float, factor: float, *, share: bool = False) -> float:
-    """A number times a factor; a whole one changes by one at least, and a `share` below one stays so, at most half as far from one."""
-    if isinstance(value, int):
-        step = 1 if factor > 1 else -1
-        return value + step * max(abs(round(value * factor) - value), 1) if value else value
-    return min(value * factor, (1 + value) / 2 if share and 0 < value < 1 else math.inf)
+    return replace(constant, change="off", value=mapped(constant.value, number, constant.column))
 
 
 def mapped(value: Any, number: Callable[[float], float], column: str = "") -> Any:
@@ -387,7 +361,7 @@ def rules_in(module: ModuleType, stage: str) -> Iterator[Variation]:
 
 
 def settings(config: Config) -> Iterator[Variation]:
-    """Other choices of options, and numbers scaled and off."""
+    """Other choices of options, and numbers switched off."""
     stages = {section: stage for stage, (_, _, sections) in STAGES.items() for section in sections.split()}
     for section, model in config:
         for key, info in type(model).model_fields.items() if isinstance(model, Section) else ():
@@ -398,7 +372,7 @@ def settings(config: Config) -> Iterator[Variation]:
             elif get_origin(info.annotation) is Literal:
                 yield from (replace(made, change=c, value=c) for c in get_args(info.annotation) if c != value)
             elif isinstance(value, (int, float)) and value:
-                yield from scalings(made)
+                yield switched_off(made)
 
 
 class Imports:
@@ -482,13 +456,11 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
             if all(text == "same" for _, text in told.values()):
                 idle.append(label)
                 continue
-            others = "; ".join(f"{c}: {t}" for c, (_, t) in told.items() if c not in ("x0.7", "x1.3", "off"))
-            cells = [told[c][1] if c in told else "" for c in ("x0.7", "x1.3", "off")]
-            lines.append((score, [label, one["unit"], one["value"], *cells, others]))
+            off = told.pop("off", (0.0, ""))[1]
+            others = "; ".join(f"{change}: {text}" for change, (_, text) in told.items())
+            lines.append((score, [label, one["value"], off, others]))
         if lines or idle:
-            table = markdown(
-                ["name", "unit", "value", "-30 %", "+30 %", "off", "other"], [row for _, row in sorted(lines)]
-            )
+            table = markdown(["name", "value", "off", "other"], [row for _, row in sorted(lines)])
             out.append(f"## {stage}\n\n{table}\n\nThe same scenarios without: {', '.join(idle) or 'none'}.")
     return "\n\n".join(out)
 

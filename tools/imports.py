@@ -1,8 +1,8 @@
-"""Print how the package holds together: rooms, imports between them, import cycles, long signatures and lines.
+"""Print how the package holds together: rooms, imports between them and import cycles.
 
 A room is a folder or a module directly below `log2sim`. Imports within functions count like all others.
 
-Usage: python tools/imports.py [CHECKOUT] [--edges]
+Usage: python tools/imports.py [--edges]
 """
 
 from __future__ import annotations
@@ -10,42 +10,30 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from entry import SAMPLES, run
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-MAX_PARAMETERS = 5
 Graph = Mapping[str, set[str]]
 
 
-def main(checkout: Annotated[Path, typer.Argument()] = SAMPLES.parent, edges: bool = False) -> None:
-    """Print the figures of a checkout, with `edges` also every import between rooms and every long signature."""
-    modules = module_graph(checkout / "log2sim")
+def main(edges: bool = False) -> None:
+    """Print the figures of the package, with `edges` also every import between rooms."""
+    modules = module_graph(SAMPLES.parent / "log2sim")
     rooms = room_graph(modules)
-    signatures = sorted(long_signatures(checkout / "log2sim"))
+    apart = sum(room_of(m) != room_of(t) for m in modules for t in modules[m])
     print(f"rooms                                     {len(rooms)}")
     print(f"imports between rooms (room -> room)      {sum(map(len, rooms.values()))}")
-    print(
-        f"imports between modules of two rooms      {sum(room_of(m) != room_of(t) for m in modules for t in modules[m])}"
-    )
+    print(f"imports between modules of two rooms      {apart}")
     print(f"import cycles of modules                  {len(cycles(modules))}")
     print(f"import cycles of rooms                    {len(cycles(rooms))}")
-    print(f"functions with more than {MAX_PARAMETERS} parameters     {len(signatures)}")
-    for folder in ("log2sim", "tests", "tools"):
-        files = sorted((checkout / folder).rglob("*.py"))
-        lines = sum(len(f.read_text(encoding="utf-8").splitlines()) for f in files)
-        print(f"{folder:<10}{len(files):>4} modules {lines:>7} lines")
     if edges:
         for room, targets in rooms.items():
             print(f"{room}: {', '.join(sorted(targets))}")
         for group in (*cycles(modules), *cycles(rooms)):
             print(f"cycle: {', '.join(sorted(group))}")
-        for signature in signatures:
-            print(signature)
 
 
 def module_graph(package: Path) -> dict[str, set[str]]:
@@ -100,17 +88,6 @@ def cycles(graph: Graph) -> list[set[str]]:
     group = connected_components(matrix, connection="strong")[1]
     groups = [{names[k] for k in np.flatnonzero(group == g)} for g in range(group.max(initial=-1) + 1)]
     return [nodes for nodes in groups if len(nodes) > 1]
-
-
-def long_signatures(package: Path) -> Iterator[str]:
-    """Functions with more parameters than `MAX_PARAMETERS`, `self` and `cls` apart, as "module:line name (count)"."""
-    for file in sorted(package.rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.FunctionDef):
-                names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-                count = len([n for n in names if n not in ("self", "cls")])
-                if count > MAX_PARAMETERS:
-                    yield f"{_name(file, package)}:{node.lineno} {node.name} ({count})"
 
 
 if __name__ == "__main__":

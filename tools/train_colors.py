@@ -20,10 +20,12 @@ from entry import run
 from lidar_training import fitting
 from lidar_training.export import describe, export_checked
 from lidar_training.fitting import FitPlan, draw_once
+from lidar_training.network import conv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from log2sim.datatypes import COLOR_NAMES
+from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.road.colors import LAB_SCALE, METADATA_KEY, SIDE_PX, ColorNetwork, open_color_network
 
 WORLDS, STEPS, BATCH, RATE = 20_000, 4_500, 64, 3e-3
@@ -52,19 +54,9 @@ class Names(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-
-        def layer(inner: int, outer: int, size: int, stride: int = 1) -> nn.Sequential:
-            conv = nn.Conv2d(inner, outer, size, stride, size // 2, bias=False)
-            return nn.Sequential(conv, nn.BatchNorm2d(outer), nn.ReLU())
-
         self.body = nn.Sequential(
-            layer(3, 24, 3, 2),
-            layer(24, 24, 1),
-            layer(24, 40, 3, 2),
-            layer(40, 40, 1),
-            layer(40, 52, 3, 2),
-            layer(52, 52, 3),
-        )
+            conv(3, 24, stride=2), conv(24, 24, 1), conv(24, 40, stride=2), conv(40, 40, 1), conv(40, 52, stride=2), conv(52, 52)
+        )  # fmt: skip
         self.where = nn.Conv2d(52, 1, 1)
         self.mixed = nn.Conv2d(3 * 52, 64, 1)
         self.head = nn.Conv2d(64, len(COLOR_NAMES) + 3, 1)
@@ -130,13 +122,11 @@ def report(network: ColorNetwork, path: Path) -> dict[str, object]:
     joined = np.array([network.decide(network.raw(list(track)))[1] for track in data["picture"]])
     rank = (single > np.take_along_axis(single, data["name"][:, None], 1)).sum(axis=1)
     sure, right = single.max(axis=1), rank == 0
-    bins = np.minimum((sure * 10).astype(int), 9)
-    gap = sum(abs(right[bins == b].mean() - sure[bins == b].mean()) * (bins == b).mean() for b in np.unique(bins))
     return {
         "pictures": len(rank), "top1": share(right), "top2": share(rank < 2),
         "top1_by_light": {str(k): share(right[data["light"] == k]) for k in np.unique(data["light"])},
         "top1_by_name": {k: share(right[data["name"] == i]) for i, k in enumerate(COLOR_NAMES)},
-        f"top1_of_{VIEWS}_views": share(joined.argmax(axis=1) == data["name"]), "calibration_error": round(float(gap), 4),
+        f"top1_of_{VIEWS}_views": share(joined.argmax(axis=1) == data["name"]), "calibration_error": round(reliability(sure, right)["expected_calibration_error"], 4),
     }  # fmt: skip
 
 

@@ -18,8 +18,7 @@ walls, and are means with what they went on from:
 Those of `roadside` went on likewise, not averaged: 3,000 scenes and 9,000 steps (seed 3), 3,000 and 6,000 (seed 4), 5,000 and 10,000 (seed 13).
 
 --data, of which every n-th sweep is taken, may be given several times; --only does one of generate, fit and finish; --seed holds with --scenes or
---steps; --bfloat16 takes a third less time where the processor has it; the weights are averaged with those of --blend, which count --share; scores
-are calibrated and tested with so many --examples.
+--steps; the weights are averaged with those of --blend, which count --share; scores are calibrated and tested with so many --examples.
 """
 
 from __future__ import annotations
@@ -48,13 +47,14 @@ from lidar_training.clouds import (
     draw_example,
     draw_sample,
     grid_of,
+    sample_of,
     window_of,
     write_shard,
 )
 from lidar_training.export import calibrate, describe, description, export_onnx, import_onnx, report
 from lidar_training.fitting import FitPlan
 from lidar_training.network import BevNetwork, loss_of, targets_of
-from lidar_training.real_logs import example_of, read_sweeps, sample_of
+from lidar_training.real_logs import example_of, read_sweeps
 from torch import Tensor, nn
 
 from log2sim.batch.discovery import find_logs
@@ -126,7 +126,7 @@ def read_own(folders: Sequence[Path], out: Path, every: int) -> tuple[list[Path]
         held_out += [example_of(sweep) for sweep in sweeps[first_held:]]
         paths.append(out / f"own-{hashlib.sha256(f'{log.digest} {every}'.encode()).hexdigest()[:16]}.npz")
         if not paths[-1].exists():
-            write_shard(paths[-1], [sample_of(sweep) for sweep in sweeps[:first_held]])
+            write_shard(paths[-1], [sample_of(example_of(sweep)) for sweep in sweeps[:first_held]])
             print(f"{found.id}: {first_held} sweeps to train on, {len(sweeps) - first_held} held out", flush=True)
     if not paths:
         raise LogError(f"{', '.join(map(str, folders))}: no log with labeled sweeps")
@@ -205,7 +205,6 @@ def fit(
     own: Sequence[Path] = (),
     *,
     start: Path | None = None,
-    bfloat16: bool = False,
     generator: Popen[bytes] | None = None,
 ) -> None:
     """Train the last of some rounds, or go on from its checkpoint in `out`; the earlier ones are complete.
@@ -228,9 +227,7 @@ def fit(
     def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         pool.prepare(step)
         grid, targets = batch_of(pool, mount, rng)
-        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            maps = network(grid.to(memory_format=torch.channels_last))
-        return loss_of(maps.float(), targets, grid)
+        return loss_of(network(grid.to(memory_format=torch.channels_last)), targets, grid)
 
     plan = FitPlan(this.steps, this.seed, this.rate, checkpoint_path(out, number), WARM_UP_STEPS)
     fitting.fit(network, step_loss, plan)
@@ -276,7 +273,7 @@ def finish(
 
 def main(
     mount: Mount, out: Path, data: list[Path] = [], scenes: int | None = None, steps: int | None = None, seed: int = 1, every: int = 1,
-    only: str = "", start: Path | None = None, bfloat16: bool = False, examples: int = 150, blend: Path | None = None, share: float = 0.5,
+    only: str = "", start: Path | None = None, examples: int = 150, blend: Path | None = None, share: float = 0.5,
 ) -> None:  # fmt: skip
     """Run the steps that are asked for."""
     out.mkdir(parents=True, exist_ok=True)
@@ -296,7 +293,7 @@ def main(
     generator = None if only else Popen([sys.executable, *sys.argv, "--only", "generate"])
     try:
         for number in range(1, len(rounds) + 1) if only in ("", "fit") else ():
-            fit(mount, shards, out, rounds[:number], own, start=start, bfloat16=bfloat16, generator=generator)
+            fit(mount, shards, out, rounds[:number], own, start=start, generator=generator)
     finally:
         if generator is not None:
             generator.terminate()

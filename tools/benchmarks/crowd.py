@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from kitti.boxes import Boxes, View
+from kitti.boxes import EGO_R_CAM, Boxes, View
 from kitti.choice import choose
 from kitti.scoring import evaluate
 
@@ -20,15 +20,15 @@ from log2sim.geometry import transform
 
 FOCAL_PX, HEIGHT_M, PERIOD_S = 721.5, 1.65, 0.1
 P = np.array([[FOCAL_PX, 0.0, 609.6, 0.0], [0.0, FOCAL_PX, 172.9, 0.0], [0.0, 0.0, 1.0, 0.0]])
-EGO_R_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+PEOPLE = (6, 18, 40, 80)  # in the square
 DEPTH_M, HALF_WIDTH_M = (6.0, 36.0), 12.0
 MISSED, FALSE_A_FRAME, HIDDEN_SHARE = 0.1, 0.5, 0.5
 
 
-def main(people: list[int] | None = None, frames: int = 200, seeds: int = 3, online: bool = False) -> None:
-    """Print the figures of each density; `people` in the square, 6, 18, 40 and 80 by default."""
+def main(frames: int = 200, seeds: int = 3, online: bool = False) -> None:
+    """Print the figures of each density."""
     rows = []
-    for count in people or [6, 18, 40, 80]:
+    for count in PEOPLE:
         for speed_mps in (0.0, 2.0):
             found, labels, seconds = {}, {}, 0.0
             for seed in range(seeds):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,7 @@ def limit(stream: Stream, noise_px: float, rows: Array | None = None) -> Array:
     return np.asarray(np.linalg.inv(np.append(best * scale, 1.0).reshape(3, 3)))
 
 
+SEEDS, REPEATS = 5, 7  # streams of a case, and runs of each that are timed
 RIGHT = np.diag([1.0, -1.0, 1.0])
 THRESHOLDS_PX = (4.0, 8.0, 16.0)
 Peer = Callable[[Array, Array, float], Array | None]
@@ -223,36 +224,34 @@ def ours(stream: Stream, method: str, repeats: int, **options: Any) -> tuple[Arr
     return each, seconds
 
 
-def measure(case: Case, seeds: int, repeats: int, thresholds: dict[str, tuple[float, float]]) -> dict[str, Array]:
+def measure(case: Case) -> dict[str, Array]:
     """Seconds a tick and scores (4,) of all methods on one case, medians over streams."""
     out: dict[str, list[tuple[float, ...]]] = {}
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         stream = make_stream(case, seed)
-        for name, (found, seconds) in answers(stream, case, repeats, thresholds).items():
+        for name, (found, seconds) in answers(stream, case).items():
             out.setdefault(name, []).append((seconds / len(stream.image_H_ground), *scores_of(found, stream)))
     return {name: np.median(rows, axis=0) for name, rows in out.items()}
 
 
-def answers(
-    stream: Stream, case: Case, repeats: int, thresholds: dict[str, tuple[float, float]]
-) -> dict[str, tuple[Array, float]]:
+def answers(stream: Stream, case: Case) -> dict[str, tuple[Array, float]]:
     """What each method makes of one stream: `ground_H_image` of each tick (T, 3, 3), and seconds."""
     each = [stream.tick == t for t in range(case.ticks)]
     out = {
-        "log2sim time-aware": ours(stream, "time-aware", repeats),
-        "log2sim calibrated": ours(stream, "calibrated", repeats, K=K),
+        "log2sim time-aware": ours(stream, "time-aware", REPEATS),
+        "log2sim calibrated": ours(stream, "calibrated", REPEATS, K=K),
     }
     if case.nod_deg:
-        out["log2sim time-aware, per tick"] = ours(stream, "time-aware", repeats, pitch_roll=True)
-        out["log2sim calibrated, per tick"] = ours(stream, "calibrated", repeats, pitch_roll=True, K=K)
+        out["log2sim time-aware, per tick"] = ours(stream, "time-aware", REPEATS, pitch_roll=True)
+        out["log2sim calibrated, per tick"] = ours(stream, "calibrated", REPEATS, pitch_roll=True, K=K)
     out["log2sim min-frame"] = ours(stream, "min-frame", 1)
     out["log2sim per-frame"] = ours(stream, "per-frame", 1)
     out["log2sim straw-man"] = ours(stream, "straw-man", 1)
     for name, (peer, _) in peers().items():
-        single, pooled = (partial(asked, peer, threshold) for threshold in thresholds[name])
+        single, pooled = (partial(asked, peer, threshold) for threshold in best_thresholds()[name])
         out[f"{name}, each frame"] = timed(partial(by_frames, single, stream, each), 1)
         if name != "scikit-image ransac":  # minutes: its full SVD grows with the square of the correspondences
-            found, seconds = timed(partial(pooled, stream.xy, stream.uv), repeats)
+            found, seconds = timed(partial(pooled, stream.xy, stream.uv), REPEATS)
             out[f"{name}, pooled"] = np.repeat(found[None], case.ticks, axis=0), seconds
     most_likely = limit(stream, case.noise_px)
     out["limit of each frame"] = np.array([limit(stream, case.noise_px, rows=r) for r in each]), float("nan")
@@ -265,6 +264,7 @@ def by_frames(method: Callable[[Array, Array], Array], stream: Stream, each: lis
     return np.array([method(stream.xy[rows], stream.uv[rows]) for rows in each])
 
 
+@cache
 def best_thresholds() -> dict[str, tuple[float, float]]:
     """Each peer's best threshold, for frames and pooled, on a stream that is not in the tables: 1 px, 30 % outliers."""
     stream, out = make_stream(Case(), 999), {}
@@ -286,9 +286,9 @@ def best_thresholds() -> dict[str, tuple[float, float]]:
     return out
 
 
-def table(cases: dict[str, Case], seeds: int, repeats: int, thresholds: dict[str, tuple[float, float]]) -> str:
+def table(cases: dict[str, Case]) -> str:
     """Near and far error of all methods by case; time and jitter of the second case, or the only one."""
-    scores = {name: measure(case, seeds, repeats, thresholds) for name, case in cases.items()}
+    scores = {name: measure(case) for name, case in cases.items()}
     timed_case = list(cases)[min(1, len(cases) - 1)]
     rows = []
     for method, (seconds, _, _, jitter) in scores[timed_case].items():
@@ -298,35 +298,29 @@ def table(cases: dict[str, Case], seeds: int, repeats: int, thresholds: dict[str
     return markdown(["method", f"ms a frame ({timed_case})", f"jitter far, m ({timed_case})", *cases], rows)
 
 
-def sections(*, quick: bool) -> tuple[str, str]:
-    """Title and tables."""
+def tables() -> str:
+    """All tables."""
     import cv2
 
     cv2.setNumThreads(1)
     warnings.simplefilter("ignore")
-    seeds, repeats = (1, 3) if quick else (5, 7)
-    thresholds = best_thresholds()
     fixed = {f"{n:g} px, {o:.0%}": Case(n, o) for o in (0.3, 0.6) for n in (0.5, 1.0, 2.0)}
     few = {f"{n:g} px, {o:.0%}": Case(n, o, cars=3) for o in (0.3, 0.6) for n in (0.5, 1.0, 2.0)}
     nodding = {f"{n:g} px, 20 corr.": Case(n, 0.3, nod_deg=0.1) for n in (0.5, 1.0, 2.0)}
     nodding["1 px, 6 corr."] = Case(1.0, 0.3, cars=3, nod_deg=0.1)
-    if quick:
-        fixed, few, nodding = (dict(list(d.items())[:2]) for d in (fixed, few, nodding))
-    parts = [
+    return "\n\n".join([
         "Box feet on flat ground, camera 2.1 m high, f 2050 px, 40 frames, 5 cm noise on the ground; half of the outliers"
         " have another car's ground position, half a foot 20-150 px too high. Errors in m, near (6-25 m) / far (30-60 m),"
-        f" medians over {seeds} streams. Every peer has its best of the thresholds 4, 8 and 16 px and ground with y to the"
+        f" medians over {SEEDS} streams. Every peer has its best of the thresholds 4, 8 and 16 px and ground with y to the"
         " right; log2sim runs with its defaults and is not told the noise. The limits are the most likely homographies of"
         ' the true inliers with known noise, by eight parameters. "fails": no answer, or off by more than 99 m, for half of'
         " the probes; log2sim refuses what four to six correspondences of a frame do not determine.",
-        f"### Fixed camera, 20 correspondences a frame\n\n{table(fixed, seeds, repeats, thresholds)}",
-        f"### Fixed camera, 6 correspondences a frame\n\n{table(few, seeds, repeats, thresholds)}",
-        "### Camera that pitches and rolls by 0.1 degree from frame to frame, 30 % outliers\n\n"
-        f"{table(nodding, seeds, repeats, thresholds)}",
-    ]
-    return "Homography", "\n\n".join(parts)
+        f"### Fixed camera, 20 correspondences a frame\n\n{table(fixed)}",
+        f"### Fixed camera, 6 correspondences a frame\n\n{table(few)}",
+        f"### Camera that pitches and rolls by 0.1 degree from frame to frame, 30 % outliers\n\n{table(nodding)}",
+    ])  # fmt: skip
 
 
-def main(quick: bool = False, write: Path | None = None) -> None:
-    """With fewer repeats, to see that everything runs; `write` puts the tables between their markers in a file."""
-    print_section("homography", sections, quick, write)
+def main(write: Path | None = None) -> None:
+    """Print the tables; `write` puts them between their markers in a file."""
+    print_section("homography", tables, write)

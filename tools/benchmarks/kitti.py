@@ -44,7 +44,7 @@ from log2sim.geometry import Array
 CATEGORIES = ("Car", "Pedestrian", "Cyclist")
 HEAD = ["class", "sAMOTA", "AMOTA", "AMOTP", "MOTA", "MOTP", "HOTA", "IDS", "FRAG", "FP", "FN"]
 LEARNED = ("0000", "0002", "0004", "0005", "0007", "0009", "0011")
-FEATURES = {True: ("score", "near_score", "near_share", "hidden", "height"), False: ("near_score", "near_share")}
+FEATURES = {True: ("score", "near_score", "near_share", "height"), False: ("near_score", "near_share")}
 # Standard deviation of the weights beforehand is 1.
 PENALTY, CONSTANT_PENALTY = 1.0, 0.01
 
@@ -116,7 +116,7 @@ def weights_of(
     rows, truth = [], []
     for name in names:
         d, on_label = described[name], labeled(described[name].boxes, labels[name], "Car")
-        wanted = (d.boxes.category == "Car") & np.isfinite(on_label) & (d.seen == seen) & (seen | ~d.doubled)
+        wanted = (d.boxes.category == "Car") & np.isfinite(on_label) & (d.seen == seen)
         columns = [np.ones(len(d.boxes)), *(d.features[feature] for feature in FEATURES[seen])]
         rows.append(np.column_stack(columns)[wanted])
         truth.append(on_label[wanted])

@@ -17,14 +17,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from kitti.boxes import EGO_R_CAM
 
 from log2sim.geometry import Camera, apply
 from log2sim.road.lane_picture import PictureMarkings, find_markings_in_picture
 
 WITHIN_PX = 20
 DRAWN_PX = 5
-# OpenLane's cameras look along z in their annotations' frame x forward, y left, z up.
-FORWARD_R_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 CURBS = (20, 21)  # left and right, of OpenLane's categories
 MATCH_M = 1.5
 SPANS_M = ((0.0, 40.0), (40.0, 80.0))
@@ -73,9 +72,9 @@ def openlane(folder: Path) -> Iterator[Picture]:
 
 
 def openlane_camera(document: dict, shape: tuple[int, ...]) -> Camera:
-    """Make the camera of an annotation, whose extrinsic is the pose of the frame x forward, y left, z up."""
+    """Make the camera of an annotation, whose extrinsic is the pose of the frame x forward, y left, z up; it looks along z."""
     pose = np.array(document["extrinsic"], np.float64)
-    pose[:3, :3] = pose[:3, :3] @ FORWARD_R_CAM
+    pose[:3, :3] = pose[:3, :3] @ EGO_R_CAM
     return Camera("picture", shape[1], shape[0], np.array(document["intrinsic"], np.float64), "ego", pose)
 
 
@@ -83,7 +82,7 @@ def lateral_errors(document: dict, camera: Camera, found: PictureMarkings) -> li
     """Median lateral errors of lines by how far ahead they are."""
     rows = []
     vehicle_T_forward = camera.mount_T_cam.copy()
-    vehicle_T_forward[:3, :3] = camera.mount_T_cam[:3, :3] @ FORWARD_R_CAM.T
+    vehicle_T_forward[:3, :3] = camera.mount_T_cam[:3, :3] @ EGO_R_CAM.T
     for line in document["lane_lines"]:
         visible = np.array(line["visibility"]) > 0
         points = apply(vehicle_T_forward, np.array(line["xyz"], np.float64).T[visible])

@@ -61,7 +61,7 @@ def simulated_clouds(mount: Mount, lidar: str) -> list[tuple[Cloud, float]]:
         rng = np.random.default_rng([11, k])
         scene = draw_scene(mount, rng, lidar=LIDAR_MODELS[lidar])
         points, sensor = labeled_cloud(scene, rng).xyz_m, scene.sensor.position_m
-        out.append((level(points, sensor), fastest_ms(lambda points=points, sensor=sensor: level(points, sensor))))
+        out.append((level(points, sensor)[0], fastest_ms(lambda points=points, sensor=sensor: level(points, sensor))))
     return out
 
 

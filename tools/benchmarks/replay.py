@@ -26,11 +26,11 @@ COUNTS, MODELS, SPEED_DT_S, DRIVE_S, LOG_S = (1, 10, 100, 1000), ("auto", "dynam
 SPEED_HEAD = ["model", "agents", "us a step", "agents x steps a second", "times real time", "s before", "s after", "whole replay"]  # fmt: skip
 
 
-def main(scenarios: list[Path], most: int = COUNTS[-1]) -> None:
-    """Print both tables; speed with `most` agents at most."""
+def main(scenarios: list[Path]) -> None:
+    """Print both tables."""
     head = ["scenario", "dt ms", "followers", *(key.replace("_", " ") for key in LIMITS), "agents beyond a limit"]
     print(markdown(head, [tracking_row(path, dt_s) for path in scenarios for dt_s in STEPS_S]))
-    rows = [speed_row(count, model) for model in MODELS for count in COUNTS if count <= most]
+    rows = [speed_row(count, model) for model in MODELS for count in COUNTS]
     print(f"\n{markdown(SPEED_HEAD, rows)}")
 
 

@@ -53,14 +53,14 @@ def replace_section(path: Path, name: str, text: str) -> None:
     path.write_text(old[: old.index(begin)] + f"{begin}\n{text}\n" + old[old.index(end) :], encoding="utf-8")
 
 
-def print_section(name: str, sections: Callable[..., tuple[str, str]], quick: bool, write: Path | None) -> None:
-    """Print what `sections(quick=...)` returns, a title and tables, with the versions of what was compared; put it into a file, too."""
+def print_section(name: str, tables: Callable[[], str], write: Path | None) -> None:
+    """Print tables with the versions of what was compared; put them into a file, too."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         print("OPENBLAS_NUM_THREADS is not 1: times will swing", file=sys.stderr)
-    title, body = sections(quick=quick)
-    command = f"OPENBLAS_NUM_THREADS=1 python tools/bench.py {name}{' --quick' if quick else ''} --write BENCHMARKS.md"
+    command = f"OPENBLAS_NUM_THREADS=1 python tools/bench.py {name} --write BENCHMARKS.md"
+    body = tables()
     versions = ", ".join(f"{peer} {_version(peer)}" for peer in PEERS)
-    text = f"## {title}\n\n`{command}`\n\n{body}\n\nPython {platform.python_version()}, {versions}."
+    text = f"## {name.capitalize()}\n\n`{command}`\n\n{body}\n\nPython {platform.python_version()}, {versions}."
     print(text)
     if write:
         replace_section(write, name, text)

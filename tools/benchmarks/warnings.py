@@ -14,11 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from kitti.boxes import Boxes, read_tracks, read_view
+from kitti.boxes import Boxes, View, in_map, read_tracks, read_view
 
 from log2sim.datatypes import EGO, Agent, EgoVehicle, Scenario, Waypoints
 from log2sim.evaluation.metrics.truth import is_static, speed_along, truth_from_log
-from log2sim.geometry import NS_PER_S, apply, wrap_angle, yaw_of
+from log2sim.geometry import NS_PER_S, wrap_angle, yaw_of
 from log2sim.logs.kitti.labels import CATEGORY_OF
 from log2sim.logs.opening import open_log
 from log2sim.simulation.runner import replay
@@ -89,19 +89,16 @@ def kitti_tracking(folder: Path) -> Iterator[tuple[str, Scenario]]:
         rows = rows.take(np.isin(rows.category, list(CATEGORY_OF)) & (rows.frame < frames))
         kind = np.array([CATEGORY_OF[name] for name in rows.category.tolist()])
         agents = [
-            _labeled(f"{of}-{number}", of, rows.take((rows.track_id == number) & (kind == of)), view.map_T_cam)
+            _labeled(f"{of}-{number}", of, rows.take((rows.track_id == number) & (kind == of)), view)
             for number, of in dict.fromkeys(zip(rows.track_id.tolist(), kind.tolist()))
         ]
         yield labels.stem, Scenario(labels.stem, 0, frames * PERIOD_S, (_kitti_ego(view.map_T_cam), *agents))
 
 
-def _labeled(name: str, kind: str, rows: Boxes, map_T_cam: np.ndarray) -> Agent:
+def _labeled(name: str, kind: str, rows: Boxes, view: View) -> Agent:
     """An agent from its labels."""
-    pose, height, turn = map_T_cam[rows.frame], rows.size_hwl_m[:, 0], rows.yaw_rad
-    center = apply(pose, rows.bottom_m - np.column_stack([0 * height, height / 2, 0 * height]))
-    ahead = np.einsum("nij,nj->ni", pose[:, :3, :3], np.column_stack([np.cos(turn), 0 * turn, -np.sin(turn)]))
     size = tuple(np.median(rows.size_hwl_m[:, ::-1], axis=0).tolist())
-    return _agent(name, kind, size, rows.frame * PERIOD_S, center, np.arctan2(ahead[:, 1], ahead[:, 0]))
+    return _agent(name, kind, size, rows.frame * PERIOD_S, *in_map(rows, view))
 
 
 def _kitti_ego(map_T_cam: np.ndarray) -> Agent:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF, Boxes3D, Measurements, Scenario
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar import measure
-from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, PairWeights, logit
+from log2sim.perception.lidar.measure import PAIR_WEIGHTS, Pairs, PairWeights, logit, match_boxes
 from log2sim.perception.lidar.projection import View
 from log2sim.pipeline import observe_log, start
 from log2sim.synth.scene import load_scene
@@ -36,18 +37,14 @@ def pairs_of(scene: Path, images: str, sweeps: str, seed: int) -> tuple[Array, N
     """Features (P, 4) of all pairs in a scene, and whether they are right (P,)."""
     log, truth = synthesize(load_scene(scene), seed=seed)
     found: list[tuple[Boxes3D, Measurements, Pairs]] = []
-    original = measure.match_boxes
 
     def match(boxes: Boxes3D, images: Measurements, frame: NDArray[np.intp], views: Sequence[View]) -> Pairs:
-        pairs = original(boxes, images, frame, views)
-        found.append((boxes, images, pairs))
-        return pairs
+        found.append((boxes, images, match_boxes(boxes, images, frame, views)))
+        return found[-1][2]
 
-    measure.match_boxes = match
-    try:
-        observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"])))
-    finally:
-        measure.match_boxes = original
+    with patch.object(measure, "match_boxes", match):
+        # In this process: what others match is not seen here.
+        observe_log(start(log, Config.load(settings=[f"detect.name={images}+{sweeps}"]), jobs=1))
     parts = [_features(*of_tick, truth) for of_tick in found]
     return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
 

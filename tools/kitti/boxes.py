@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import VEHICLE, Measurements, seen_from
 from log2sim.files.arrays import Columns
-from log2sim.geometry import Array, apply, box_corners, inverse, rectangle_overlap, rotation_from_quaternion, transform
+from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform, upright_box_iou
 from log2sim.logs.kitti import labels
 
 PERIOD_NS = 100_000_000
@@ -23,9 +23,6 @@ IMAGE_PX = np.array([1242.0, 375.0])
 NEAR_M = 1.0
 # Spread of the detected centers of labeled cars as a line over the range, taken twice as wide for what is partly hidden.
 SIGMA_M, SIGMA_PER_M = 0.1, 0.004
-# Boxes are looked at through a grid of so many points on each side to tell how much of them is hidden.
-GRID = 8
-NEARER_M = 1.0
 NEIGHBORS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 MAX_OCCLUSION, MAX_TRUNCATION, MIN_HEIGHT_PX = 2, 0, 25.0
 DONT_CARE_SHARE = 0.5
@@ -76,18 +73,16 @@ def read_tracks(path: Path) -> Boxes:
     )  # fmt: skip
 
 
+def upright(boxes: Boxes) -> Array:
+    """Boxes (N, 7) on axes x right, z forward, y up: center, length, width, height and yaw, which is counter-clockwise on them."""
+    height = boxes.size_hwl_m[:, 0]
+    x, y, z = boxes.bottom_m.T
+    return np.column_stack([x, z, height / 2 - y, boxes.size_hwl_m[:, ::-1], -boxes.yaw_rad])
+
+
 def overlap_3d(a: Boxes, b: Boxes) -> Array:
     """IoU (N,) in 3D of boxes with each other, row by row."""
-    top = np.maximum(a.bottom_m[:, 1] - a.size_hwl_m[:, 0], b.bottom_m[:, 1] - b.size_hwl_m[:, 0])
-    height = np.clip(np.minimum(a.bottom_m[:, 1], b.bottom_m[:, 1]) - top, 0, None)
-    common = rectangle_overlap(_from_above(a), _from_above(b)) * height
-    union = a.size_hwl_m.prod(1) + b.size_hwl_m.prod(1) - common
-    return np.divide(common, union, out=np.zeros(len(a)), where=union > 0)
-
-
-def _from_above(boxes: Boxes) -> Array:
-    """Rectangles (N, 5) on the camera's x-z plane, on which rotation_y, from z toward x, is clockwise."""
-    return np.column_stack([boxes.bottom_m[:, [0, 2]], boxes.size_hwl_m[:, :0:-1], -boxes.yaw_rad])
+    return upright_box_iou(upright(a), upright(b))
 
 
 def same_frame(a: Boxes, b: Boxes, *, reach_m: bool) -> tuple[Index, Index]:
@@ -161,17 +156,21 @@ def read_view(calib: Path, ego_motion: Path | None, frames: int) -> View:
     return View(map_T_imu @ inverse(rect_T_cam @ cam_T_velo @ velo_T_imu), P)
 
 
+def in_map(boxes: Boxes, view: View) -> tuple[Array, Array]:
+    """Centers (N, 3) and yaws (N,) of boxes in the map."""
+    pose, off = view.map_T_cam[boxes.frame], np.zeros((len(boxes), 3))
+    off[:, 1] = boxes.size_hwl_m[:, 0] / 2
+    ahead = np.column_stack([np.cos(boxes.yaw_rad), np.zeros(len(boxes)), -np.sin(boxes.yaw_rad)])
+    heading = np.einsum("nij,nj->ni", pose[:, :3, :3], ahead)
+    return apply(pose, boxes.bottom_m - off), np.arctan2(heading[:, 1], heading[:, 0])
+
+
 def to_measurements(boxes: Boxes, view: View) -> Measurements:
     """Boxes as measurements in the map; `points`, which the tracker does not read, is the row."""
     n = len(boxes)
-    center = boxes.bottom_m.copy()
-    center[:, 1] -= boxes.size_hwl_m[:, 0] / 2
-    pose = view.map_T_cam[boxes.frame]
-    ahead = np.column_stack([np.cos(boxes.yaw_rad), np.zeros(n), -np.sin(boxes.yaw_rad)])
-    heading = np.einsum("nij,nj->ni", pose[:, :3, :3], ahead)
-    sigma = SIGMA_M + SIGMA_PER_M * np.hypot(center[:, 0], center[:, 2])
+    map_center, yaw_rad = in_map(boxes, view)
+    sigma = SIGMA_M + SIGMA_PER_M * np.hypot(boxes.bottom_m[:, 0], boxes.bottom_m[:, 2])
     half_m = boxes.size_hwl_m[:, :0:-1] / 2
-    map_center = apply(pose, center)
     return Measurements(
         t_ns=boxes.frame * PERIOD_NS,
         category=np.array([CATEGORY_OF[c] for c in boxes.category.tolist()], dtype="<U16"),
@@ -185,7 +184,7 @@ def to_measurements(boxes: Boxes, view: View) -> Measurements:
         bottom_m=map_center[:, 2] - boxes.size_hwl_m[:, 0] / 2,
         top_m=map_center[:, 2] + boxes.size_hwl_m[:, 0] / 2,
         center_m=map_center,
-        yaw_rad=np.arctan2(heading[:, 1], heading[:, 0]),
+        yaw_rad=yaw_rad,
         covariance=sigma[:, None, None] ** 2 * np.eye(2),
         points=np.arange(n),
         source=np.full(n, "lidar", dtype="<U16"),
@@ -220,9 +219,8 @@ def from_map(center_m: Array, size_m: Array, yaw_rad: Array, frame: NDArray[np.i
 
 def project(boxes: Boxes, P: Array) -> Array:
     """Image boxes (N, 4) around 3D boxes, cut at the border; NaN where less than half lies inside or a corner is too near."""
-    center = boxes.bottom_m[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
-    center[:, 2] += boxes.size_hwl_m[:, 0] / 2
-    corners = box_corners(center, boxes.size_hwl_m[:, ::-1], -boxes.yaw_rad)  # on axes x right, z forward, y up
+    box = upright(boxes)
+    corners = box_corners(box[:, :3], box[:, 3:6], box[:, 6])
     xyz = np.stack([corners[..., 0], -corners[..., 2], corners[..., 1], np.ones(corners.shape[:2])], axis=-1)
     uvw = xyz @ P.T
     ahead = (uvw[..., 2] > NEAR_M).all(axis=1)
@@ -231,23 +229,3 @@ def project(boxes: Boxes, P: Array) -> Array:
     cut_low, cut_high = np.clip(low, 0, IMAGE_PX - 1), np.clip(high, 0, IMAGE_PX - 1)
     inside = ahead & ((cut_high - cut_low).prod(1) >= 0.5 * (high - low).prod(1))
     return np.where(inside[:, None], np.concatenate([cut_low, cut_high], axis=1), np.nan)
-
-
-def hidden_share(boxes: Boxes, hides: Mask) -> Array:
-    """Share (N,) of every image box that lies behind those of the rows `hides` (N,) of its frame that are nearer to the camera."""
-    depth, out = np.linalg.norm(boxes.bottom_m, axis=1), np.zeros(len(boxes))
-    (u0, v0, u1, v1), front = boxes.box_px.T, np.flatnonzero(hides)
-    front = front[np.argsort(boxes.frame[front], kind="stable")]
-    i, j = same_frame(boxes, boxes.take(front), reach_m=False)
-    j = front[j]
-    for nearer, farther in ((depth + NEARER_M, depth), (u0, u1), (-u1, -u0), (v0, v1), (-v1, -v0)):
-        kept = nearer[j] < farther[i]
-        i, j = i[kept], j[kept]
-    if len(i):
-        low, high = boxes.box_px[:, :2], boxes.box_px[:, 2:]
-        grid = low[:, None] + (high - low)[:, None] * ((np.arange(GRID) + 0.5) / GRID)[:, None]
-        covered = (grid[i] > low[j, None]) & (grid[i] < high[j, None])
-        cells = covered[:, :, None, 0] & covered[:, None, :, 1]
-        begin = np.flatnonzero(np.diff(i, prepend=-1))
-        out[i[begin]] = np.logical_or.reduceat(cells, begin, axis=0).mean(axis=(1, 2))
-    return out

@@ -14,7 +14,6 @@ from kitti.boxes import (
     Mask,
     View,
     from_map,
-    hidden_share,
     is_small,
     overlap_3d,
     project,
@@ -32,20 +31,18 @@ from kitti.tracks import (
     sum_so_far,
 )
 from log2sim.datatypes import Measurements
-from log2sim.geometry import NS_PER_S, Array
+from log2sim.geometry import NS_PER_S, Array, choose_pairs
 from log2sim.tracking.tracker import MAX_PEDESTRIAN_SPEED_MPS
 
 # Log-odds that a box of a car lies on a labeled one, of detected and of predicted boxes, with all frames at hand and with those
 # so far: logistic regression by `bench.py kitti --fit` on sequences 0000, 0002, 0004, 0005, 0007, 0009 and 0011, all of the part on
 # which the benchmark's validation does not run.
-SEEN = {"constant": -8.89, "score": 0.2, "near_score": 1.0, "near_share": 3.25, "hidden": -3.67, "height": -4.68}
-PREDICTED = {"constant": -5.5, "near_score": 0.67, "near_share": 3.59}
-SEEN_ONLINE = {"constant": -7.45, "score": 0.49, "near_score": 0.7, "near_share": 2.18, "hidden": -1.7, "height": -4.12}
-PREDICTED_ONLINE = {"constant": -5.33, "near_score": 0.98, "near_share": 1.93}
+SEEN = {"constant": -9.24, "score": 0.24, "near_score": 0.98, "near_share": 2.99, "height": -5.01}
+PREDICTED = {"constant": -6.06, "near_score": 0.7, "near_share": 3.88}
+SEEN_ONLINE = {"constant": -7.6, "score": 0.48, "near_score": 0.71, "near_share": 2.14, "height": -4.26}
+PREDICTED_ONLINE = {"constant": -5.46, "near_score": 0.94, "near_share": 1.96}
 # A box is told where it is more likely labeled than not; a detected one is left out only where that is unlikely.
 MIN_PREDICTED, MIN_SEEN = 0.5, 0.2
-# A track of which less than half is likely labeled stands or falls as a whole, by its score.
-WEAK_TRACK = 0.5
 # Boxes so small that the benchmark does not count them as errors are carried on for so many frames.
 SMALL_FRAMES = 20
 # There are too few labeled people to learn from. Tracks of at least this confidence are filled where they are missed for at
@@ -68,21 +65,17 @@ def _cars(d: Described, *, online: bool) -> tuple[Mask, Array]:
     # What cannot be an error says nothing against its track.
     seen = np.where(small, 1.0, labeled_probability(d.features, SEEN_ONLINE if online else SEEN))
     predicted = labeled_probability(d.features, PREDICTED_ONLINE if online else PREDICTED)
-    soon = d.distance <= SMALL_FRAMES
-    likely = ~d.doubled & (small & soon | (predicted >= MIN_PREDICTED))
+    keep = np.where(d.seen, seen >= MIN_SEEN, small & (d.distance <= SMALL_FRAMES) | (predicted >= MIN_PREDICTED))
     if online:
         # What is only predicted is believed as much as the last detection.
         before, _ = neighbors(d.seen, d.boxes.track_id)
-        return np.where(d.seen, seen >= MIN_SEEN, likely), seen[before]
-    weak = _mean_of_track(d, seen, d.seen) < WEAK_TRACK
-    keep = np.where(d.seen, weak | (seen >= MIN_SEEN), likely)
+        return keep, seen[before]
     return keep, _mean_of_track(d, seen, d.seen & keep & ~small)
 
 
 def _people(d: Described, *, online: bool) -> tuple[Mask, Array]:
     few = d.distance <= FILLED_FRAMES_ONLINE if online else (d.gap > 0) & (d.gap <= FILLED_FRAMES)
-    filled = ~d.doubled & (d.confidence >= FILLED_CONFIDENCE) & few
-    keep = d.seen | filled
+    keep = d.seen | (d.confidence >= FILLED_CONFIDENCE) & few
     if not online:
         return keep, d.confidence
     # The evaluation takes the mean over the track: what is seen now counts beside all that was seen.
@@ -111,16 +104,10 @@ MISSED_SCORE = -1.0
 FULL_HITS = 20
 # What stands may be a pole; what moved this far is none.
 MOVED_M = 5.0
-# Confidences are told apart within these limits; tracks from this one on hide others.
-CONFIDENCE_LIMITS, HIDING_CONFIDENCE = (-2.0, 8.0), 2.0
 # Detections within so many frames tell how surely an object is seen at that time.
 NEAR_FRAMES = 5
-# What may stand behind: shares of image boxes that are hidden by more than this weigh.
-HIDDEN_SHARE = 0.6
 # Higher boxes than this are seen as well as these, lower ones than that are no errors.
 HEIGHTS_PX = (20.0, 60.0)
-# A predicted box that overlaps a detection of another track by this much (IoU in 3D) is no second object.
-SAME_PLACE_IOU = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +116,16 @@ class Described:
 
     `boxes`: N rows; `track_id` is the track. `seen` (N,): whether the box was detected. `distance` (N,): frames to the
     nearest detection of the track, online to the last one. `gap` (N,): frames in a row without a detection between two of
-    them, 0 where there is one and beyond the ends of the track. `doubled` (N,): predicted boxes where another track is that
-    was seen there or nearer in time. `hits` (N,): detections of the track so far. `confidence` (N,): how much the track is
+    them, 0 where there is one and beyond the ends of the track. `hits` (N,): detections of the track so far. `confidence` (N,): how much the track is
     believed by all its detections, online by those so far. `features`: (N,) float64 each, by name: `score` of the detection,
     `near_score` and `near_share` the mean score of the detections around it and the share of the frames that have one,
-    `hidden` the share of the image box that others hide beyond what does not matter, `height` the logarithm of its height.
+    `height` the logarithm of that of its image box.
     """
 
     boxes: Boxes
     seen: Mask
     distance: Index
     gap: Index
-    doubled: Mask
     hits: Array
     confidence: Array
     features: Mapping[str, Array]
@@ -162,27 +147,23 @@ def describe(rows: Rows, boxes: Boxes, measurements: Measurements, view: View, *
         rows, out = rows.take(order), replace(out, track_id=rows.track).take(order)
     seen = rows.source >= 0
     score = np.where(seen, boxes.score[rows.source], 0.0)
-    distance, beyond, gap = _distances(rows, online=online)
+    distance, gap, outside = _distances(rows, online=online)
     moved = np.clip(_moved_m(rows, measurements.center_m, online=online)[0] / MOVED_M, 0, 1) * view.motion_known
-    evidence = _evidence(rows.track, seen, score, online | (beyond == 0), online=online)
-    confidence = np.clip(evidence + moved, *CONFIDENCE_LIMITS)
+    confidence = _evidence(rows.track, seen, score, online | ~outside, online=online) + moved
     share, local = _near(rows, seen, score, online=online)
-    hidden = hidden_share(out, seen & (confidence >= HIDING_CONFIDENCE))
     height = np.clip(out.box_px[:, 3] - out.box_px[:, 1], *HEIGHTS_PX)
     features = {
         "score": score,
         "near_score": local,
         "near_share": share,
-        "hidden": np.maximum(hidden - HIDDEN_SHARE, 0),
         "height": np.log(height / HEIGHTS_PX[1]),
     }
-    doubled = _doubled(out, distance, beyond)
     hits = sum_so_far(seen, first_of_run(out.track_id))
-    return Described(out, seen, distance, gap, doubled, hits, confidence, features)
+    return Described(out, seen, distance, gap, hits, confidence, features)
 
 
-def _distances(rows: Rows, *, online: bool) -> tuple[Index, Index, Index]:
-    """Frames (N,) to the nearest detection of the track, beyond its end (negative before it), and of the gap a row is in.
+def _distances(rows: Rows, *, online: bool) -> tuple[Index, Index, Mask]:
+    """Frames (N,) to the nearest detection of the track and of the gap a row is in, and whether it is beyond the ends of the track.
 
     Online no detection is known but the last one.
     """
@@ -191,7 +172,7 @@ def _distances(rows: Rows, *, online: bool) -> tuple[Index, Index, Index]:
     since, until = rows.frame - rows.frame[before], rows.frame[after] - rows.frame
     outside = ~seen & (online | (before == after))
     distance = np.where(outside, np.abs(since), np.minimum(since, until))
-    return distance, np.where(outside, since, 0), np.where(seen | outside, 0, since + until - 1)
+    return distance, np.where(seen | outside, 0, since + until - 1), outside
 
 
 def _evidence(track: Index, seen: Mask, score: Array, within: Mask, *, online: bool) -> Array:
@@ -222,30 +203,6 @@ def _near(rows: Rows, seen: Mask, score: Array, *, online: bool) -> tuple[Array,
     b = np.searchsorted(known, key + (0 if online else NEAR_FRAMES), "right")
     window = NEAR_FRAMES if online else 2 * NEAR_FRAMES
     return (b - a - seen) / window, (total[b] - total[a]) / SCALE / np.maximum(b - a, 1)
-
-
-def _doubled(out: Boxes, distance: Index, beyond: Index) -> Mask:
-    """Which predicted boxes (N,) are where another track is that was detected there or, `distance` (N,) frames away, nearer.
-
-    So are those farther from the end of their track, `beyond` (N,) frames after it or, negative, before it.
-    """
-    order = np.argsort(out.frame, kind="stable")
-    predicted = np.flatnonzero(distance > 0)
-    i, j = same_frame(out.take(predicted), out.take(order), reach_m=True)
-    i, j = predicted[i], order[j]
-    nearer = (distance[j] < distance[i]) | (distance[j] == distance[i]) & (j < i)
-    stronger = (out.track_id[i] != out.track_id[j]) & nearer
-    i, j = i[stronger], j[stronger]
-    here = np.zeros(len(out), dtype=bool)
-    here[i[overlap_3d(out.take(i), out.take(j)) >= SAME_PLACE_IOU]] = True
-    doubled = here.copy()
-    for sign in (1, -1):
-        rows = np.flatnonzero(sign * beyond > 0)[::sign]
-        if len(rows):
-            # Rows beyond the same end follow each other; elsewhere the frame jumps back to one beside an end.
-            ends = np.cumsum(np.abs(beyond[rows]) == 1) * (int(out.track_id.max()) + 1)
-            doubled[rows] |= sum_so_far(here[rows], first_of_run(out.track_id[rows] + ends)) > 0
-    return doubled
 
 
 # Boxes that overlap this much (IoU in 3D) are one object, as for the benchmark.
@@ -322,18 +279,15 @@ class Pairs:
 
 
 def find_pairs(boxes: Boxes) -> Pairs:
-    """Pair each pedestrian with the nearest rider in its place; the likelier one is tracked."""
+    """Pair pedestrians with riders in their places; the likelier one of each pair is tracked."""
     boxes = boxes.take(np.argsort(boxes.frame, kind="stable"))
     pedestrian, rider = (np.flatnonzero(boxes.category == c) for c in (PEDESTRIAN, RIDER))
     i, j = same_frame(boxes.take(pedestrian), boxes.take(rider), reach_m=False)
     i, j = pedestrian[i], rider[j]
     apart_m = np.hypot(*(boxes.bottom_m[i] - boxes.bottom_m[j])[:, [0, 2]].T)
-    order = np.flatnonzero(apart_m < SAME_OBJECT_M)
-    order = order[np.argsort(apart_m[order], kind="stable")]
+    one = choose_pairs(i, j, apart_m, SAME_OBJECT_M)
     pair = np.full(len(boxes), -1, dtype=np.int64)
-    for a, b in zip(i[order].tolist(), j[order].tolist()):
-        if pair[a] < 0 and pair[b] < 0:
-            pair[a], pair[b] = b, a
+    pair[i[one]], pair[j[one]] = j[one], i[one]
     opposite = np.where(pair >= 0, boxes.score[pair], MISSED_SCORE)
     lead = np.where(boxes.category == RIDER, 1, -1) * (boxes.score - opposite) - RIDER_LEAD
     second = (pair >= 0) & np.where(boxes.category == RIDER, lead <= 0, lead > 0)

@@ -128,48 +128,29 @@ def _in_order(boxes: Boxes) -> Boxes:
     return replace(boxes, track_id=index.astype(np.int64))
 
 
-class Matcher:
-    """Assignment of found boxes to labels at any threshold; frames whose candidates are the same are solved once."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        frame = scene.truth.frame[scene.row]
-        cuts = np.flatnonzero(np.diff(frame)) + 1
-        self.spans = list(zip(np.r_[0, cuts], np.r_[cuts, len(frame)])) if len(frame) else []
-        self.known: dict[tuple[int, bytes], Index] = {}
-
-    def match(self, threshold: float) -> Index:
-        """Row of the found box of every label (A,), -1 for none: most pairs, then the greatest overlap, frame by frame."""
-        match = np.full(len(self.scene.truth), -1, dtype=np.int64)
-        keep = self.scene.near & (self.scene.score[self.scene.col] >= threshold)
-        for a, b in self.spans:
-            key = (a, keep[a:b].tobytes())
-            if key not in self.known:
-                rows = a + np.flatnonzero(keep[a:b])
-                # One more pair must always be worth more than any overlap.
-                self.known[key] = rows[
-                    choose_pairs(self.scene.row[rows], self.scene.col[rows], -len(rows) - self.scene.iou[rows], 0.0)
-                ]
-            chosen = self.known[key]
-            match[self.scene.row[chosen]] = self.scene.col[chosen]
-        return match
+def match(scene: Scene, threshold: float) -> Index:
+    """Row of the found box of every label (A,) at a threshold of the score, -1 for none: most pairs, then the greatest overlap, frame by frame."""
+    out = np.full(len(scene.truth), -1, dtype=np.int64)
+    rows = np.flatnonzero(scene.near & (scene.score[scene.col] >= threshold))
+    chosen = rows[choose_pairs(scene.row[rows], scene.col[rows], -scene.iou[rows])]
+    out[scene.row[chosen]] = scene.col[chosen]
+    return out
 
 
 def evaluate(results: Mapping[str, Boxes], labels: Mapping[str, Boxes], category: str) -> Score:
     """Score one category over all sequences that are labeled."""
     scene = make_scene(results, labels, category)
-    matcher = Matcher(scene)
-    everything = matcher.match(-np.inf)
+    everything = match(scene, -np.inf)
     matched = np.flatnonzero(everything >= 0)
     wanted = len(scene.truth) - int((scene.ignorable & (everything < 0)).sum())
     steps = recall_thresholds(scene.score[everything[matched]], wanted)
-    counts = [count(scene, matcher.match(t), t) for t, _ in steps]
+    counts = [count(scene, match(scene, t), t) for t, _ in steps]
     best = max(range(len(steps)), key=lambda k: counts[k].mota, default=None)
     threshold = steps[best][0] if best is not None else np.inf
-    match = matcher.match(threshold)
-    at_best = count(scene, match, threshold)
+    matched_at_best = match(scene, threshold)
+    at_best = count(scene, matched_at_best, threshold)
     sums = sum(c.smota(r) for c, (_, r) in zip(counts, steps)), sum(c.mota for c in counts), sum(c.motp for c in counts)
-    shares = [*(v / RECALL_STEPS for v in sums), at_best.mota, at_best.motp, _hota(scene, match, threshold)]
+    shares = [*(v / RECALL_STEPS for v in sums), at_best.mota, at_best.motp, _hota(scene, matched_at_best, threshold)]
     errors = at_best.id_switches, at_best.fragments, at_best.false_positives, at_best.false_negatives
     return Score(*(100 * float(v) for v in shares), *errors)
 

@@ -24,8 +24,8 @@ from log2sim.tracking.tracker import track
 
 # Gaps up to this are bridged offline.
 MAX_GAP_S = 2.0
-# Offline, tracks of at least so many detections with this mean score (a logit) are carried on by so many frames at both ends.
-EXTENDED_HITS, EXTENDED_SCORE, EXTENDED_FRAMES = 3, 2.0, 20
+# Offline, tracks are carried on by so many frames at both ends.
+EXTENDED_FRAMES = 20
 # Online, tracks of at least so many detections are carried on while they are not seen.
 COAST_HITS = 3
 
@@ -97,8 +97,7 @@ def rows_offline(boxes: Boxes, measurements: Sequence[Measurements]) -> Rows:
     t_ns = np.arange(len(measurements), dtype=np.int64) * PERIOD_NS
     tracks = track(measurements, t_ns, birth_score=0.0, max_gap_s=MAX_GAP_S, min_life_s=0.0, whole_boxes=True)
     rows_of = [t.measurements.points for t in tracks]
-    extended = np.array([len(r) >= EXTENDED_HITS and boxes.score[r].mean() >= EXTENDED_SCORE for r in rows_of])
-    paths = smooth_paths(tracks, t_ns, np.where(extended, EXTENDED_FRAMES, 0))
+    paths = smooth_paths(tracks, t_ns, EXTENDED_FRAMES)
     seen = paths.row >= 0
     source = np.full(len(seen), -1, dtype=np.int64)
     source[seen] = np.concatenate(rows_of)
@@ -183,8 +182,8 @@ class Paths(Columns):
     covariance: Array  # (N, 4, 4)
 
 
-def smooth_paths(tracks: Sequence[Track], t_ns: Index, beyond: Index) -> Paths:
-    """Estimate the states of all tracks at all ticks from their first to their last measurement, and `beyond` (A,) ticks before and after.
+def smooth_paths(tracks: Sequence[Track], t_ns: Index, beyond: int) -> Paths:
+    """Estimate the states of all tracks at all ticks from their first to their last measurement, and `beyond` ticks before and after.
 
     The tracker's Kalman filter and Rauch-Tung-Striebel smoother. All tracks are processed in parallel, each from its own first tick on, so
     the number of steps is the length of the longest track.
@@ -200,9 +199,8 @@ def smooth_paths(tracks: Sequence[Track], t_ns: Index, beyond: Index) -> Paths:
     group = np.array([GROUP_OF[t.category] for t in tracks])
     noise = np.array([ACCELERATION_MPS2[g] for g in group.tolist()])
     paths = Paths(track, tick, row, *_smoothed(tracks, group, noise, start, length, t_ns[tick], row >= 0))
-    step = np.arange(beyond.sum()) - np.repeat(np.cumsum(beyond) - beyond, beyond) + 1
-    origin = np.concatenate([np.repeat(start + length - 1, beyond), np.repeat(start, beyond)])
-    step = np.concatenate([step, -step])
+    origin = np.repeat(np.concatenate([start + length - 1, start]), beyond)
+    step = np.outer(np.repeat([1, -1], len(start)), np.arange(beyond) + 1).ravel()
     there = (tick[origin] + step >= 0) & (tick[origin] + step < len(t_ns))
     origin, later = origin[there], tick[origin[there]] + step[there]
     dt_s = (t_ns[later] - t_ns[tick[origin]]) / NS_PER_S

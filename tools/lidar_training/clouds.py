@@ -13,7 +13,7 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
 from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M, rasterize
-from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, estimate_ground
+from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, Ground, estimate_ground
 from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
 
 
@@ -23,15 +23,18 @@ class Example:
 
     cloud: Cloud
     truth: SceneBoxes
+    ground_m: Array  # (M,): height of the ground under each box
 
 
-def level(xyz_m: NDArray[np.float32], sensor_m: Array) -> Cloud:
-    """Level the points of a simulated sweep as the pipeline does; the origin is below the sensor."""
-    height = xyz_m[:, 2] - estimate_ground(xyz_m, np.zeros(2), 0.0).at(xyz_m[:, :2])
-    return Cloud(
+def level(xyz_m: NDArray[np.float32], sensor_m: Array) -> tuple[Cloud, Ground]:
+    """Level the points of a simulated sweep as the pipeline does, and return the ground as well; the origin is below the sensor."""
+    ground = estimate_ground(xyz_m, np.zeros(2), 0.0)
+    height = xyz_m[:, 2] - ground.at(xyz_m[:, :2])
+    cloud = Cloud(
         stamp_ns=0, origin=np.zeros(3), xyz=xyz_m, t_s=np.zeros(len(xyz_m), np.float32),
         sensor=sensor_m.astype(np.float32), ground=np.abs(height) <= ON_GROUND_M, height=height,
     )  # fmt: skip
+    return cloud, ground
 
 
 # Kinds that training does not see: scores are calibrated on scenes that have the first of them, reports on such that have all.
@@ -46,11 +49,11 @@ def draw_example(mount: Mount, seed: tuple[int, ...], without: frozenset[str] = 
     rng = np.random.default_rng(seed)
     scene = draw_scene(mount, rng, without=without)
     labeled = labeled_cloud(scene, rng)
-    cloud = level(labeled.xyz_m, scene.sensor.position_m)
+    cloud, ground = level(labeled.xyz_m, scene.sensor.position_m)
     seen = labeled.points > 0
     ignored = (labeled.points < MIN_POINTS) | np.isin(labeled.category, ("bicycle", "other"))
     truth = SceneBoxes.of(labeled.boxes, labeled.category, points=labeled.points, ignored=ignored).take(seen)
-    return Example(cloud, truth)
+    return Example(cloud, truth, ground.at(truth.box[:, :2].astype(np.float32)))
 
 
 STEP_M = 0.005  # of stored coordinates
@@ -68,21 +71,21 @@ class Sample:
     points: NDArray[np.int64]  # (M,)
 
 
+def sample_of(example: Example) -> Sample:
+    """Turn an example into a sample to train on."""
+    cloud, truth = example.cloud, example.truth
+    xyz, boxes = cloud.xyz.copy(), truth.box.astype(np.float32)
+    xyz[:, 2] = cloud.height
+    boxes[:, 2] -= example.ground_m
+    near = (np.abs(xyz[:, :2]) < KEPT_RANGE_M).all(axis=1) & (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < MAX_HEIGHT_M)
+    names = [c if c in CATEGORIES else "other" for c in truth.category.tolist()]
+    assert truth.points is not None
+    return Sample(xyz[near], boxes, np.array([CATEGORIES.index(c) for c in names], np.int64), truth.points)
+
+
 def draw_sample(mount: Mount, seed: tuple[int, ...]) -> Sample:
     """Draw a scene to train on, cast it and level its cloud."""
-    rng = np.random.default_rng(seed)
-    cloud = labeled_cloud(draw_scene(mount, rng, without=CALIBRATED_KINDS | REPORTED_KINDS), rng)
-    xyz = cloud.xyz_m
-    ground = estimate_ground(xyz, np.zeros(2), 0.0)
-    leveled = xyz.copy()
-    leveled[:, 2] -= ground.at(xyz[:, :2])
-    near = (np.abs(xyz[:, :2]) < KEPT_RANGE_M).all(axis=1)
-    near &= (leveled[:, 2] > MIN_HEIGHT_M) & (leveled[:, 2] < MAX_HEIGHT_M)
-    boxes = cloud.boxes.astype(np.float32)
-    boxes[:, 2] -= ground.at(boxes[:, :2])
-    seen = cloud.points > 0
-    category = np.array([CATEGORIES.index(c) for c in cloud.category], np.int64)
-    return Sample(leveled[near], boxes[seen], category[seen], cloud.points[seen])
+    return sample_of(draw_example(mount, seed, CALIBRATED_KINDS | REPORTED_KINDS))
 
 
 def write_shard(path: Path, samples: list[Sample]) -> None:

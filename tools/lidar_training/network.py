@@ -96,7 +96,7 @@ def _heat_loss(logits: Tensor, targets: Targets) -> Tensor:
 def _quality_loss(maps: Tensor, targets: Targets) -> Tensor:
     """Cross entropy to the overlap of the regressed and the true rectangle, as if both had the true heading."""
     with torch.no_grad():
-        box, truth = maps[:, BOX].float(), targets.box
+        box, truth = maps[:, BOX], targets.box
         c, s = truth[:, 9], truth[:, 8]
         dx, dy = box[:, 0] - truth[:, 0], box[:, 1] - truth[:, 1]
         overlap = torch.ones_like(dx)
@@ -107,7 +107,7 @@ def _quality_loss(maps: Tensor, targets: Targets) -> Tensor:
         for source in (box, truth):
             areas = areas + (source[:, 3].clamp(-2, 4) + source[:, 4].clamp(-2, 4)).exp()
         # A heading that is off turns the rectangle out of the other.
-        aligned = (maps[:, AXIS].float() * truth[:, 6:8]).sum(1) / maps[:, AXIS].float().norm(dim=1).clamp(min=1e-3)
+        aligned = (maps[:, AXIS] * truth[:, 6:8]).sum(1) / maps[:, AXIS].norm(dim=1).clamp(min=1e-3)
         iou = overlap / (areas - overlap).clamp(min=1e-3) * aligned.clamp(0, 1)
     entropy = F.binary_cross_entropy_with_logits(maps[:, QUALITY][:, 0], iou.clamp(0, 1), reduction="none")
     return (entropy * targets.regressed[:, 0]).sum()

@@ -1,4 +1,4 @@
-"""Labeled sweeps of a real log: clouds with truth to test detectors on, and samples to train them with."""
+"""Labeled sweeps of a real log: clouds with truth to train and test detectors on."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_training.clouds import CATEGORIES, KEPT_RANGE_M, Example, Sample
+from lidar_training.clouds import Example
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
@@ -15,7 +15,6 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array, Camera, apply, inverse, nearest_index, project
 from log2sim.perception.detect3d.detectors import create_lidar_detector
-from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin
 
 MAX_RANGE_M = 60.0
@@ -48,10 +47,6 @@ class LogSweep:
     cloud: Cloud
     truth: SceneBoxes  # relative to the cloud's origin
     views: tuple[LogView, ...]  # the cameras in whose images road users were labeled; empty where everything was
-
-    def labeled(self, xyz: Array) -> NDArray[np.bool_]:
-        """Mark the points (N, 3), relative to the cloud's origin, where road users have labels."""
-        return labeled_by(self.views, xyz)
 
 
 def labeled_by(views: tuple[LogView, ...], xyz: Array) -> NDArray[np.bool_]:
@@ -110,32 +105,18 @@ def _views(log: Log, cloud: Cloud) -> tuple[LogView, ...]:
     return tuple(views)
 
 
-def sample_of(sweep: LogSweep) -> Sample:
-    """Turn a sweep into a training sample; only what was labeled is kept of the cloud."""
-    cloud, truth = sweep.cloud, sweep.truth
-    xyz, center = cloud.xyz.copy(), truth.box[:, :3].copy()
-    xyz[:, 2] = cloud.height
-    center[:, 2] -= ground_under(cloud, center)
-    xyz[:, :2] -= cloud.sensor[:2]
-    near = (np.abs(xyz[:, :2]) < KEPT_RANGE_M).all(axis=1) & (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < MAX_HEIGHT_M)
-    near &= sweep.labeled(cloud.xyz)
-    boxes = np.column_stack([center[:, :2] - cloud.sensor[:2], center[:, 2], truth.box[:, 3:]])
-    assert truth.points is not None
-    category = np.array([CATEGORIES.index(c) if c in CATEGORIES else CATEGORIES.index("other") for c in truth.category])
-    return Sample(xyz[near], boxes.astype(np.float32), category.astype(np.int64), truth.points)
-
-
 def example_of(sweep: LogSweep) -> Example:
-    """Turn a sweep into an example to test detectors on, with the sensor's foot as origin; only what was labeled is kept of the cloud."""
+    """Turn a sweep into an example with the sensor's foot as origin; only what was labeled is kept of the cloud."""
     cloud, truth = sweep.cloud, sweep.truth
     foot = np.append(cloud.sensor[:2], np.float32(0.0))
-    kept = sweep.labeled(cloud.xyz)
+    kept = labeled_by(sweep.views, cloud.xyz)
     columns = {name: getattr(cloud, name)[kept] for name in ("t_s", "ground", "height")}
     moved = Cloud(0, np.zeros(3), cloud.xyz[kept] - foot, sensor=cloud.sensor - foot, **columns)
     boxes = truth.box - np.append(foot, np.zeros(truth.box.shape[1] - 3))
     assert truth.points is not None
     ignored = (truth.points < MIN_POINTS) | np.isin(truth.category, ("bicycle", "other"))
-    return Example(moved, SceneBoxes.of(boxes, truth.category, points=truth.points, ignored=ignored))
+    named = SceneBoxes.of(boxes, truth.category, points=truth.points, ignored=ignored)
+    return Example(moved, named, ground_under(cloud, truth.box))
 
 
 def ground_under(cloud: Cloud, center: Array) -> Array:

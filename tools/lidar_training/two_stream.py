@@ -46,6 +46,7 @@ from log2sim.geometry import (
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, open_network
+from log2sim.perception.detect3d.network import open_session
 from log2sim.perception.lidar.cloud import Cloud
 
 MIN_DEPTH_M = 1.0
@@ -421,7 +422,7 @@ def loss_of_anchors(network: nn.Module, batch: Batch) -> tuple[Tensor, dict[str,
 
 
 INPUTS = ("bev", "image", "bev_boxes", "image_boxes")
-MIN_SCORE = 0.05
+MIN_SCORE, MAX_BYTES = 0.05, 100_000_000
 MAX_CANDIDATES = 500
 MAX_RANGE_M = 40.0
 CRITERIA = {
@@ -445,11 +446,7 @@ def export_two_stream(network: TwoStream, path: Path) -> None:
 
 def search_by_network(path: Path) -> Search:
     """Search pairs by an exported network, in the frames of their clouds, with one thread."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    session = open_session(path, MAX_BYTES, "network")
 
     def search(pair: Pair) -> SceneBoxes:
         seen = inputs_of(pair)

@@ -165,7 +165,7 @@ def loss_of_cells(out: Tensor, targets: CellTargets) -> tuple[Tensor, dict[str, 
     filled = (targets.label != IGNORED).float()
     user = (targets.label >= LARGE).float()
     users = user.sum().clamp(min=1)
-    log_p = F.log_softmax(out[:, CLASSES].float(), dim=1)
+    log_p = F.log_softmax(out[:, CLASSES], dim=1)
     label = targets.label.clamp(min=0)
     own = log_p.gather(1, label[:, None])[:, 0]
     weight = torch.tensor(CLASS_WEIGHTS)[label]
@@ -252,12 +252,10 @@ def export_zou2021(network: Zou2021Network, path: Path, card: dict[str, object])
     describe(path, description("zou2021", CELL_M, RANGE_M) | {"stride": 1, "card": card})
 
 
-def main(
-    data: list[Path], out: Path, steps: int = 1500, seed: int = 1, share: float = 1.0, start: Path | None = None
-) -> Path:
+def main(data: list[Path], out: Path, steps: int = 1500, seed: int = 1, share: float = 1.0) -> Path:
     """Train on folders of shards, or go on from the checkpoint in `out`, and export the averaged weights; returns the ONNX file.
 
-    `share` of the paper's channels; `start` is the checkpoint of another run to start from.
+    `share` of the paper's channels.
     """
     shards = [Shard(path) for folder in data for path in sorted(folder.glob("*.npz"))]
     if not shards:
@@ -267,8 +265,6 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)
     network = Zou2021Network(share).to(memory_format=torch.channels_last)
-    if start is not None:
-        network.load_state_dict(torch.load(start, weights_only=True)["mean"])
 
     def step(network: nn.Module, rng: np.random.Generator, _: int) -> tuple[Tensor, dict[str, float]]:
         drawn = [shards[int(rng.integers(len(shards)))] for _ in range(BATCH)]
