@@ -23,7 +23,6 @@ from log2sim.evaluation.detection.boxes import DetectedBoxes, SceneBoxes
 from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.evaluation.detection.evaluation import (
     DetectionOptions,
-    average_precision,
     evaluate_boxes,
     precision_recall,
 )
@@ -380,9 +379,10 @@ def test_average_precision_of_a_case_by_hand():
     # Precision 1 at recall .25, .5 (2/3 and 3/4 later), so best precision: 1 up to .25, 3/4 up to .75, 0 beyond.
     found = SceneBoxes.of(cars(0.0, 70.0, 10.0, 20.0), score=[0.9, 0.8, 0.7, 0.6])
     truth = SceneBoxes.of(cars(0.0, 10.0, 20.0, 30.0))
-    assert average_precision(found, truth, IOU, 40) == pytest.approx((10 * 1 + 20 * 0.75 + 10 * 0) / 40)
+    curve = precision_recall(found, match_detections(found, truth, IOU))
+    assert curve.average(40) == pytest.approx((10 * 1 + 20 * 0.75 + 10 * 0) / 40)
     # 0, .1, .2 | .3 to .7 | .8, .9, 1
-    assert average_precision(found, truth, IOU, 11) == pytest.approx((3 * 1 + 5 * 0.75) / 11)
+    assert curve.average(11) == pytest.approx((3 * 1 + 5 * 0.75) / 11)
 
 
 def test_nuscenes_leaves_out_low_recall_and_low_precision():

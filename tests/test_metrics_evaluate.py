@@ -41,6 +41,7 @@ def test_a_result_keeps_its_schema_and_prints():
     lines = blocks[1].splitlines()
     assert [line.split()[0] for line in lines[1:]] == [*rows, "ego"]
     assert len(set(map(len, lines[:-1]))) == 1
+    assert lines[1].split() == ["all", "5", "100.0", "100.0", "0.00", "0.00", "0.0", "0.00", "0.00", "1.000", "1.000"]
     shares = next(block for block in blocks if block.startswith("wrong in %")).splitlines()
     assert {"all", "0-15", "15-30"} <= {line.split()[0] for line in shares if line.strip()}
 

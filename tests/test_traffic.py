@@ -28,7 +28,7 @@ from log2sim.synth.render import DEPTH_M, LENS_SPACING_M, WIDTH_M, Body, SceneIn
 from log2sim.synth.returns import LidarModel, ReturnModel, lidar_model, reflected
 from log2sim.synth.scene import Environment
 from log2sim.synth.terrain import Surface
-from log2sim.synth.traffic import TrafficScene, draw_scene, labeled_cloud, rig_of
+from log2sim.synth.traffic import TrafficScene, draw_scene, rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, write_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
 from log2sim.synth.traffic_shapes import KINDS
@@ -95,7 +95,7 @@ def test_a_scene_depends_on_its_seed_alone() -> None:
     clouds = []
     for seed in (1, 1, 2):
         rng = np.random.default_rng(seed)
-        clouds.append(labeled_cloud(draw_scene("roadside", rng), rng).xyz_m)
+        clouds.append(draw_scene("roadside", rng).cast(rng).xyz_m)
     assert np.array_equal(clouds[0], clouds[1])
     assert clouds[0].shape != clouds[2].shape or not np.array_equal(clouds[0], clouds[2])
 

@@ -179,4 +179,7 @@ def test_the_command(folder, tmp_path) -> None:
     assert "cut_in" in run("vary", folder, "standing", "-o", tmp_path / "w").line
     closest = run("vary", folder, "cut_in and gap_m < 0.001", "-o", tmp_path / "w").line
     assert "without 'gap_m < 0.001' there are" in closest
+    nothing = run("vary", folder, "cut_in and gap_m < 0.001 and ttc_s < 0", "-o", tmp_path / "w", "--probability", 0.9)
+    assert "each alone: 'cut_in' " in nothing.line
+    assert "'probability >= 0.9' " in nothing.line
     assert not (tmp_path / "w").exists()

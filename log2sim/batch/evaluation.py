@@ -22,10 +22,7 @@ LoadTruth = Callable[[FoundLog, Scenario], Scenario]
 
 VERSION = 1
 POOLED_BY_SQUARE = ("position_rmse_m", "speed_rmse_mps")
-OF_A_LOG = (
-    "recall", "precision", "position_rmse_m", "position_median_m", "yaw_median_deg", "speed_rmse_mps", "size_median_m", "id_switches",
-    "mota", "hota",
-)  # fmt: skip
+OF_A_LOG = tuple(key for key, _, _ in table.COLUMNS)
 MEDIANS = ("recall", "precision", "position_median_m", "yaw_median_deg", "size_median_m", "hota")
 DIGITS = 4
 
@@ -153,17 +150,7 @@ def format_batch_table(document: Figures, *, max_rows: int) -> str:
     total = document["total"]
     whole = {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in OF_A_LOG if k in total}}
     lines = [("all", {**whole, "counts": total["counts"]}), *((entry["log"], entry) for entry in rows[:max_rows])]
-    cells = [["", "agents", *_TITLES], *(_cells(name, figures) for name, figures in lines)]
+    cells = [["", "agents", *(title for _, title, _ in table.COLUMNS)]]
+    cells += [[name, str(f["counts"].get("truth_agents", 0)), *table.figure_cells(f)] for name, f in lines]
     notes = [f"and {len(rows) - max_rows} more logs with higher recall"] if len(rows) > max_rows else []
     return "\n".join([*table.columns_text(cells), *notes, "medians and HOTA of all are medians over the logs"])
-
-
-_TITLES = ("recall %", "precis. %", "rms m", "med m", "yaw deg", "m/s", "size m", "id sw", "MOTA", "HOTA")
-_DECIMALS = (1, 1, 2, 2, 1, 2, 2, 0, 3, 3)
-
-
-def _cells(name: str, figures: Figures) -> list[str]:
-    values = [figures[key] for key in OF_A_LOG]
-    values[:2] = [None if share is None else 100 * share for share in values[:2]]
-    numbers = ["-" if value is None else f"{value:.{digits}f}" for value, digits in zip(values, _DECIMALS)]
-    return [name, str(figures["counts"].get("truth_agents", 0)), *numbers]

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from log2sim.geometry import Array
     from log2sim.scenarios.failure import Outcome
-    from log2sim.scenarios.index import Index, Row
-    from log2sim.scenarios.query import Found
+    from log2sim.scenarios.index import Index
+    from log2sim.scenarios.logical import Base, Logical
 
 
 def tag(
@@ -203,14 +203,24 @@ def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _hits(found: Found) -> Sequence[Row]:
-    """Return the rows of what was found; where there are none, raise `ConfigError` that says what was closest."""
-    from log2sim.scenarios.logical import TIMING
+def _situation(path: Path, condition: str, probability: float = 0.3) -> tuple[Logical, Base]:
+    """Return the distribution of a situation's parameters over all that are found, and the most usual hit.
 
+    Raises `ConfigError` that says what was closest where nothing is found.
+    """
+    from log2sim.datatypes import Scenario
+    from log2sim.scenarios.index import open_index
+    from log2sim.scenarios.logical import TIMING, Base, choose_base, fit
+    from log2sim.scenarios.query import ask
+
+    index = open_index(path)
+    found = ask(index, condition, min_probability=probability)
     if not found.rows:
         said = ("condition: nothing fulfils it", *found.closest, f"what can be varied is {', '.join(TIMING)}")
         raise ConfigError("; ".join(said))
-    return found.rows
+    logical = fit(found.rows)
+    chosen = choose_base(logical, found.rows)
+    return logical, Base.of(Scenario.load(index.folder / chosen["file"]), chosen)
 
 
 def vary(
@@ -236,19 +246,13 @@ def vary(
     --------
     log2sim vary results/ "cut_in and other == 'ego'" -o variations/ --count 256 --openscenario
     """
-    from log2sim.datatypes import Scenario
     from log2sim.files.documents import refuse_folder, write_json
-    from log2sim.scenarios.index import open_index, write_rows
-    from log2sim.scenarios.logical import Base, choose_base, concrete, fit, write_openscenario
-    from log2sim.scenarios.query import ask
+    from log2sim.scenarios.index import write_rows
+    from log2sim.scenarios.logical import concrete, write_openscenario
 
     refuse_folder(out, overwrite=overwrite, holding="logical.json", kind="folder of variations")
-    index = open_index(path)
-    rows = _hits(ask(index, condition, min_probability=probability))
-    logical = fit(rows)
-    chosen = choose_base(logical, rows)
-    base = Base.of(Scenario.load(index.folder / chosen["file"]), chosen)
-    values = logical.sample(count, sampler, seed)
+    logical, base = _situation(path, condition, probability)
+    chosen, values = base.row, logical.sample(count, sampler, seed)
     table, kept = [], []
     with replaced_folder(out, overwrite=overwrite) as folder:
         for k, (made, problems) in enumerate(concrete(base, logical, values)):
@@ -316,7 +320,6 @@ def test_(
 
     import numpy as np
 
-    from log2sim.datatypes import Scenario
     from log2sim.files.documents import refuse_folder, write_json
     from log2sim.scenarios.failure import (
         LIMITS,
@@ -328,9 +331,7 @@ def test_(
         search,
         with_ego,
     )
-    from log2sim.scenarios.index import open_index, write_rows
-    from log2sim.scenarios.logical import Base, choose_base, fit
-    from log2sim.scenarios.query import ask
+    from log2sim.scenarios.index import write_rows
     from log2sim.simulation.metrics.all_metrics import parse_limits
     from log2sim.simulation.policy import load_policy
     from log2sim.simulation.sensing import NamedPolicy, parse_sensing
@@ -342,11 +343,8 @@ def test_(
     load_policy(policy)  # so that a wrong name is said at once
     source, _, name = policy.rpartition(":")
     driver = NamedPolicy(f"{Path(source).resolve()}:{name}" if source.endswith(".py") else policy, sensing)
-    index = open_index(path)
-    rows = _hits(ask(index, condition))
-    logical = fit(rows)
-    chosen = choose_base(logical, rows)
-    base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
+    logical, situation = _situation(path, condition)
+    base = with_ego(situation)
     outcomes: list[Outcome] = []
     values: list[Array] = []
     work = partial(judge_run, base, logical, driver, limits, agents)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -254,7 +254,8 @@ def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:
 KEEPING_SIGMA_M, KEEPING_S = 0.3, 1.0
 
 
-class EgoStates(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class EgoStates(Columns):
     """States of the ego (C,)."""
 
     x_m: Array  # box center, map frame
@@ -263,10 +264,6 @@ class EgoStates(NamedTuple):
     speed_mps: Array
     accel_mps2: Array  # of the speed's amount
     progress_m: Array  # how far along its path
-
-    def take(self, index: NDArray[np.generic]) -> EgoStates:
-        """Return some of the states."""
-        return EgoStates(*(column[index] for column in self))
 
 
 class EgoPath:

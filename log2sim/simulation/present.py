@@ -36,15 +36,6 @@ class Present:
     group: NDArray[np.str_]  # (A,): of categories
 
 
-def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]:
-    """Return times from which agents can be simulated: with a past, and half the horizon at least to compare with."""
-    w = max(scenario.agents, key=lambda a: len(a.waypoints)).waypoints
-    wanted = np.arange(w.t_s[0] + HISTORY_S, w.t_s[-1] - min(horizon_s, w.t_s[-1] - w.t_s[0] - HISTORY_S) / 2, every_s)
-    # Where others have waypoints, too, so that nothing is taken from later ones.
-    rows = np.unique(np.searchsorted(w.t_s, wanted - TICK_S / 4))
-    return [float(t) for t in w.t_s[rows]]
-
-
 def recorded(scenario: Scenario, now_s: float, horizon_s: float = 8.0) -> tuple[Motions, int]:
     """Return what the agents that are there at a time did from `HISTORY_S` before, (1, A, T), and the tick of that time."""
     before, after = round(HISTORY_S / TICK_S), round(horizon_s / TICK_S)

@@ -43,16 +43,6 @@ class Polytope:
     high: Array  # (3,), m: bounds
     material: Material
 
-    def vertices(self) -> Array:
-        """Corners (V, 3) float64, m, by intersecting triples of faces."""
-        n, c = self.normals.astype(np.float64), self.offsets.astype(np.float64)
-        i, j, k = np.array([(a, b, d) for a in range(len(n)) for b in range(a) for d in range(b)]).T
-        triples = np.stack([n[i], n[j], n[k]], axis=1)
-        regular = np.abs(np.linalg.det(triples)) > 1e-6
-        points = np.linalg.solve(triples[regular], np.stack([c[i], c[j], c[k]], axis=1)[regular][..., None])[..., 0]
-        inside = (points @ n.T <= c + 1e-5).all(axis=1)
-        return np.unique(points[inside].round(6), axis=0)
-
 
 Shape = tuple[tuple[float, float, float], tuple[Polytope, ...]]
 """Length, width, height in m of an object, and its parts."""

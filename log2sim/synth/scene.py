@@ -359,12 +359,3 @@ def scene_from_table(table: dict[str, Any]) -> Scene:
         return Scene.model_validate(table)
     except ValidationError as error:
         raise ConfigError(first_problem(error, Scene)) from None
-
-
-def scene_schema() -> dict[str, Any]:
-    """JSON Schema of scene files, as stored in `schemas/scene-1.json`."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **Scene.model_json_schema(),
-        "title": "log2sim scene file, version 1",
-    }

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from log2sim.geometry import Array, Camera, rotation_from_rpy, transform, wrap_angle
 from log2sim.synth import traffic_shapes as clutter
@@ -73,35 +72,6 @@ class TrafficScene:
             return one
         two = cast_polytopes(*self.second, solids, self.surface, rng, self.returns)
         return Returns.join([one, two])
-
-
-@dataclass(frozen=True, eq=False)
-class LabeledCloud:
-    """A cloud and the road users in it, as a network is trained on."""
-
-    xyz_m: NDArray[np.float32]  # (N, 3), m: level frame
-    hit: NDArray[np.int32]  # (N,): index of the object, -1 for the ground
-    category: NDArray[np.str_]  # (M,): of the road users
-    # (M, 7) float64: x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's
-    # points
-    boxes: Array
-    points: NDArray[np.int64]  # (M,): number of points on each
-    scene: TrafficScene = field(repr=False)
-
-
-def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud:
-    """Cast a scene and label its road users."""
-    cloud = scene.cast(rng)
-    users = [k for k, o in enumerate(scene.objects) if o.category]
-    count = np.bincount(cloud.hit[cloud.hit >= 0], minlength=len(scene.objects))
-    total_s = np.bincount(cloud.hit[cloud.hit >= 0], cloud.t_s[cloud.hit >= 0], minlength=len(scene.objects))
-    boxes = np.zeros((len(users), 7))
-    for row, k in enumerate(users):
-        item = scene.objects[k]
-        position, yaw = item.pose_at(float(total_s[k] / max(count[k], 1)))
-        boxes[row] = *position[:2], position[2] + item.size_m[2] / 2, *item.size_m, yaw
-    category = np.array([scene.objects[k].category for k in users], dtype="<U16")
-    return LabeledCloud(cloud.xyz_m, cloud.hit, category, boxes, count[users], scene)
 
 
 REACH_M = 60.0

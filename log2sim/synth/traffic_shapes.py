@@ -608,10 +608,3 @@ def draw_user(category: str, rng: Rng, without: Collection[str] = ()) -> tuple[s
     shares = np.array([share for share, _ in kinds.values()])
     kind = list(kinds)[rng.choice(len(kinds), p=shares / shares.sum())]
     return kind, kinds[kind][1](rng)
-
-
-ROAD_USERS: dict[str, Callable[[Rng], Shape]] = {
-    category: (lambda rng, category=category: draw_user(category, rng)[1])  # type: ignore[misc]
-    for category in ("car", "truck", "bus", "motorcycle", "cyclist", "bicycle", "pedestrian", "other")
-}
-"""How to draw a road user of a category."""

@@ -22,7 +22,7 @@ from log2sim.perception.detect3d.network import grid_window, level_points, raste
 from log2sim.perception.first_pass import cloud_origin
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud
 from log2sim.synth.returns import LIDAR_MODELS
-from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
+from log2sim.synth.traffic import Mount, draw_scene
 
 SWEEPS, REPEATS = 12, 5
 HEAD = ["clouds", "points in range", "cells", "leveling", "grid", "network", "decoding", "cloud to boxes", "over network alone"]  # fmt: skip
@@ -60,7 +60,7 @@ def simulated_clouds(mount: Mount, lidar: str) -> list[tuple[Cloud, float]]:
     for k in range(SWEEPS):
         rng = np.random.default_rng([11, k])
         scene = draw_scene(mount, rng, lidar=LIDAR_MODELS[lidar])
-        points, sensor = labeled_cloud(scene, rng).xyz_m, scene.sensor.position_m
+        points, sensor = scene.cast(rng).xyz_m, scene.sensor.position_m
         out.append((level(points, sensor)[0], fastest_ms(lambda points=points, sensor=sensor: level(points, sensor))))
     return out
 

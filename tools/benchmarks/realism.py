@@ -16,13 +16,24 @@ import numpy as np
 
 from benchmarks.table import markdown
 from benchmarks.warnings import scenarios
+from log2sim.datatypes import Scenario
 from log2sim.simulation.drivers import MODELS, roll_out
 from log2sim.simulation.metrics.realism import COMPONENTS, Realism, Road, realism
-from log2sim.simulation.present import judged, moments, recorded
+from log2sim.simulation.prediction.motion_table import TICK_S
+from log2sim.simulation.present import HISTORY_S, judged, recorded
 
 COUNT, HORIZON_S, EVERY_S = 32, 8.0, 8.0
 
 Results = dict[str, list[Realism]]
+
+
+def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]:
+    """Return times from which agents can be simulated: with a past, and half the horizon at least to compare with."""
+    w = max(scenario.agents, key=lambda a: len(a.waypoints)).waypoints
+    wanted = np.arange(w.t_s[0] + HISTORY_S, w.t_s[-1] - min(horizon_s, w.t_s[-1] - w.t_s[0] - HISTORY_S) / 2, every_s)
+    # Where others have waypoints, too, so that nothing is taken from later ones.
+    rows = np.unique(np.searchsorted(w.t_s, wanted - TICK_S / 4))
+    return [float(t) for t in w.t_s[rows]]
 
 
 def main(logs: list[Path], each: bool = False) -> None:

@@ -26,7 +26,7 @@ from log2sim.synth.returns import LIDAR_MODELS, LidarModel
 from log2sim.synth.terrain import Road
 from log2sim.synth.traffic import TrafficObject, TrafficScene, draw_scene
 from log2sim.synth.traffic_data import REAR_AXLE_OFFSET_M, REAR_AXLE_TO_LIDAR_M, poses_of, run_of, stamps_of
-from log2sim.synth.traffic_shapes import ROAD_USERS
+from log2sim.synth.traffic_shapes import draw_user
 
 TARGET_M, TARGET_DEG, TARGET_S = 0.1, 0.3, 0.02
 RATES_HZ = (10.0, 5.0, 2.0, 20.0)
@@ -93,9 +93,9 @@ def draw_world(
     if kind == "open":
         moving = [o for o in scene.objects if (o.category and o.speed_mps > TRAFFIC_SPEED_MPS) or o.kind == "own car"]
         scene = replace(scene, objects=tuple(moving))
-    run, (size, parts) = run_of(scene, duration_s + 0.5), ROAD_USERS["car"](rng)
+    run, (size, parts) = run_of(scene, duration_s + 0.5), draw_user("car", rng)[1]
     while not 4.0 < size[0] < 5.0:
-        size, parts = ROAD_USERS["car"](rng)
+        size, parts = draw_user("car", rng)[1]
     ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, float(scene.sensor.position_m[2])]))
     model, map_T_pole = _pole(road_lidar, {**step, "rate_hz": rates_hz[1]}, scene, rng)
     phase_s = float(rng.uniform(0, 1 / rates_hz[1]))

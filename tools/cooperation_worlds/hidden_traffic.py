@@ -15,7 +15,7 @@ from cooperation_worlds.runs import NAMES, detect
 from cooperation_worlds.world import ROAD_LIDAR, ROAD_LINES, VEHICLE_LIDAR, Array, Parts
 from log2sim.datatypes import GROUP_OF, Boxes3D, EgoVehicle, Lidar, Log, Stream, Sweep
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.evaluation import average_precision
+from log2sim.evaluation.detection.evaluation import precision_recall
 from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import NS_PER_S, rotation_from_rpy, transform
 from log2sim.synth.polytope_caster import Returns, SensorState, Solid, cast_polytopes
@@ -213,7 +213,7 @@ def figures(rows: dict[str, list[BoxesOfSweep]]) -> dict[str, Any]:
         for kind in KINDS:
             criterion = Criterion("iou_bev", IOU[kind])
             found, truth = (SceneBoxes.join([sweep[kind][k] for sweep in of_way]) for k in (0, 1))
-            ap[kind][way] = average_precision(found, truth, criterion)
+            ap[kind][way] = precision_recall(found, match_detections(found, truth, criterion)).average()
         found, truth = (SceneBoxes.join([sweep["vehicle"][k] for sweep in of_way]) for k in (0, 1))
         hidden = np.concatenate([sweep["vehicle"][2] for sweep in of_way])
         right = match_detections(

@@ -25,7 +25,7 @@ from log2sim.synth.returns import LidarModel, ReturnModel
 from log2sim.synth.scene import LidarSpec, Scene
 from log2sim.synth.synthesis import synthesize
 from log2sim.synth.terrain import Surface
-from log2sim.synth.traffic_shapes import ROAD_USERS, SMALL
+from log2sim.synth.traffic_shapes import SMALL, draw_user
 
 Array = NDArray[np.float64]
 VEHICLE_LIDAR, ROAD_LIDAR = "vehicle_lidar", "road_lidar"
@@ -184,9 +184,9 @@ class Builder:
 
     def drive_ego(self, waypoints: Any) -> None:
         """Let the ego, a car of random shape, drive along waypoints (W, 3: x, y, speed) of its box's center at time 0."""
-        (length, width, height), parts = ROAD_USERS["car"](self.rng)
+        (length, width, height), parts = draw_user("car", self.rng)[1]
         while length > 5.2 or height > VEHICLE_HEIGHT_M - 0.1:
-            (length, width, height), parts = ROAD_USERS["car"](self.rng)
+            (length, width, height), parts = draw_user("car", self.rng)[1]
         self.parts["ego"] = parts
         size = _rounded((length, width, height))
         self.ego = {"waypoints": waypoints, "size_m": size, "rear_axle_offset_m": round(0.3 * length, 3)}
@@ -199,7 +199,7 @@ class Builder:
 
     def draw_shape(self, category: str) -> Shape:
         """Draw the shape of a road user."""
-        return ROAD_USERS[category](self.rng)
+        return draw_user(category, self.rng)[1]
 
     def scatter(self, line: Any, edge_m: float) -> None:
         """Put trees, posts, bins and the like beside both sides of a line (P, 2), farther from it than `edge_m`."""

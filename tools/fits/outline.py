@@ -21,7 +21,7 @@ from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
 from log2sim.synth.returns import LIDAR_MODELS, ReturnModel
 from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic import VEHICLE_LIDAR_SHARES, VEHICLE_LIDARS
-from log2sim.synth.traffic_shapes import ROAD_USERS
+from log2sim.synth.traffic_shapes import draw_user
 
 # By whether the vehicle is tall, and whether most of its length shows.
 NAMES = {(False, True): "LOW", (False, False): "LOW_IN_PART", (True, True): "TALL", (True, False): "TALL_IN_PART"}
@@ -47,7 +47,7 @@ class Seen:
 
 def draw(rng: np.random.Generator) -> Seen | None:
     """Draw a vehicle at the origin that points along x, and cast it."""
-    size, parts = ROAD_USERS[str(rng.choice(list(SHARES), p=list(SHARES.values())))](rng)
+    size, parts = draw_user(str(rng.choice(list(SHARES), p=list(SHARES.values()))), rng)[1]
     solids = [solid(parts, 0.0, 0.0, 0.0, rng), *neighbors(size, rng)]
     model = LIDAR_MODELS[str(rng.choice(VEHICLE_LIDARS, p=VEHICLE_LIDAR_SHARES))]
     step = model.azimuth_step_deg * float(rng.choice([1.0, 1.2, 1.5]))
@@ -83,7 +83,7 @@ def neighbors(size, rng: np.random.Generator) -> list[Solid]:
         if place < 0.6 and rng.random() < 0.7:
             along = end * (size[0] / 2 + 2.3 + rng.uniform(0.6, 2.5)) if place < 0.4 else rng.normal(0, 0.3)
             beside = rng.normal(0, 0.15) if place < 0.4 else end * (size[1] / 2 + 0.9 + rng.uniform(0.5, 1.2))
-            found.append(solid(ROAD_USERS["car"](rng)[1], along, beside, np.pi * rng.integers(2), rng))
+            found.append(solid(draw_user("car", rng)[1][1], along, beside, np.pi * rng.integers(2), rng))
     return found
 
 

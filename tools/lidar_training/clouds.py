@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,36 @@ from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
 from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M, rasterize
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, Ground, estimate_ground
-from log2sim.synth.traffic import Mount, draw_scene, labeled_cloud
+from log2sim.synth.traffic import Mount, TrafficScene, draw_scene
+
+
+@dataclass(frozen=True, eq=False)
+class LabeledCloud:
+    """A cloud and the road users in it, as a network is trained on."""
+
+    xyz_m: NDArray[np.float32]  # (N, 3), m: level frame
+    hit: NDArray[np.int32]  # (N,): index of the object, -1 for the ground
+    category: NDArray[np.str_]  # (M,): of the road users
+    # (M, 7) float64: x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's
+    # points
+    boxes: Array
+    points: NDArray[np.int64]  # (M,): number of points on each
+    scene: TrafficScene = field(repr=False)
+
+
+def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud:
+    """Cast a scene and label its road users."""
+    cloud = scene.cast(rng)
+    users = [k for k, o in enumerate(scene.objects) if o.category]
+    count = np.bincount(cloud.hit[cloud.hit >= 0], minlength=len(scene.objects))
+    total_s = np.bincount(cloud.hit[cloud.hit >= 0], cloud.t_s[cloud.hit >= 0], minlength=len(scene.objects))
+    boxes = np.zeros((len(users), 7))
+    for row, k in enumerate(users):
+        item = scene.objects[k]
+        position, yaw = item.pose_at(float(total_s[k] / max(count[k], 1)))
+        boxes[row] = *position[:2], position[2] + item.size_m[2] / 2, *item.size_m, yaw
+    category = np.array([scene.objects[k].category for k in users], dtype="<U16")
+    return LabeledCloud(cloud.xyz_m, cloud.hit, category, boxes, count[users], scene)
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,8 @@ from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Log
 from log2sim.errors import RecordError
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.evaluation.detection.evaluation import average_precision
-from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion
+from log2sim.evaluation.detection.evaluation import precision_recall
+from log2sim.evaluation.detection.protocols import MIN_POINTS, Criterion, match_detections
 from log2sim.geometry import (
     Array,
     box_corners,
@@ -491,7 +491,8 @@ def compare(searches: dict[str, Search], pairs: Sequence[Pair]) -> dict[str, dic
         for kind, criteria in CRITERIA.items():
             f = SceneBoxes.join([b.take((b.category == kind) & (b.range_m < MAX_RANGE_M)) for b in found])
             t = SceneBoxes.join([truth_of(pair, kind) for pair in pairs])
-            row[kind] = {str(c): average_precision(f, t, c) for c in criteria} | {"truths": int((~t.ignored).sum())}
+            ap = {str(c): precision_recall(f, match_detections(f, t, c)).average() for c in criteria}
+            row[kind] = ap | {"truths": int((~t.ignored).sum())}
         out[name] = row
     return out
 

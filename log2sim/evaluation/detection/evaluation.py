@@ -21,7 +21,6 @@ from log2sim.evaluation.detection.protocols import (
     ObjectClass,
     assign_boxes,
     candidate_pairs,
-    match_detections,
 )
 from log2sim.evaluation.detection.truth import ImageViews, image_views, truth_of_sweeps
 from log2sim.evaluation.metrics.comparison import MIN_REGION_SHARE
@@ -107,16 +106,6 @@ def precision_recall(found: SceneBoxes, matches: Matches) -> PrecisionRecall:
     right = np.cumsum(matches.right[rows])[last]
     recall = right / matches.truths if matches.truths else np.zeros(len(last))
     return PrecisionRecall(score[last], right / (last + 1), recall, matches.truths)
-
-
-def average_precision(
-    found: SceneBoxes, truth: SceneBoxes, criterion: Criterion, recall_points: int = 40
-) -> float | None:
-    """Compute the average precision of the boxes of one class; None without counted true boxes.
-
-    `recall_points`: as in `PrecisionRecall.average`.
-    """
-    return precision_recall(found, match_detections(found, truth, criterion)).average(recall_points)
 
 
 def operating_point(found: SceneBoxes, matches: Matches, min_score: float) -> dict[str, Any]:

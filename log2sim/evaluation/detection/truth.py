@@ -14,6 +14,7 @@ from log2sim.errors import LogError
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.detect_log import clouds, middle_ns, take_ticks
 from log2sim.evaluation.metrics.truth import MAX_STAMP_LAG_NS, image_shares, rows_by_track
+from log2sim.files.arrays import Columns
 from log2sim.geometry import NS_PER_S, Array, inverse, nearest_index, period_of, project_boxes, wrap_angle
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import cloud_origin
@@ -99,17 +100,13 @@ def _along(
 
 
 @dataclass(frozen=True, eq=False)
-class ImageViews:
+class ImageViews(Columns):
     """M boxes in the images of one camera."""
 
     shown: NDArray[np.bool_]  # (M,) whether the image shows a part of the box
     height_px: Array  # (M,) height of the box in the image, clipped to it; 0 where it is not shown
     truncation: Array  # (M,) share of the outline outside the image; 1 where it is not shown
     region_share: Array  # (M,) greatest share of the image box in one region left without labels
-
-    def take(self, rows: NDArray[np.bool_]) -> ImageViews:
-        """Take the rows of a mask."""
-        return ImageViews(self.shown[rows], self.height_px[rows], self.truncation[rows], self.region_share[rows])
 
 
 def image_views(

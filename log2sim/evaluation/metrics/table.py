@@ -101,7 +101,7 @@ def _noun(count: int, noun: str) -> str:
 MAX_COLUMNS = 100
 MAX_NAMED = 3  # agents that a line of the verdict names; the tables have more, the document all
 MAX_NAME = 16  # characters of the id of a labeled object; some logs use 36
-_COLUMNS = (
+COLUMNS = (
     ("recall", "recall %", 1), ("precision", "precis. %", 1), ("position_rmse_m", "rms m", 2), ("position_median_m", "med m", 2),
     ("yaw_median_deg", "yaw deg", 1), ("speed_rmse_mps", "m/s", 2), ("size_median_m", "size m", 2), ("id_switches", "id sw", 0),
     ("mota", "MOTA", 3), ("hota", "HOTA", 3),
@@ -196,20 +196,24 @@ def format_table(result: Mapping[str, Any]) -> str:
                 why_not = [str(count or "-") for count in part["why_not"].values()]
                 cells.append([name, str(part["labeled"]), str(part["counted"]), *why_not, *hit])
         blocks += columns_text(cells)
-    cells = [["", "agents", *(title for _, title, _ in _COLUMNS)]]
+
+    def values(figures: Mapping[str, Any]) -> list[str]:
+        return figure_cells({**figures, "id_switches": figures.get("id_switches") or None})
+
+    cells = [["", "agents", *(title for _, title, _ in COLUMNS)]]
     for name, figures in lines:
         if figures is result or any(figures["counts"].values()):
-            cells.append([name, str(figures["counts"]["truth_agents"]), *_values(figures)])
+            cells.append([name, str(figures["counts"]["truth_agents"]), *values(figures)])
     if result["ego"] is not None:
-        cells.append(["ego", "", *_values(result["ego"])])
+        cells.append(["ego", "", *values(result["ego"])])
     blocks += ["", *columns_text(cells)] if blocks else columns_text(cells)
     return "\n".join([*blocks, *correctness_lines(result["correctness"]), *map_lines(result)])
 
 
-def _values(figures: Mapping[str, Any]) -> list[str]:
+def figure_cells(figures: Mapping[str, Any]) -> list[str]:
+    """Format the figures of a row of `COLUMNS`; '-' for None, nothing for those that it has not."""
     scale = {"recall": 100, "precision": 100}
-    found = {**figures, "id_switches": figures.get("id_switches") or None}
-    return [cell(found[key], n, scale.get(key, 1)) if key in found else "" for key, _, n in _COLUMNS]
+    return [cell(figures[key], n, scale.get(key, 1)) if key in figures else "" for key, _, n in COLUMNS]
 
 
 def columns_text(cells: Sequence[Sequence[str]], heads: int = 1) -> list[str]:

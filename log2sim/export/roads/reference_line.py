@@ -10,10 +10,10 @@ import numpy as np
 
 from log2sim.geometry import Array
 
-# Largest distance of the smoothing spline from the path, and of the arcs from the spline: together below TOLERANCE_M.
-TOLERANCE_M, SPLINE_M, ARCS_M = 0.01, 0.007, 0.002
-# Closer points of a path are merged; between points farther apart the path is sampled on their connecting line.
-MIN_STEP_M, MAX_STEP_M = 0.01, 0.25
+# Largest distance of the smoothing spline from the path, and of the arcs from the spline: together below 1 cm.
+SPLINE_M, ARCS_M = 0.007, 0.002
+# Between points farther apart a path is sampled on their connecting line.
+MAX_STEP_M = 0.25
 SAMPLE_M = 0.2
 # Longer paths are sampled more coarsely, which bounds the run time.
 MAX_POINTS = 20_000

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import Labels, Sweep
 from log2sim.errors import LogError, RecordError
+from log2sim.files.arrays import Columns
 from log2sim.files.documents import RepeatedKeysError, read_json, require_unique, unique_decoder
 from log2sim.files.inputs import inside, open_regular, require_link_inside
 from log2sim.geometry import Array, PoseTrack, apply, inverse, rotation_from_quaternion, transform, wrap_angle, yaw_of
@@ -391,7 +392,7 @@ MAX_GAP_NS = 1_100_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _Rows(Columns):
     """Annotations as columns, A rows, in the order of instances and stamps."""
 
     sample: NDArray[np.int64]
@@ -403,10 +404,6 @@ class _Rows:
     size_m: Array
     yaw_rad: Array
     visible: NDArray[np.bool_]
-
-    def take(self, index: NDArray[Any], **changes: Any) -> _Rows:
-        """Select rows; `changes` replace columns of the selection."""
-        return _Rows(**{**{name: column[index] for name, column in vars(self).items()}, **changes})
 
 
 def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: list[str]) -> Labels | None:
@@ -439,8 +436,7 @@ def read_labels(scene: Scene, lidar: Channel | None, offset_m: Array, notes: lis
     number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
     step_ns = (step // (missing + 1))[first]
     ends_ns = np.union1d(t_ns, t_ns[first] + number * step_ns)
-    parts = [rows, _between(scene, lidar, rows, stamps, ends_ns)]
-    rows = _Rows(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(rows)})
+    rows = _Rows.join([rows, _between(scene, lidar, rows, stamps, ends_ns)])
     rows = rows.take(np.argsort(rows.t_ns, kind="stable"))
     return Labels(
         rows.t_ns, rows.track_id, rows.category, rows.center_m - offset_m, rows.size_m, rows.yaw_rad, rows.visible,
@@ -479,7 +475,7 @@ def _between(
     center = rows.center_m[pair] + share[:, None] * step
     yaw = wrap_angle(rows.yaw_rad[pair] + share * turn)
     nearer = np.where(share <= 0.5, pair, pair + 1)
-    return rows.take(nearer[keep], t_ns=t_ns[keep], center_m=center[keep], yaw_rad=yaw[keep])
+    return replace(rows.take(nearer[keep]), t_ns=t_ns[keep], center_m=center[keep], yaw_rad=yaw[keep])
 
 
 def _rows_of(scene: Scene, annotations: list[Record], samples: dict[str, int], notes: list[str]) -> _Rows:
