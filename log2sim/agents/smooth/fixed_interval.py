@@ -37,7 +37,7 @@ from log2sim.agents.smooth.quadratic import (
     zero_motion,
 )
 from log2sim.files.arrays import Columns
-from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index
+from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index, runs_of
 
 # A place is known before to some car lengths: the gates of the tracker reach as far.
 PLACE_SIGMA_M = 5.0
@@ -162,19 +162,16 @@ def zero_velocity_sigma(
     sigma = np.sqrt(np.trace(covariance[:, 2:4, 2:4], axis1=1, axis2=2) / 2)
     slow = speed < CANDIDATE_MPS + CANDIDATE_SIGMAS * sigma
     out = np.full(len(knots_s), np.inf)
-    if not slow.any():
-        return out
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
-    for first, last in zip(edges[::2], edges[1::2] - 1):
-        inside = np.flatnonzero((measurement.knot >= first) & (measurement.knot <= last) & (weight > MIN_WEIGHT))
+    for first, end in runs_of(slow):
+        inside = np.flatnonzero((measurement.knot >= first) & (measurement.knot < end) & (weight > MIN_WEIGHT))
         span = _trim_to_standstill(measurement, inside, speed[measurement.knot])
         if len(span):
             # A candidate that reaches the track's end stands until then.
             begin = first if first == 0 and span[0] == inside[0] else measurement.knot[span[0]]
-            end = last if last == len(knots_s) - 1 and span[-1] == inside[-1] else measurement.knot[span[-1]]
-            since = np.inf if begin == 0 else knots_s[begin : end + 1] - knots_s[begin]
-            until = np.inf if end == len(knots_s) - 1 else knots_s[end] - knots_s[begin : end + 1]
-            out[begin : end + 1] = STANDSTILL_SIGMA_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
+            last = end - 1 if end == len(knots_s) and span[-1] == inside[-1] else measurement.knot[span[-1]]
+            since = np.inf if begin == 0 else knots_s[begin : last + 1] - knots_s[begin]
+            until = np.inf if last == len(knots_s) - 1 else knots_s[last] - knots_s[begin : last + 1]
+            out[begin : last + 1] = STANDSTILL_SIGMA_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
     return out
 
 
