@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Frame, Log
 from log2sim.errors import ConfigError
 from log2sim.geometry import Camera
-from log2sim.perception.detect.detectors import create_detector, detect_all
+from log2sim.perception.detect.detectors import create_detector
 
 onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
 WIDTH, HEIGHT = 96, 64  # of the input: 12*8 + 6*4 + 3*2 cells
@@ -186,7 +186,7 @@ def test_frames_that_are_searched_together_have_the_boxes_of_each_alone(tiles: i
     images = [np.tile(shade[None, :, None], (128, 1, 3)) for shade in shades]
     frames = [Frame(Camera("c", i.shape[1], 128, np.eye(3), "ego", np.eye(4)), 0, lambda i=i: i) for i in images]
     alone = [detector.detect(frame) for frame in frames]
-    for one, together in zip(alone, detect_all(detector, frames), strict=True):
+    for one, together in zip(alone, detector.detect_many(frames), strict=True):
         assert len(one)
         np.testing.assert_array_equal(together.box_px, one.box_px)
         np.testing.assert_array_equal(together.score, one.score)

@@ -15,9 +15,8 @@ Treatment = Literal["left_out", "corrected", "kept"]
 
 
 class Kind(NamedTuple):
-    """What a kind of findings means, which numbers it carries, and its sentence."""
+    """The sentence of a kind of findings, and which numbers it carries."""
 
-    meaning: str
     # Format of the numbers and of `other`, `when`, `done`; where the kind has several cases, one for each.
     words: str | Mapping[str, str]
     numbers: tuple[str, ...] = ()  # with units; `at_s`: when it is worst, which the sentence ends with
@@ -53,39 +52,18 @@ OFF_MAP = (
 )
 
 AGENT_KINDS: Mapping[str, Kind] = {
-    "acceleration": Kind(
-        "accelerates or brakes harder than vehicles can", "accelerates at {most_mps2:.0f} m/s2", ("most_mps2", "at_s")
-    ),
-    "lateral_acceleration": Kind(
-        "accelerates sideways harder than tires hold",
-        "accelerates sideways at {most_mps2:.0f} m/s2",
-        ("most_mps2", "at_s"),
-    ),
-    "curvature": Kind(
-        "turns on a smaller circle than vehicles can", "turns on a circle of {radius_m:.1f} m", ("radius_m", "at_s")
-    ),
-    "jerk": Kind(
-        "changes its acceleration faster than brakes can", "jerks at {most_mps3:.0f} m/s3", ("most_mps3", "at_s")
-    ),
-    "speed": Kind("is faster than anything of its category", "moves at {most_mps:.0f} m/s {when}", ("most_mps",)),
-    "reversing": Kind("drives backward fast or far", "reverses at up to {most_mps:.1f} m/s {when}", ("most_mps",)),
-    "sideways": Kind("slides across its length", "slides across its length {when}"),
-    "jump": Kind(
-        "its measurements are far from its trajectory",
-        "measured up to {residual_m:.1f} m off its path {when}",
-        ("residual_m",),
-    ),
-    "passes_through": Kind(
-        "is in the place of another agent", {"": "passes through {other}", "static": "stands in {other}"}, ("at_s",)
-    ),
-    "in_ego": Kind("touches the ego", "touches the ego", ("at_s",)),
-    "empty": Kind(
-        "LiDAR rays pass through its place",
-        "{through_share:.0%} of the LiDAR's rays pass through its place",
-        ("through_share",),
-    ),
+    "acceleration": Kind("accelerates at {most_mps2:.0f} m/s2", ("most_mps2", "at_s")),
+    "lateral_acceleration": Kind("accelerates sideways at {most_mps2:.0f} m/s2", ("most_mps2", "at_s")),
+    "curvature": Kind("turns on a circle of {radius_m:.1f} m", ("radius_m", "at_s")),
+    "jerk": Kind("jerks at {most_mps3:.0f} m/s3", ("most_mps3", "at_s")),
+    "speed": Kind("moves at {most_mps:.0f} m/s {when}", ("most_mps",)),
+    "reversing": Kind("reverses at up to {most_mps:.1f} m/s {when}", ("most_mps",)),
+    "sideways": Kind("slides across its length {when}"),
+    "jump": Kind("measured up to {residual_m:.1f} m off its path {when}", ("residual_m",)),
+    "passes_through": Kind({"": "passes through {other}", "static": "stands in {other}"}, ("at_s",)),
+    "in_ego": Kind("touches the ego", ("at_s",)),
+    "empty": Kind("{through_share:.0%} of the LiDAR's rays pass through its place", ("through_share",)),
     "hardly_observed": Kind(
-        "the LiDAR or the cameras look toward it and hardly ever show it",
         {
             "no_points": "the LiDAR looks toward it and has no point of it",
             "any": "is detected at {detected_ticks:.0f} of {shown_ticks:.0f} ticks that show it well",
@@ -94,45 +72,30 @@ AGENT_KINDS: Mapping[str, Kind] = {
         ("detected_ticks", "shown_ticks"),
     ),
     "unlikely_size": Kind(
-        "has a size that no road vehicle has",
         {
             "width": "is {width_m:.1f} m wide, road vehicles have at most {limit_m:.1f} m",
             "length": "is longer than the {limit_m:.1f} m of the longest {other}",
         },
         ("width_m", "limit_m"),
     ),
-    "heading_ambiguous": Kind("front and back may be swapped", "front and back may be swapped"),
+    "heading_ambiguous": Kind("front and back may be swapped"),
 }
 """The kinds that speak against an agent; a scenario file calls them flags."""
 
 SENSOR_KINDS: Mapping[str, Kind] = {
-    "frozen_images": Kind(
-        "a camera repeats a picture while the ego or the scene moves",
-        "pictures repeat an earlier one: {count:.0f} of {total:.0f} {when}; they are not used",
-        SPAN,
-    ),
+    "frozen_images": Kind("pictures repeat an earlier one: {count:.0f} of {total:.0f} {when}; they are not used", SPAN),
     "black_images": Kind(
-        "pictures of a camera show nothing",
         "pictures show nothing (black, covered, of one color): {count:.0f} of {total:.0f} {when}; they are not used",
         SPAN,
     ),
     "missing_images": Kind(
-        "a camera gives no pictures for longer than usual",
-        "no pictures {when} (gaps: {gaps:.0f}, the longest of {longest_s:.2f} s)",
-        ("gaps", "longest_s"),
+        "no pictures {when} (gaps: {gaps:.0f}, the longest of {longest_s:.2f} s)", ("gaps", "longest_s")
     ),
-    "repeated_sweeps": Kind(
-        "a LiDAR repeats a sweep",
-        "sweeps repeat an earlier one: {count:.0f} of {total:.0f} {when}; they are not used",
-        SPAN,
-    ),
+    "repeated_sweeps": Kind("sweeps repeat an earlier one: {count:.0f} of {total:.0f} {when}; they are not used", SPAN),
     "missing_sweeps": Kind(
-        "a LiDAR gives no sweeps for longer than usual",
-        "no sweeps {when} (gaps: {gaps:.0f}, the longest of {longest_s:.2f} s)",
-        ("gaps", "longest_s"),
+        "no sweeps {when} (gaps: {gaps:.0f}, the longest of {longest_s:.2f} s)", ("gaps", "longest_s")
     ),
     "sparse_sweeps": Kind(
-        "sweeps have next to no points",
         {
             "some": "sweeps have at most {most_points:.0f} points where {usual_points:.0f} are usual: "
             "{count:.0f} of {total:.0f} {when}",
@@ -141,7 +104,6 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         (*SPAN, "most_points", "usual_points"),
     ),
     "pose_jump": Kind(
-        "the ego's position jumps farther than the ego can drive",
         {
             "kept": "the position steps by {shift_m:.1f} m {when}, farther than a vehicle moves: it jumped, or the stamps miss "
             "some time, which does not show; used as it is",
@@ -151,7 +113,6 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         REPAIR,
     ),
     "frozen_poses": Kind(
-        "the ego's pose stays while the ego moves",
         {
             "copies": "{poses:.0f} poses {when} repeat the one before while the ego moves on by up to {shift_m:.1f} m, as those "
             "of a slower source do: they are not used",
@@ -161,7 +122,6 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         REPAIR,
     ),
     "sparse_poses": Kind(
-        "poses are farther apart than usual and are interpolated by the ego's motion",
         {
             "corrected": "poses are up to {longest_s:.2f} s apart {when} (gaps: {gaps:.0f}): {other} interpolates them, to "
             "{sigma_m:.2f} m (1 sigma)",
@@ -171,19 +131,16 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         ("longest_s", "gaps", "sigma_m", "duration_s", "unknown_s"),
     ),
     "time_offset": Kind(
-        "the stamps of a sensor are off against the poses",
         "stamps are off by {offset_ms:+.0f} ms (+: late) against the poses of the ego (sigma {offset_sigma_ms:.0f} ms), by which what "
         "the sensor sees is up to {moved_m:.1f} m out of place; {done}",
         ("offset_s", "offset_sigma_s", "pose_error_m", "moved_m"),
         "--fix-time",
     ),
     "unknown_offset": Kind(
-        "stamps were to be corrected, but the ego's motion does not show their offset",
         "stamps are not corrected: the ego's motion does not show whether they are off, which takes that it speeds up, brakes or "
-        "turns",
+        "turns"
     ),
     "lidar_rotation": Kind(
-        "the mount of a LiDAR is rotated against its calibration",
         {
             "mount": BY_MOTION + "; {done}",
             "heading": BY_MOTION
@@ -196,27 +153,21 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         FIX,
     ),
     "lidar_translation": Kind(
-        "the mount of a LiDAR, or the ego's origin, is elsewhere than in the calibration",
         "its mount in the calibration, or the ego's origin, is {x_m:+.2f} m too far forward, {y_m:+.2f} m left, {z_m:+.2f} m up "
         "(sigma {x_sigma_m:.2f}, {y_sigma_m:.2f}, {z_sigma_m:.2f}) by how the ego turns; {done}",
         TRANSLATION,
         FIX,
     ),
     "unknown_rotation": Kind(
-        "a mount was to be corrected, but the ego's motion does not show its rotation",
         {
             "motion": "the mount is not corrected: the ego's motion does not show whether it is turned",
             "edges": "the mount is not corrected: the edges that {other} sees do not show whether it is turned",
-        },
+        }
     ),
     "camera_rotation": Kind(
-        "the mount of a camera is rotated against its calibration",
-        {"camera": BY_EDGES + "; {done}", "either": BY_EDGES + ", or the mount of {other} is; {done}"},
-        TURN,
-        FIX,
+        {"camera": BY_EDGES + "; {done}", "either": BY_EDGES + ", or the mount of {other} is; {done}"}, TURN, FIX
     ),
     "swapped_cameras": Kind(
-        "cameras have each other's calibration",
         {
             "edges": "sees {other}'s points: " + FITS + " the mount of {other} " + NOT_OWN,
             "exchanged": "its mount is that of {other}, whose images fit edges that the LiDAR sees with it " + NOT_OWN,
@@ -226,7 +177,6 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         FIX,
     ),
     "wrong_mount": Kind(
-        "the mount of a camera is inverted, or its images are turned",
         {
             "inverted": "its mount in the calibration is inverted: " + FITS + " the inverse " + NOT_OWN,
             "turned": "its images are turned by {turn_deg:.0f} degrees: "
@@ -238,29 +188,23 @@ SENSOR_KINDS: Mapping[str, Kind] = {
         FIX,
     ),
     "road_pose": Kind(
-        "the pose of a roadside unit is off against the ego's map",
-        {"all": OFF_MAP + "corrected", "height_and_tilt": OFF_MAP + "its height and tilt are corrected"},
-        ROAD_POSE,
+        {"all": OFF_MAP + "corrected", "height_and_tilt": OFF_MAP + "its height and tilt are corrected"}, ROAD_POSE
     ),
     "road_clock": Kind(
-        "the stamps of a roadside unit are off against the ego's clock",
         "the stamps of its pole are off by {delay_ms:+.0f} ms (+: late) against the ego's clock (sigma {delay_sigma_ms:.0f} ms), by "
         "road users that both ends see move; corrected",
         ROAD_POSE,
     ),
     "unknown_road_pose": Kind(
-        "the vehicle sees too little of what a roadside unit sees to know its pose to 0.1 m and 0.3 degrees",
         "its place in the plane is known no better than to a sigma of {x_sigma_m:.2f}, {y_sigma_m:.2f} m and {yaw_sigma_deg:.1f} degrees "
         "of yaw: the vehicle sees too little of what it sees",
         ROAD_POSE,
     ),
     "unknown_road_clock": Kind(
-        "both ends see too little that moves to know the clock of a roadside unit to 20 ms",
         "its clock is known no better than to a sigma of {delay_sigma_ms:.0f} ms against the ego's: both ends see too little that moves",
         ROAD_POSE,
     ),
     "wrong_road_pose": Kind(
-        "the vehicle saw through what a roadside unit sees, and no pose near its own makes both fit",
         "its pose cannot be trusted: the vehicle saw through {through_share:.0%} of the upright surfaces that it sees, and no pose "
         "within 0.5 m and 2 degrees makes both fit; left out",
         ("through_share",),
@@ -269,29 +213,16 @@ SENSOR_KINDS: Mapping[str, Kind] = {
 """The kinds that concern a sensor, its clock or mount, or the ego's poses: the faults of a report."""
 
 RUN_KINDS: Mapping[str, Kind] = {
-    "planar_motion": Kind(
-        "poses come from a camera", "camera motion is planar, and some percent of its path may be wrong"
-    ),
-    "predicted_poses": Kind(
-        "poses were predicted where nothing was measured",
-        "{other}: {count:.0f} of {total:.0f} poses are predicted",
-        SPAN,
-    ),
+    "planar_motion": Kind("camera motion is planar, and some percent of its path may be wrong"),
+    "predicted_poses": Kind("{other}: {count:.0f} of {total:.0f} poses are predicted", SPAN),
     "degenerate_sweeps": Kind(
-        "sweeps do not hold a direction of motion",
-        "LiDAR odometry: {count:.0f} of {total:.0f} sweeps show too little that holds one direction of motion",
-        SPAN,
+        "LiDAR odometry: {count:.0f} of {total:.0f} sweeps show too little that holds one direction of motion", SPAN
     ),
-    "sweeps_without_pose": Kind("odometry found no pose", "LiDAR odometry: sweeps that gave no pose: {other}"),
-    "moved_ego": Kind(
-        "the ego moved in the map, its surroundings did not",
-        "sensors fixed in the map stay there, labels move with the ego: they may not fit to each other",
-    ),
-    "unreadable": Kind("records are damaged", "{count:.0f} records could not be read, first: {other}", ("count",)),
-    "frames_without_pose": Kind(
-        "frames have no place", "{count:.0f} frames skipped, since no ego pose is known at their stamps", ("count",)
-    ),
-    "not_cached": Kind("later runs start from the beginning", "the first pass is not kept for later runs: {other}"),
+    "sweeps_without_pose": Kind("LiDAR odometry: sweeps that gave no pose: {other}"),
+    "moved_ego": Kind("sensors fixed in the map stay there, labels move with the ego: they may not fit to each other"),
+    "unreadable": Kind("{count:.0f} records could not be read, first: {other}", ("count",)),
+    "frames_without_pose": Kind("{count:.0f} frames skipped, since no ego pose is known at their stamps", ("count",)),
+    "not_cached": Kind("the first pass is not kept for later runs: {other}"),
 }
 """The kinds that concern estimated poses, records and the cache, which a report has in places of their own."""
 

@@ -49,6 +49,7 @@ from log2sim.geometry.statistics import (
     choose_pairs,
     fit_windows,
     median,
+    runs_of,
     weighted_quantile,
 )
 from log2sim.geometry.transforms import (
@@ -78,6 +79,6 @@ __all__ = [
     "cos_sin", "cross_slab", "crossings", "distort", "fit_windows", "fold_radius", "ground_homography", "homography_jacobian", "inverse", "line_stamps_ns", "line_time_s",
     "median", "nearest_index", "nearest_rotation", "outline", "overlap_of_smaller", "period_of", "points_in_box", "project",
     "project_boxes", "project_moving", "quaternion_from_rotation", "rectangle_iou", "rectangle_overlap",
-    "rectangles_overlap", "rotation_from_quaternion", "rotation_from_rpy", "separating_axes", "shift_poses", "slerp",
+    "rectangles_overlap", "rotation_from_quaternion", "rotation_from_rpy", "runs_of", "separating_axes", "shift_poses", "slerp",
     "transform", "undistort", "upright_box_iou", "weighted_quantile", "whole_kilometers", "wrap_angle", "yaw_of",
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Assignment, gates, medians, quantiles, and polynomials fitted to windows."""
+"""Assignment, gates, medians, quantiles, runs of a mask, and polynomials fitted to windows."""
 
 from __future__ import annotations
 
@@ -50,6 +50,12 @@ def choose_pairs(
         taken = place[linear_sum_assignment(table)]
         chosen.append(taken[taken >= 0])
     return np.sort(np.concatenate(chosen))
+
+
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """List the runs of True in a mask (T,): the first row of each and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
 
 
 def median(values: NDArray[Any]) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Finding, Log
-from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, yaw_of
+from log2sim.geometry import NS_PER_S, Array, PoseTrack, rotation_from_rpy, runs_of, yaw_of
 from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.path import (
     MAX_DENSE_S,
@@ -21,7 +21,6 @@ from log2sim.localization.path import (
     bridge,
     independent_noise,
     repair_path,
-    runs_of,
     smooth_path,
 )
 

@@ -200,8 +200,6 @@ class Fit:
     residual: float  # mean squared Mahalanobis distance of these points, without unit
     constraint: float  # share of points, as if all were square to it, that hold the weakest direction of translation
     weakest: Array  # (3,): that direction, in the frame of the map
-    # (6, 6): of rotation vector and translation, rad and m; the inverse of the information matrix, hence optimistic
-    covariance: Array
 
 
 def load_small_gicp() -> ModuleType:
@@ -253,7 +251,6 @@ class SurfaceMap:
             2 * float(found.error) / count,
             constraint,
             pose[:3, :3] @ weakest,
-            np.linalg.pinv(information),
         )
 
     def holds(self, surfaces: Any, fit: Fit) -> bool:
@@ -305,7 +302,6 @@ class Odometry:
     overlap: Array  # `overlap`, `residual`, `constraint`: (P,): see `Fit`; NaN where the pose is only predicted
     residual: Array
     constraint: Array
-    weakest: Array  # (P, 3): direction of the weakest constraint, odometry frame
     degenerate: NDArray[np.bool_]  # (P,): whether the sweep does not constrain some direction of the motion
     # (P,): whether the sweep did not fit to the others and the pose is predicted by constant velocity
     predicted: NDArray[np.bool_]
@@ -350,12 +346,12 @@ def run_odometry(
     problems = dict(run.problems) | ({"of another part of the drive": lost} if lost else {})
     fits = [step.fit for step in best]
 
-    def column(name: str, missing: Any = np.nan) -> Array:
-        return np.array([missing if fit is None else getattr(fit, name) for fit in fits], dtype=np.float64)
+    def column(name: str) -> Array:
+        return np.array([np.nan if fit is None else getattr(fit, name) for fit in fits], dtype=np.float64)
 
     return Odometry(
         lidar, np.array([step.t_ns for step in best], dtype=np.int64), np.stack([step.pose for step in best]),
-        column("overlap"), column("residual"), column("constraint"), column("weakest", np.full(3, np.nan)),
+        column("overlap"), column("residual"), column("constraint"),
         np.array([not step.held for step in best]), np.array([step.predicted for step in best]), len(index), problems,
     )  # fmt: skip
 

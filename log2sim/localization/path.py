@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.geometry import Array
+from log2sim.geometry import Array, runs_of
 
 # Derivatives are taken over these times: the first finds jumps and sudden stops, the second jumps that take a while. Shorter ones
 # would find the vibration of the vehicle and the last digits of stored poses.
@@ -253,8 +253,7 @@ def find_parts(samples: Samples) -> list[Part]:
     broken = find_breaks(samples)
     if not broken.any():
         return [Part(np.arange(len(samples.t_s)))]
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], broken, [True]]).astype(np.int8)))
-    cores = [np.arange(first, end) for first, end in zip(edges[::2].tolist(), edges[1::2].tolist())]
+    cores = [np.arange(first, end) for first, end in runs_of(~broken)]
     if not cores:
         return []
     parts = [Part(rows) for rows in _grown(samples, cores)]
@@ -497,12 +496,6 @@ def repair_path(t_s: Array, values: Array, limits: Limits, wrong: NDArray[np.boo
             continue
         new[first:stop], sigma[first:stop] = fitted.value, fitted.sigma
     return RepairedPath(limits, new, sigma, noise, moved, bridged, at_rest & bridged, tuple(skips))
-
-
-def runs_of(marked: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """List the runs of marked rows: the first row of each and the one after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
 
 
 def bridge(

@@ -33,9 +33,9 @@ from log2sim.perception.detect.detectors import (
     CheckedDetector,
     Detector,
     FunctionDetector,
-    TilingDetector,
     create_detector,
 )
+from log2sim.perception.detect.onnx_detector import OnnxDetector
 from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
 
 KEY_BYTES = 16
@@ -313,7 +313,7 @@ class Detectors:
     def search_tiles(self, cameras: Iterable[Camera]) -> bool:
         """Whether several tiles of the pictures of one of the cameras are searched besides the whole picture."""
         images = self.images
-        return isinstance(images, TilingDetector) and any(
+        return isinstance(images, OnnxDetector) and any(
             len(images.tiles_of(c.width_px, c.height_px)) > 2 for c in cameras
         )
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Log
-from log2sim.geometry import NS_PER_S, Array, Camera, inverse, project, project_moving
+from log2sim.geometry import Array, Camera, inverse, project, project_moving
+from log2sim.perception.lidar.projection import poses_around
 from log2sim.road.ground_map import Raster
 from log2sim.road.surface import Surface, upsample
 
@@ -86,18 +87,11 @@ class View:
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Project points (N, 3), m, map frame: pixels (N, 2), NaN behind the camera, and depths (N,), m."""
-        log = self.log
-        if log is None or self.camera.rolling_shutter is None or self.camera.mount == "map":
+        if self.log is None or self.camera.rolling_shutter is None or self.camera.mount == "map":
             cam_T_map = inverse(self.map_T_cam)
             local = points @ cam_T_map[:3, :3].T + cam_T_map[:3, 3]
             return project(self.camera, local)[0], local[:, 2]
-
-        def cam_T_map_at(t_s: Array) -> Array:
-            t_ns = self.t_ns + np.round(t_s * NS_PER_S).astype(np.int64)
-            poses, known = log.map_T_sensor(self.camera.name, t_ns)
-            return inverse(np.where(known[:, None, None], poses, self.map_T_cam))
-
-        uv, depth, _ = project_moving(self.camera, points, cam_T_map_at)
+        uv, depth, _ = project_moving(self.camera, points, poses_around(self.log, self.camera.name, self.t_ns))
         return uv, depth
 
 

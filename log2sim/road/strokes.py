@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from log2sim.geometry import Array, median
+from log2sim.geometry import Array, median, runs_of
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.ridges import sample
 
@@ -145,8 +145,7 @@ class Trace:
 
     def strokes(self) -> Array:
         """Begin and end (K, 2) of the parts with paint, m, without flakes and small gaps."""
-        change = np.flatnonzero(np.diff(np.concatenate([[False], self.on, [False]]).astype(np.int8)))
-        runs = np.stack([change[::2], change[1::2] - 1], 1)
+        runs = np.array(runs_of(self.on), dtype=np.intp).reshape(-1, 2) - [0, 1]
         merged: list[list[float]] = []
         for begin, end in self.s[runs] + np.array([-STEP_M / 2, STEP_M / 2]):
             between = self.seen[(self.s > merged[-1][1]) & (self.s < begin)] if merged else self.seen[:0]

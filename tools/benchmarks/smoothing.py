@@ -155,8 +155,8 @@ def of_derivatives(xy: Array, velocity: Array, acceleration: Array) -> Result:
     return xy, velocity, np.arctan2(velocity[:, 1], velocity[:, 0]), across / speed**3
 
 
-def log2sim(t: Array, xy: Array, sigma: float, *, told: bool = True) -> Result:
-    found = smooth_track(t, xy, sigma_m=sigma if told else None, at_s=ALL_S)
+def log2sim(t: Array, xy: Array, sigma: float) -> Result:
+    found = smooth_track(t, xy, sigma_m=sigma, at_s=ALL_S)
     return found.xy_m, found.velocity_mps, found.yaw_rad, found.curvature_1pm
 
 
@@ -205,7 +205,6 @@ def smoothers() -> dict[str, Smoother]:
     fixed = partial(spline, fit=lambda t, z, sigma: make_smoothing_spline(t, z, lam=0.1 * np.sqrt(sigma / 0.3)))
     out: dict[str, Smoother] = {
         "log2sim": log2sim,
-        "log2sim, noise not told": partial(log2sim, told=False),
         "raw, differences": partial(filtered, window=0),
         "SciPy make_smoothing_spline, GCV": gcv,
         "SciPy make_smoothing_spline, fixed penalty": fixed,

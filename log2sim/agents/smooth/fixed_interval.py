@@ -1,4 +1,4 @@
-"""Fixed-interval smoothing of planar positions: outliers, noise and jerk densities estimated, standstill recognized.
+"""Fixed-interval smoothing of planar positions: outliers and jerk densities estimated, standstill recognized.
 
 All unknowns (place, velocity, accelerations, errors that repeat) are Gaussian and integrated out, so that hypotheses with more
 of them are compared fairly (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 28). Positions that
@@ -37,7 +37,7 @@ from log2sim.agents.smooth.quadratic import (
     zero_motion,
 )
 from log2sim.files.arrays import Columns
-from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index
+from log2sim.geometry import CHI2_2DOF_99, Array, nearest_index, runs_of
 
 # A place is known before to some car lengths: the gates of the tracker reach as far.
 PLACE_SIGMA_M = 5.0
@@ -162,19 +162,16 @@ def zero_velocity_sigma(
     sigma = np.sqrt(np.trace(covariance[:, 2:4, 2:4], axis1=1, axis2=2) / 2)
     slow = speed < CANDIDATE_MPS + CANDIDATE_SIGMAS * sigma
     out = np.full(len(knots_s), np.inf)
-    if not slow.any():
-        return out
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
-    for first, last in zip(edges[::2], edges[1::2] - 1):
-        inside = np.flatnonzero((measurement.knot >= first) & (measurement.knot <= last) & (weight > MIN_WEIGHT))
+    for first, end in runs_of(slow):
+        inside = np.flatnonzero((measurement.knot >= first) & (measurement.knot < end) & (weight > MIN_WEIGHT))
         span = _trim_to_standstill(measurement, inside, speed[measurement.knot])
         if len(span):
             # A candidate that reaches the track's end stands until then.
             begin = first if first == 0 and span[0] == inside[0] else measurement.knot[span[0]]
-            end = last if last == len(knots_s) - 1 and span[-1] == inside[-1] else measurement.knot[span[-1]]
-            since = np.inf if begin == 0 else knots_s[begin : end + 1] - knots_s[begin]
-            until = np.inf if end == len(knots_s) - 1 else knots_s[end] - knots_s[begin : end + 1]
-            out[begin : end + 1] = STANDSTILL_SIGMA_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
+            last = end - 1 if end == len(knots_s) and span[-1] == inside[-1] else measurement.knot[span[-1]]
+            since = np.inf if begin == 0 else knots_s[begin : last + 1] - knots_s[begin]
+            until = np.inf if last == len(knots_s) - 1 else knots_s[last] - knots_s[begin : last + 1]
+            out[begin : last + 1] = STANDSTILL_SIGMA_MPS + EDGE_MPS * np.exp(-np.minimum(since, until) / EDGE_S)
     return out
 
 
@@ -234,7 +231,7 @@ PERMISSIVE_JERK_DENSITY = 4.0
 MAX_ROBUST_ROUNDS, MAX_REWEIGHTING_ROUNDS = 4, 4
 # Reweighting ends when no weight changes by more.
 MAX_WEIGHT_CHANGE = 0.05
-# Minimum distance of knots while noise and densities are estimated: in between the acceleration is taken as constant, which
+# Minimum distance of knots while densities are estimated: in between the acceleration is taken as constant, which
 # at the jerk of an emergency brake costs a millimeter.
 SEARCH_STEP_S = 0.39
 MIN_KNOTS = 4
@@ -289,8 +286,8 @@ def smooth_interval(observed: NoisyPositions, asked_s: Array, motion: MotionMode
     `asked_s`: (T,), s: times of the result.
 
     For given densities the estimate equals that of a Kalman filter with the smoother of Rauch, Tung and Striebel (AIAA
-    Journal 3, 1965) for the constant-acceleration model, found in one banded solve. Jerk densities and the scale of the
-    noise maximize the marginal likelihood; outliers are reweighted iteratively; standstill and the nonholonomic
+    Journal 3, 1965) for the constant-acceleration model, found in one banded solve. Jerk densities
+    maximize the marginal likelihood; outliers are reweighted iteratively; standstill and the nonholonomic
     constraint of slow vehicles are pseudo-measurements. Cost O(n).
     """
     prior = MotionPrior.over(np.concatenate([observed.t_s, asked_s]))
@@ -358,12 +355,12 @@ def _weights(observed: NoisyPositions, squared: Array) -> Array:
 
 
 def _problem(prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel) -> _Problem:
-    """Find outliers, noise and densities with fewer knots, then pose the problem on all of them."""
+    """Find outliers and densities with fewer knots, then pose the problem on all of them."""
     observed = measurement.observed
     few = MotionPrior.over(observed.t_s, SEARCH_STEP_S)
     coarse = MeasurementModel.of(observed, few)
-    fit, weight, isotropic, variance_factor = _robust_fit(few, coarse, motion)
-    information = np.asarray(np.linalg.inv(observed.r * variance_factor), dtype=np.float64)
+    fit, weight, isotropic = _robust_fit(few, coarse, motion)
+    information = np.asarray(np.linalg.inv(observed.r), dtype=np.float64)
     yaw = unwrap(yaw_of_motion(fit[:, 0], fit[:, 1], hint_rad=motion.heading_rad))
     density = (isotropic, isotropic)
     if motion.density_by_direction and len(few) >= MIN_KNOTS:
@@ -386,15 +383,13 @@ def _directions(yaw: Array) -> Array:
 
 def _estimator(observed: NoisyPositions, motion: MotionModel) -> DensityEstimator:
     prior = STRONG_PRIOR if observed.correlated else WEAK_PRIOR
-    return DensityEstimator(prior, observed.unknown_scale, rounds=1 if motion.density_by_direction else 2)
+    return DensityEstimator(prior, rounds=1 if motion.density_by_direction else 2)
 
 
-def _robust_fit(
-    prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel
-) -> tuple[Array, Array, float, float]:
-    """Find outliers, noise and one density with both axes treated alike, which makes the search cheap.
+def _robust_fit(prior: MotionPrior, measurement: MeasurementModel, motion: MotionModel) -> tuple[Array, Array, float]:
+    """Find outliers and one density with both axes treated alike, which makes the search cheap.
 
-    Returns the state (K, 3, 2), weights (n,), jerk density in m2/s5 and factor on the noise's variance.
+    Returns the state (K, 3, 2), weights (n,) and jerk density in m2/s5.
     """
     observed = measurement.observed
     variance = np.trace(observed.r, axis1=1, axis2=2) / 2
@@ -410,14 +405,13 @@ def _robust_fit(
             break
         weight = geman_mcclure_weights(squared)
     weight = _weights(observed, squared)
-    if motion.jerk_density is not None and not observed.unknown_scale:
-        return state, weight, density, 1.0
+    if motion.jerk_density is not None:
+        return state, weight, density
     likelihood = measurement.independent_axes(state, weight / variance)
-    density, factor = _estimator(observed, motion).isotropic(prior, state, likelihood, float(weight.sum()))
-    density = density if motion.jerk_density is None else motion.jerk_density
-    state = state + minimize(weighted_sum([(1.0, likelihood), (factor / density, prior.jerk(state))])).step
-    squared = (measurement.residual(state) ** 2).sum(axis=1) / (variance * factor)
-    return state, _weights(observed, squared), density, factor
+    density = _estimator(observed, motion).isotropic(prior, state, likelihood)
+    state = state + minimize(weighted_sum([(1.0, likelihood), (1.0 / density, prior.jerk(state))])).step
+    squared = (measurement.residual(state) ** 2).sum(axis=1) / variance
+    return state, _weights(observed, squared), density
 
 
 def _constraints(problem: _Problem, state: Array, covariance: Array, motion: MotionModel) -> Quadratic | None:

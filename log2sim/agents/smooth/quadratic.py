@@ -156,7 +156,6 @@ class NoisyPositions:
     t_s: Array  # (n,), s
     xy: Array  # (n, 2), m
     r: Array  # (n, 2, 2), m2: covariance of each position
-    unknown_scale: bool = False  # whether `r` is known up to a common factor only
     # Whether errors repeat from tick to tick and have heavier tails than Gaussian ones, as those of measured boxes
     correlated: bool = False
 
@@ -374,40 +373,29 @@ class DensityEstimator:
     """Maximizes the marginal likelihood of jerk densities."""
 
     prior: tuple[float, float] = WEAK_PRIOR
-    unknown_scale: bool = False  # whether the variance of the noise is known up to a factor only
     rounds: int = 2  # rounds of the search for one density, each narrower; 1 where a finer search follows
 
     def _penalty(self, log_density: float) -> float:
         """Twice the negative log density of the prior, up to a constant."""
         return ((log_density - float(np.log(self.prior[0]))) / self.prior[1]) ** 2
 
-    def isotropic(
-        self, motion: MotionPrior, state: Array, likelihood: Quadratic, weight_sum: float
-    ) -> tuple[float, float]:
-        """Estimate one jerk density in m2/s5 for both axes and the factor on the noise's variance.
+    def isotropic(self, motion: MotionPrior, state: Array, likelihood: Quadratic) -> float:
+        """Estimate one jerk density in m2/s5 for both axes.
 
         `state`: (K, 3, 2): reference state of the forms. `likelihood`: squared residuals over 3 unknowns a knot and 2 columns,
-        about `state`. `weight_sum`: sum of the observations' weights.
+        about `state`.
         """
         jerk = motion.jerk(state)
         steps = len(motion) - 1
-        # The six unknowns of the initial state are as good as free.
-        freedom = max(2.0 * weight_sum - 6.0, 1.0)
 
         def objective(log_density: Array) -> float:
             u = float(log_density[0])
             least = minimize(weighted_sum([(1.0, likelihood), (np.exp(-u), jerk)]))
-            noise = freedom * np.log(least.value) if self.unknown_scale else least.value
-            return float(noise + 2.0 * least.log_determinant + 6.0 * steps * u + self._penalty(u))
+            return float(least.value + 2.0 * least.log_determinant + 6.0 * steps * u + self._penalty(u))
 
         lowest = min_density(motion)
         start = np.array([np.log(max(self.prior[0], lowest))])
-        u = _coordinate_descent(objective, start, SEARCH_WIDTHS[: self.rounds], lowest)
-        ratio = float(np.exp(u[0]))
-        if not self.unknown_scale:
-            return ratio, 1.0
-        factor = minimize(weighted_sum([(1.0, likelihood), (1 / ratio, jerk)])).value / freedom
-        return ratio * factor, factor
+        return float(np.exp(_coordinate_descent(objective, start, SEARCH_WIDTHS[: self.rounds], lowest)[0]))
 
     def by_direction(
         self, motion: MotionPrior, jerk: tuple[Quadratic, Quadratic], likelihood: Quadratic, start: float

@@ -15,8 +15,6 @@ from log2sim.geometry import Array, wrap_angle
 
 # Below this speed the curvature of a smoothed path is noise.
 MIN_CURVATURE_SPEED_MPS = 1.5
-# Third differences need some rows for a median; below, this standard deviation is assumed.
-MIN_ROWS_FOR_SIGMA, DEFAULT_SIGMA_M, MIN_SIGMA_M = 8, 0.2, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +38,6 @@ class SmoothedTrack:
 def smooth_track(
     t_s: ArrayLike,
     xy_m: ArrayLike,
-    valid: ArrayLike | None = None,
     *,
     sigma_m: ArrayLike | None = None,
     covariance: Array | None = None,
@@ -49,13 +46,12 @@ def smooth_track(
 ) -> SmoothedTrack:
     """Smooth positions over a fixed interval, rejecting outliers.
 
-    `t_s`: (n,), s, strictly increasing. `xy_m`: (n, 2), m. `valid`: (n,): rows to use; rows that are not finite are never used.
-    `sigma_m`: of all or (n,): standard deviation of the positions; estimated from their third differences when neither it nor
-    `covariance` is given. `covariance`: (n, 2, 2): covariance of the positions, m2. Given by measurements, whose errors are
-    correlated over time and have heavier tails than Gaussian ones. `at_s`: (T,): times of the result, by default `t_s`.
-    `motion`: by default a vehicle whose most likely jerk densities along and across the path are estimated.
+    `t_s`: (n,), s, strictly increasing. `xy_m`: (n, 2), m; rows that are not finite are not used. `sigma_m`: of all or (n,):
+    standard deviation of the positions; or `covariance`: (n, 2, 2): covariance of the positions, m2. Given by measurements, whose
+    errors are correlated over time and have heavier tails than Gaussian ones. `at_s`: (T,): times of the result, by default
+    `t_s`. `motion`: by default a vehicle whose most likely jerk densities along and across the path are estimated.
 
-    Raises `ValueError` for stamps that do not increase, shapes that do not fit, or no valid row.
+    Raises `ValueError` for stamps that do not increase, shapes that do not fit, or no row to use.
     """
     motion = MotionModel() if motion is None else motion
     t, xy = np.asarray(t_s, dtype=np.float64), np.asarray(xy_m, dtype=np.float64)
@@ -63,13 +59,13 @@ def smooth_track(
         raise ValueError(f"t_s must be (n,) and xy_m (n, 2), got {t.shape} and {xy.shape}")
     if np.any(np.diff(t) <= 0):
         raise ValueError(f"t_s must increase strictly; it does not at index {int(np.argmax(np.diff(t) <= 0)) + 1}")
-    use = np.isfinite(xy).all(axis=1) & (np.ones(len(t), bool) if valid is None else np.asarray(valid, dtype=bool))
+    use = np.isfinite(xy).all(axis=1)
     if not use.any():
         raise ValueError("no valid position to smooth")
     if covariance is not None:
         r = np.asarray(covariance, dtype=np.float64)[use]
     else:
-        sigma = np.asarray(estimate_sigma(t[use], xy[use]) if sigma_m is None else sigma_m, dtype=np.float64)
+        sigma = np.asarray(sigma_m, dtype=np.float64)
         sigma = sigma[use] if sigma.ndim else np.full(int(use.sum()), float(sigma))
         if np.any(~np.isfinite(sigma) | (sigma <= 0)):
             raise ValueError("sigma_m must be positive and finite")
@@ -77,8 +73,7 @@ def smooth_track(
     asked = t if at_s is None else np.asarray(at_s, dtype=np.float64)
     # Far from the origin the normal equations would lose digits, so everything is relative to the first position.
     origin = xy[use][0]
-    unknown_scale, correlated = sigma_m is None and covariance is None, covariance is not None
-    path = smooth_interval(NoisyPositions(t[use], xy[use] - origin, r, unknown_scale, correlated), asked, motion)
+    path = smooth_interval(NoisyPositions(t[use], xy[use] - origin, r, covariance is not None), asked, motion)
     velocity, acceleration = path.state[:, 1], path.state[:, 2]
     speed = np.hypot(*velocity.T)
     fast = speed > MIN_CURVATURE_SPEED_MPS
@@ -106,22 +101,6 @@ def smooth_track(
         sigma_speed_mps=speed_sigma(path.yaw_rad, path.covariance[:, 2:4, 2:4]),
         broken=broken,
     )
-
-
-def estimate_sigma(t: Array, xy: Array) -> float:
-    """Estimate the standard deviation of the noise in m from third divided differences, zero at constant acceleration.
-
-    The median absolute value, 0.6745 standard deviations of a Gaussian, is insensitive to outliers (Rousseeuw and Croux,
-    J. Am. Stat. Assoc. 88, 1993).
-    """
-    if len(t) < MIN_ROWS_FOR_SIGMA:
-        return DEFAULT_SIGMA_M
-    rows = np.arange(len(t) - 3)[:, None] + np.arange(4)
-    # Weights of the divided difference: the inverse products of each time's distances to the other three.
-    distance = (t[rows][:, :, None] - t[rows][:, None, :]) / np.median(np.diff(t)) + np.eye(4)
-    weights = 1.0 / distance.prod(axis=2)
-    differences = np.einsum("nj,njk->nk", weights, xy[rows]) / np.linalg.norm(weights, axis=1, keepdims=True)
-    return max(float(np.median(np.abs(differences))) / 0.6745, MIN_SIGMA_M)
 
 
 def signed_speed(velocity_mps: Array, yaw_rad: Array) -> Array:

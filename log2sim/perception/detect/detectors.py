@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from log2sim.geometry import NS_PER_S, period_of, rectangles_overlap, wrap_angle
 from log2sim.logs.excerpt import STAMP_TOLERANCE_NS
 from log2sim.perception.lidar.projection import project_boxes_in_view, view_of
 
-__all__ = ["BatchDetector", "Detector", "create_detector", "detect_all"]
+__all__ = ["Detector", "create_detector"]
 
 
 MEMBERS = ("name", "default_min_score", "detect")
@@ -357,31 +357,6 @@ class Detector(Protocol):
     def detect(self, frame: Frame) -> Detections:
         """Detect road users in one frame, best score first; deterministic, and may be called from threads."""
         ...
-
-
-@runtime_checkable
-class BatchDetector(Protocol):
-    """Detector that can search several frames at once, in less time than one after the other."""
-
-    def detect_many(self, frames: Sequence[Frame]) -> list[Detections]:
-        """Detect road users in each of several frames, as `Detector.detect` does."""
-        ...
-
-
-@runtime_checkable
-class TilingDetector(Protocol):
-    """Detector that searches tiles of large pictures, and leaves out those that `Frame.turn` lets wait."""
-
-    def tiles_of(self, width_px: int, height_px: int) -> list[Any]:
-        """Return the tiles of an image that are searched, the whole image first."""
-        ...
-
-
-def detect_all(detector: Detector, frames: Sequence[Frame]) -> list[Detections]:
-    """Detect road users in several frames, at once where the detector can."""
-    if isinstance(detector, BatchDetector):
-        return detector.detect_many(frames)
-    return [detector.detect(frame) for frame in frames]
 
 
 def create_detector(
