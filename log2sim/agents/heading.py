@@ -80,8 +80,8 @@ MAX_MEASUREMENTS, MAX_POINTS_EACH = 8, 300
 TALL_M = 2.1
 # Of outlines that are surer than this, one in fifty is wrong on random traffic whose boxes are those of tracks.
 MAX_LOG_ODDS = 4.0
-# Ends of trucks and buses look alike, and all sweeps err alike: of those of which boxes are surer than this, one in seventeen points the
-# wrong way, of cars one in 400 (2,226 vehicles of 150 simulated logs; 2 and 4 fit nearly as well).
+# The ends of trucks and buses have the same shape, so that the boxes of all sweeps err together: where they are surer than this, one in
+# seventeen points the wrong way, of cars one in 400 (2,226 vehicles of 150 simulated logs; 2 and 4 fit nearly as well).
 MAX_LOG_ODDS_OF_LARGE = 3.0
 # Where less of the length shows, something hides the rest.
 MIN_WHOLE_SHARE = 0.8

@@ -204,9 +204,9 @@ def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:
 
 
 def _situation(path: Path, condition: str, probability: float = 0.3) -> tuple[Logical, Base]:
-    """Return the distribution of a situation's parameters over all that are found, and the most usual hit.
+    """Return the distribution of a situation's parameters over all its hits, and the hit nearest to their medians.
 
-    Raises `ConfigError` that says what was closest where nothing is found.
+    Raises `ConfigError` that says what was closest where there is no hit.
     """
     from log2sim.datatypes import Scenario
     from log2sim.scenarios.index import open_index

@@ -32,7 +32,7 @@ from log2sim.perception.records import RecordSource
 
 # Corrections between keyframes are interpolated: so many cover braking and curves of a short log, and in a long one they are
 # so near to each other that errors of GNSS last from one to the next.
-USUAL_KEYFRAMES, MAX_SPACING_S = 30, 1.0
+SHORT_LOG_KEYFRAMES, MAX_SPACING_S = 30, 1.0
 # An ego that stands has one pose.
 MIN_WAY_M = 0.5
 # Each is registered to those before it at these distances in their order: near ones are precise, far ones hold the drift.
@@ -81,8 +81,8 @@ def refine_poses(log: Log, during_ns: tuple[int, int] | None = None, *, every_sw
             yield [(j - lag, j, recent[-1 - lag], surfaces) for lag in LAGS if lag <= j]
 
     def registered(pairs: list[tuple[int, int, Surfaces, Surfaces]]) -> list[Link]:
-        found = [(i, j, register(first, second, inverse(poses[i]) @ poses[j])) for i, j, first, second in pairs]
-        return [(i, j, registration) for i, j, registration in found if registration is not None]
+        all_links = ((i, j, register(first, second, inverse(poses[i]) @ poses[j])) for i, j, first, second in pairs)
+        return [(i, j, registration) for i, j, registration in all_links if registration is not None]
 
     links = [link for some in work_ahead(registered, neighbors()) for link in some]
     if len(poses) < MIN_KEYFRAMES:
@@ -120,7 +120,7 @@ def _told(covariance: Array, measured: Array) -> Array | None:
 
 
 def _choose(log: Log, lidar: str, during_ns: tuple[int, int] | None, every_sweep: bool) -> NDArray[np.int64]:
-    """Choose sweeps evenly by the way and by the time of the ego: poses err along both."""
+    """Choose all sweeps of an ego that moves, or some evenly by its way and by its time: poses err along both."""
     t_ns = log.streams[lidar].t_ns
     pose, known = log.map_T_sensor(lidar, t_ns)
     known &= is_during(t_ns, during_ns)
@@ -131,10 +131,12 @@ def _choose(log: Log, lidar: str, during_ns: tuple[int, int] | None, every_sweep
     span_s = (t_ns[usable[-1]] - t_ns[usable[0]]) / NS_PER_S
     if moved[-1] < MIN_WAY_M:
         return usable[:0]
+    if every_sweep:
+        return usable
     since = (t_ns[usable] - t_ns[usable[0]]) / float(t_ns[usable[-1]] - t_ns[usable[0]])
     progress = (moved / moved[-1] + since) / 2
-    count = len(usable) if every_sweep else min(max(USUAL_KEYFRAMES, round(span_s / MAX_SPACING_S)), len(usable))
-    return usable if every_sweep else usable[np.unique(np.searchsorted(progress, np.linspace(0, 1, count) - 1e-9))]
+    count = min(max(SHORT_LOG_KEYFRAMES, round(span_s / MAX_SPACING_S)), len(usable))
+    return usable[np.unique(np.searchsorted(progress, np.linspace(0, 1, count) - 1e-9))]
 
 
 def corrected(track: PoseTrack, t_ns: NDArray[np.int64], twists: Array) -> PoseTrack:
@@ -158,26 +160,23 @@ def solve_twists(t_ns: NDArray[np.int64], map_T_ego: Array, links: Sequence[Link
     prior[1:] += drift
     every, diagonal = np.arange(count), np.eye(6)
     fixed = [(every, every, prior[:, :, None] * diagonal), (every[1:], every[:-1], -drift[:, :, None] * diagonal)]
-    firsts, seconds, equations = list[int](), list[int](), list[tuple[Array, Array, Array]]()
+    equations = []
     for first, second, registration in links:
         j_T_i = inverse(map_T_ego[second]) @ map_T_ego[first]
         twist = log_of(j_T_i @ registration.first_T_second)
-        held = _told(registration.covariance, twist)
-        if held is not None:
-            firsts.append(first)
-            seconds.append(second)
-            equations.append((-adjoint_of(j_T_i), twist, held))
+        information = _told(registration.covariance, twist)
+        if information is not None:
+            equations.append((first, second, -adjoint_of(j_T_i), twist, information))
     twists = np.zeros((count, 6))
     if not equations:
         return twists
-    i, j = np.array(firsts), np.array(seconds)
-    of_i, measured, information = (np.array(column) for column in zip(*equations, strict=True))
+    i, j, of_i, measured, weight = (np.array(column) for column in zip(*equations, strict=True))
     # Lower triangle of the normal equations, by diagonals: keyframes are tied to those at most `max(LAGS)` before them.
     offset = np.arange(6)
     for _ in range(ROUNDS):
         residual = twists[j] + np.einsum("nij,nj->ni", of_i, twists[i]) - measured
-        square = np.einsum("ni,nij,nj->n", residual, information, residual)
-        scaled = information / (1 + square / (6 * CAUCHY**2))[:, None, None]
+        square = np.einsum("ni,nij,nj->n", residual, weight, residual)
+        scaled = weight / (1 + square / (6 * CAUCHY**2))[:, None, None]
         to_i = of_i.transpose(0, 2, 1) @ scaled
         blocks = [*fixed, (j, j, scaled), (i, i, to_i @ of_i), (j, i, scaled @ of_i)]
         band, right = np.zeros((6 * int((j - i).max() + 1), 6 * count)), np.zeros((count, 6))

@@ -276,10 +276,12 @@ class Rays:
     spread_m: float
 
     def bins_toward(self, count: int, points: Callable[[NDArray[np.int64]], Any]) -> NDArray[np.int64]:
-        """Return the bins (N,) in which the sensor looks at `count` points, which `points` (3, N), m, gives in the shifted map for bins (N,).
+        """Return the bins (N,) in which rays go toward `count` points.
+
+        `points`: gives their places (3, N), m, in the shifted map at the times of bins (N,).
 
         Points and sensor move while it turns, so each round takes both where they are in the bin of the round before: of a surface 2 m
-        beside an ego at 30 m/s a fourth of the error is left each time.
+        beside an ego at 30 m/s a fourth of the error remains each time.
         """
         pose, bins = self.bin_T_map.astype(np.float32), np.full(count, len(self.bin_ns) // 2)
         for _ in range(BIN_ROUNDS):
