@@ -18,7 +18,7 @@ from log2sim.errors import RecordError
 from log2sim.files.stages import StageClock
 from log2sim.geometry import Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.perception.first_pass import base_poses, observe
-from log2sim.perception.frames import AHEAD, give_pictures, work_ahead
+from log2sim.perception.frames import AHEAD, read_pictures, work_ahead
 from log2sim.perception.fusion import fuse
 from log2sim.perception.lidar.cloud import CELL_RAD, CloudSensor, cloud_origin, obstacles_of, sample_rays
 from log2sim.perception.records import RecordSource
@@ -294,20 +294,6 @@ SIZE = (64, 48)
 K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1.0]])
 
 
-class Wants:
-    """Takes note of what comes."""
-
-    def __init__(self, **frames: list[int]) -> None:
-        self.wanted = {name: np.array(index, dtype=np.int64) for name, index in frames.items()}
-        self.got: list[tuple[str, int, int]] = []
-
-    def frames(self) -> dict[str, NDArray[np.int64]]:
-        return self.wanted
-
-    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
-        self.got.append((camera, index, int(image_bgr[0, 0, 0])))
-
-
 def log_of(reads: list[tuple[str, int]], *, black: int = -1, broken: int = -1) -> Log:
     """Two cameras with 5 frames each, the second 50 ms later; the first pixel of a frame is its index."""
 
@@ -331,11 +317,11 @@ def log_of(reads: list[tuple[str, int]], *, black: int = -1, broken: int = -1) -
 def test_each_is_decoded_once_and_comes_in_order_of_time() -> None:
     reads: list[tuple[str, int]] = []
     log = log_of(reads)
-    first, second = Wants(left=[3, 1, 1], right2=[1]), Wants(left=[3, 4])
+    wanted = {"left": np.array([3, 1, 4, 1]), "right2": np.array([1])}
     steps: list[tuple[int, int]] = []
-    assert give_pictures(RecordSource(log), [first, second], lambda *step: steps.append(step)) == 4
-    assert first.got == [("left", 1, 1), ("right2", 1, 1), ("left", 3, 3)]
-    assert second.got == [("left", 3, 3), ("left", 4, 4)]
+    pictures = read_pictures(RecordSource(log), wanted, lambda *step: steps.append(step))
+    got = [(camera, index, int(image[0, 0, 0])) for camera, index, image in pictures]
+    assert got == [("left", 1, 1), ("right2", 1, 1), ("left", 3, 3), ("left", 4, 4)]
     assert sorted(reads) == [("left", 1), ("left", 3), ("left", 4), ("right2", 1)]
     assert steps == [(k + 1, 4) for k in range(4)]
 

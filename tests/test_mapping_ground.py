@@ -16,7 +16,7 @@ from log2sim.datatypes import Agent, Stream, Sweep
 from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform, undistort
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap, Raster
-from log2sim.road.pictures import ColorRaster, View, warp_onto
+from log2sim.road.pictures import ColorRaster, View, sample_at, warp_onto
 from log2sim.road.road_users import RoadUsers, draw_outlines
 from log2sim.road.surface import MAX_POINTS, Surface, take_sweep
 
@@ -215,7 +215,7 @@ def lay(
     for image, view in pictures:
         warp = warp_onto(view, flat, z_m, raster)
         if warp is not None:
-            colors.add(view.camera.name, image, warp)
+            colors.add(view.camera.name, sample_at(image, warp.u, warp.v, warp.scale), warp)
     return GroundMap(*colors.image(), unknown, unknown, raster.resolution_m, raster.extent_m)
 
 

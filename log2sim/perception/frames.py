@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -209,41 +209,23 @@ class FrameDetector:
         return {name: found for name in cameras if (found := self._known.get((name, tick))) is not None}
 
 
-class PictureConsumer(Protocol):
-    """Something that is read from pictures."""
-
-    def frames(self) -> Mapping[str, NDArray[np.int64]]:
-        """Return the indices of the frames that it wants, by camera."""
-        ...
-
-    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
-        """Take a picture (H, W, 3); pictures come in the order of their stamps and are not to be changed."""
-        ...
-
-
-def give_pictures(
+def read_pictures(
     records: RecordSource,
-    consumers: Sequence[PictureConsumer],
+    wanted: Mapping[str, NDArray[np.int64]],
     progress: Callable[[int, int], None] = lambda done, total: None,
     *,
     least_px: int = MAX_WIDTH_PX,
-) -> int:
-    """Give every consumer the pictures that it wants; return how many were decoded.
+) -> Iterator[tuple[str, int, NDArray[np.uint8]]]:
+    """Yield camera, index and picture (H, W, 3) of the wanted frames, indices by camera, each once and in the order of the stamps.
 
     Pictures that cannot be read, that are black, or that repeat an earlier one are left out, as they were judged before, or
     else now. They are decoded a few ahead in threads, see `RecordSource.picture` for `least_px`.
     """
-    takers: dict[tuple[str, int], list[PictureConsumer]] = {}
-    for consumer in consumers:
-        for camera, indices in consumer.frames().items():
-            for index in np.unique(indices).tolist():
-                takers.setdefault((camera, index), []).append(consumer)
     streams = records.log.streams
-    order = sorted(takers, key=lambda key: (int(streams[key[0]].t_ns[key[1]]), key[0]))
+    order = [(name, index) for name, indices in wanted.items() for index in np.unique(indices).tolist()]
+    order.sort(key=lambda key: (int(streams[key[0]].t_ns[key[1]]), key[0]))
     images = work_ahead(lambda key: records.picture(*key, least_px), order)
     for done, ((camera, index), image) in enumerate(zip(order, images, strict=True)):
         if image is not None and records.watch.is_live(camera, int(streams[camera].t_ns[index]), image):
-            for consumer in takers[camera, index]:
-                consumer.add(camera, index, image)
+            yield camera, index, image
         progress(done + 1, len(order))
-    return len(order)

@@ -16,11 +16,21 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
-from log2sim.perception.frames import give_pictures, work_ahead
+from log2sim.perception.frames import read_pictures, work_ahead
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.records import RecordSource
 from log2sim.road.ground_map import GroundMap, Raster, coarsened_cell_m
-from log2sim.road.pictures import ColorRaster, Image, View, find_hidden, median_picture, sample_nearest, warp_onto
+from log2sim.road.pictures import (
+    ColorRaster,
+    Image,
+    View,
+    Warp,
+    find_hidden,
+    median_picture,
+    sample_at,
+    sample_nearest,
+    warp_onto,
+)
 from log2sim.road.road_users import MASK_SHRINK, RoadUsers, covered, draw_footprints, draw_outlines
 from log2sim.road.surface import (
     MAX_POINTS,
@@ -105,10 +115,10 @@ Progress = Callable[[int, int], None]
 
 
 class GroundMapBuilder:
-    """Make a map of the ground; it takes its pictures as a `PictureConsumer` and reads its sweeps itself.
+    """Make a map of the ground from pictures and sweeps.
 
     `log`: with refined poses, see `refine_poses`. `scenario`: its agents hide the ground: moving ones where they are at
-    the time of a record, standing ones always. `records`: of this log; reads the sweeps and counts those that cannot be read.
+    the time of a record, standing ones always. `records`: of this log; reads both and counts what cannot be read.
 
     `notes`: what could not be mapped, and why.
 
@@ -165,28 +175,36 @@ class GroundMapBuilder:
         places = [self.raster.resolution_m, self.raster.extent_m, self._anchors, self._z0_m, self.notes]
         return [*places, self._frames, self._sweeps, known, *self._users.inputs()]
 
-    def frames(self) -> Mapping[str, NDArray[np.int64]]:
-        """Return the indices of the frames that the map is made of, by camera."""
-        return self._frames
+    def lay_pictures(self, progress: Progress = lambda done, total: None) -> None:
+        """Lay the pictures on the ground, each where the surface that the sweeps show appears in it."""
+        if self._colors is None:
+            return
+        self._laid, self._likely_ground  # noqa: B018  made here, before threads ask for them
+        pictures = read_pictures(self._records, self._frames, progress)
+        for view, image, users, seen in filter(None, work_ahead(self._place, pictures)):
+            if view.camera.mount == "map":
+                self._standing.setdefault(view.camera.name, (view, []))[1].append((image, users))
+            elif seen is not None:
+                self._colors.add(view.camera.name, *seen)
 
-    def add(self, camera: str, index: int, image_bgr: Image) -> None:
-        """Add a picture (H, W, 3)."""
+    def _place(
+        self, frame: tuple[str, int, Image]
+    ) -> tuple[View, Image, NDArray[np.uint8], tuple[NDArray[np.uint8], Warp] | None] | None:
+        """Mask the road users in a picture and, unless its camera stands, find what it shows of the ground; None without a pose."""
+        camera, index, image = frame
         t_ns = int(self._log.streams[camera].t_ns[index])
         map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
-        if self._colors is None or not known[0]:
-            return
+        if not known[0]:
+            return None
         view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
         users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
-        if view.camera.mount == "map":
-            self._standing.setdefault(camera, (view, []))[1].append((image_bgr, users))
-        else:
-            self._lay(self._colors, view, image_bgr, users)
+        return view, image, users, None if view.camera.mount == "map" else self._seen_ground(view, image, users)
 
-    def _lay(self, colors: ColorRaster, view: View, image: Image, users: NDArray[np.uint8]) -> None:
-        """Lay a picture on the ground but where its mask shows road users, or where something stands before the ground."""
+    def _seen_ground(self, view: View, image: Image, users: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Warp] | None:
+        """Colors (N, 3) and cells of the ground in a picture, but where its mask shows road users, or something stands before it."""
         warp = warp_onto(view, self._laid, self._z0_m, self.raster)
         if warp is None:
-            return
+            return None
         kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
         kept &= self._likely_ground.ravel().take(warp.cell) > 0
         if view.camera.mount == "ego":
@@ -197,7 +215,8 @@ class GroundMapBuilder:
             ]
             if hiding:
                 kept &= ~find_hidden(view, warp, np.concatenate(hiding))
-        colors.add(view.camera.name, image, warp.take(kept))
+        warp = warp.take(kept)
+        return sample_at(image, warp.u, warp.v, warp.scale), warp
 
     def build(self) -> GroundMap:
         """Return the map of all that was added, as far as anything is known; once, since what it is made of is let go."""
@@ -207,7 +226,9 @@ class GroundMapBuilder:
             color, alpha = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
         else:
             for view, pictures in self._standing.values():
-                self._lay(self._colors, view, *median_picture(*zip(*pictures)))
+                seen = self._seen_ground(view, *median_picture(*zip(*pictures)))
+                if seen is not None:
+                    self._colors.add(view.camera.name, *seen)
             self._standing.clear()
             color, alpha = self._colors.image()
             self._colors = None
@@ -323,6 +344,6 @@ def map_ground(
         log = log if refined is None else replace_poses(log, refined)
     records = records.of(log)
     builder = GroundMapBuilder(log, scenario, settings, records, partial(progress, "map: sweeps"))
-    give_pictures(records, [builder], partial(progress, "map: pictures"))
+    builder.lay_pictures(partial(progress, "map: pictures"))
     records.require_some()
     return builder.build()

@@ -151,8 +151,6 @@ MAX_GRAY_DIFFERENCE = 4  # between channels of a picture without color, by the e
 class ColorSampler:
     """Looks at the vehicles of a scenario in chosen pictures and names their colors.
 
-    A consumer of `log2sim.perception.frames.give_pictures`.
-
     `gray`: cameras whose pictures have no color.
     """
 

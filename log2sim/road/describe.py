@@ -21,7 +21,7 @@ from log2sim.geometry import PoseTrack
 from log2sim.localization.pose_refinement import place_as_given
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.first_pass import Observations
-from log2sim.perception.frames import give_pictures
+from log2sim.perception.frames import read_pictures
 from log2sim.perception.records import RecordSource
 from log2sim.perception.run_detectors import StageCache
 from log2sim.plan import Decision, Plan, Stage
@@ -63,7 +63,7 @@ def describe(
     look = partial(_appearance, scenario, log, plan, observations, records, earlier)
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         if builder is not None:
-            draw, of = partial(_draw, builder, records, clock, progress), [*builder.inputs(), drawn.ego]
+            draw, of = partial(_draw, builder, clock, progress), [*builder.inputs(), drawn.ego]
             features = (
                 draw() if earlier is None else earlier.known("map", log, of, (MapFeatures, Marking, RoadBorder), draw)
             )
@@ -98,12 +98,10 @@ def describe(
     return described, decisions, figures
 
 
-def _draw(
-    builder: GroundMapBuilder, records: RecordSource, clock: StageClock, progress: Callable[[str, int, int], None]
-) -> MapFeatures:
+def _draw(builder: GroundMapBuilder, clock: StageClock, progress: Callable[[str, int, int], None]) -> MapFeatures:
     """Draw the ground and find markings and borders on it."""
     with clock.stage("pictures", progress):
-        give_pictures(records, [builder], lambda done, total: progress("pictures", done, total))
+        builder.lay_pictures(lambda done, total: progress("pictures", done, total))
     with clock.stage("lanes", progress):
         ground = builder.build()
         markings, borders, notes = find_markings(ground)
@@ -124,7 +122,8 @@ def _appearance(
         colors, uncolored = dict[str, dict[str, Any]](), tuple[str, ...]()
         if plan.keeps(Stage.COLORS):
             sampler = ColorSampler(log, scenario)
-            give_pictures(records, [sampler])
+            for frame in read_pictures(records, sampler.frames()):
+                sampler.add(*frame)
             colors, uncolored = sampler.colors(), sampler.notes()
         signals = find_signals(log, scenario, observations.lights) if plan.keeps(Stage.SIGNALS) else ((), "")
         return colors, uncolored, *signals

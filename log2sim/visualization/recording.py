@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from log2sim import geometry
 from log2sim.datatypes import AgentTable, Log, Scenario
 from log2sim.errors import ConfigError, LogError
 from log2sim.geometry.boxes import EDGES, NEAR_M
-from log2sim.perception.frames import give_pictures
+from log2sim.perception.frames import read_pictures
 from log2sim.perception.lidar.cloud import cloud_origin, estimate_ground, sweep_to_map
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, view_of
 from log2sim.perception.records import RecordSource
@@ -159,23 +159,6 @@ POSE_BYTES = 140  # of the pose of a camera: twelve numbers
 OUTLINE_BYTES = 100  # of an outline in the page: sixteen numbers of up to four digits, mostly
 
 
-@dataclass(eq=False)
-class ShrunkPictures:
-    """Takes pictures of a log as JPEGs; a `PictureConsumer`."""
-
-    chosen: Mapping[str, NDArray[np.int64]]  # indices of the frames by camera
-    width_px: int  # pictures that are wider are made as wide as this
-    jpeg: dict[str, dict[int, bytes]] = field(default_factory=dict)  # pictures taken so far, by camera and index
-
-    def frames(self) -> Mapping[str, NDArray[np.int64]]:
-        """Return the indices of the frames that are wanted, by camera."""
-        return self.chosen
-
-    def add(self, camera: str, index: int, image_bgr: NDArray[np.uint8]) -> None:
-        """Take a picture (H, W, 3)."""
-        self.jpeg.setdefault(camera, {})[index] = encode_small(image_bgr, self.width_px)
-
-
 def encode_small(image_bgr: NDArray[np.uint8], width_px: int) -> bytes:
     """Encode a picture as a JPEG that is at most `width_px` wide."""
     shrink = min(width_px / image_bgr.shape[1], 1.0)
@@ -221,9 +204,10 @@ def picture_document(
     what = "pictures", "one of each camera", ", or choose fewer cameras with --cameras"
     detail, chosen = _fit(log, scenario.t0_ns, known, probes, PICTURE_DETAILS, budget_bytes, what)
     width_px = int(detail.size)
-    pictures = ShrunkPictures(chosen, width_px)
-    give_pictures(reader, [pictures], progress, least_px=width_px)
-    entries = {name: _entry(log, scenario, name, pictures.jpeg.get(name, {})) for name in chosen}
+    jpegs: dict[str, dict[int, bytes]] = {name: {} for name in chosen}
+    for camera, i, picture in read_pictures(reader, chosen, progress, least_px=width_px):
+        jpegs[camera][i] = encode_small(picture, width_px)
+    entries = {name: _entry(log, scenario, name, jpegs[name]) for name in chosen}
     entries = {name: entry for name, entry in entries.items() if entry["t_s"]}
     used = [log.cameras[name] for name in entries]
     forward = [camera.mount_T_cam[0, 2] if camera.mount == "ego" else -2.0 for camera in used]
