@@ -23,6 +23,7 @@ from log2sim.geometry import (
     transform,
 )
 from log2sim.localization.odometry import MAX_POINTS, MIN_RANGE_M, is_during
+from log2sim.perception.frames import work_ahead
 from log2sim.perception.lidar.cloud import sweep_to_map
 from log2sim.perception.records import RecordSource
 
@@ -275,16 +276,20 @@ def pair_sweeps(
     track = log.ego
     if track is None:
         return None
-    chosen = choose_sweeps(track, log.streams[lidar].t_ns, during_ns)
-    records, places, surfaces = RecordSource(log), [], []
-    for done, i in enumerate(chosen.tolist()):
-        report(done, len(chosen))
+    records = RecordSource(log)
+
+    def look(i: int) -> tuple[bool, tuple[int, Array, Surfaces] | None]:
+        """Whether the points of a sweep are given in the map, and its surfaces."""
         record = records.get(lidar, i)
-        if record is None:
-            continue
-        if record.frame == "map":
+        in_map = record is not None and record.frame == "map"
+        return in_map, None if record is None or in_map else surfaces_of_sweep(log, lidar, record)
+
+    chosen = choose_sweeps(track, log.streams[lidar].t_ns, during_ns).tolist()
+    places, surfaces = [], []
+    for done, (in_map, found) in enumerate(work_ahead(look, chosen)):
+        report(done, len(chosen))
+        if in_map:
             return None
-        found = surfaces_of_sweep(log, lidar, record)
         if found is not None:
             places.append(found[0])
             surfaces.append(found[2])
@@ -342,19 +347,23 @@ def surfaces_of_sweep(log: Log, lidar: str, sweep: Sweep) -> tuple[int, Array, S
 
 def _compare(surfaces: list[Surfaces], map_T_ego: Array) -> list[Pair]:
     """Register sweeps with the next ones, and with those `STEP` later, from what the former have shown."""
-    near: dict[int, Registration] = {}
+    near: dict[int, Registration | None] = {}
+
+    def compare(ends: tuple[int, int]) -> Registration | None:
+        first, second = ends
+        guess = inverse(map_T_ego[first]) @ map_T_ego[second]
+        if np.linalg.norm(guess[:3, 3]) > MAX_APART_M:
+            return None
+        between = [found.first_T_second for k in range(first, second) if (found := near.get(k)) is not None]
+        if len(between) == second - first:
+            guess = reduce(np.matmul, between)
+        return register(surfaces[first], surfaces[second], guess)
+
     pairs = []
     for step in (1, STEP):
-        for i in range(len(surfaces) - step):
-            guess = inverse(map_T_ego[i]) @ map_T_ego[i + step]
-            if np.linalg.norm(guess[:3, 3]) > MAX_APART_M:
-                continue
-            between = [near.get(k) for k in range(i, i + step)]
-            if step > 1 and all(between):
-                guess = reduce(np.matmul, [found.first_T_second for found in between if found is not None])
-            found = register(surfaces[i], surfaces[i + step], guess)
-            if found is not None:
-                pairs.append(Pair(i, i + step, found))
-                if step == 1:
-                    near[i] = found
+        ends = [(i, i + step) for i in range(len(surfaces) - step)]
+        found = list(work_ahead(compare, ends))
+        pairs += [Pair(*of, one) for of, one in zip(ends, found) if one is not None]
+        if step == 1:
+            near.update(enumerate(found))
     return pairs
