@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -50,15 +50,6 @@ class AgentCandidate:
     def doubted(self, doubts: Sequence[Finding]) -> Self:
         """Return the candidate with more doubts of its agent."""
         return replace(self, agent=replace(self.agent, doubts=(*self.agent.doubts, *doubts))) if doubts else self
-
-
-# Processes are worth their start, some 30 ms, where each takes so many measurements.
-ROWS_A_PROCESS = 500
-
-
-def useful_jobs(tracks: Iterable[Track], jobs: int) -> int:
-    """Return how many of some processes are worth their start for tracks."""
-    return max(min(jobs, sum(map(len, tracks)) // ROWS_A_PROCESS), 1)
 
 
 def candidate_of(

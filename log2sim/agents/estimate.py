@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
+from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.evidence import may_suffice
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.moving import moving_candidate
@@ -32,6 +32,9 @@ from log2sim.geometry import NS_PER_S, Array, PoseTrack, yaw_of
 from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.perception.sync import Schedule
 from log2sim.tracking.forward import MAX_MISSES
+
+# Processes are worth their start, some 30 ms, where each takes so many measurements.
+ROWS_A_PROCESS = 500
 
 
 def estimate_agents(
@@ -62,7 +65,7 @@ def estimate_agents(
         found = [*moving, *zip((k for k, p in parts if p.static), standing)]
         return [(k, replace(c, track=replace(c.track, measurements=Measurements.empty()))) for k, c in found]
 
-    jobs = useful_jobs(tracks, jobs)
+    jobs = max(min(jobs, sum(map(len, tracks)) // ROWS_A_PROCESS), 1)
     shares = [range(k, len(tracks), jobs) for k in range(jobs)]
     found = list(chain.from_iterable(map_in_processes(estimate, shares, jobs)))
     candidates = []

@@ -13,13 +13,12 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.agents.candidate import AgentCandidate, Timeline, useful_jobs
+from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.rays import count_rays
 from log2sim.agents.size import independent
 from log2sim.agents.weights import THERE
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, AgentTable, Log, Obstacles, Track
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of
-from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, median, project
 from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
 from log2sim.perception.lidar.measure import logit
@@ -79,22 +78,19 @@ SIGNS = {
 Table = dict[str, Array]
 
 
-def gather(candidates: Sequence[AgentCandidate], recording: Recording, jobs: int = 1) -> Table:
-    """Gather the evidence for and against each of C candidates, which so many processes share."""
+def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
+    """Gather the evidence for and against each of C candidates."""
     if not candidates:
         return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
-    jobs = useful_jobs((c.track for c in candidates), jobs)
-    most = min(MAX_CELLS // max(len(recording.clouds), 1), -(-len(candidates) // jobs)) or 1
+    most = MAX_CELLS // max(len(recording.clouds), 1) or 1
     # Those that are there at the same time together, so that each cloud is looked at by few shares of a long log.
     order = sorted(range(len(candidates)), key=lambda k: float(candidates[k].agent.waypoints.t_s[0]))
-    shares = [[candidates[i] for i in order[k : k + most]] for k in range(0, len(order), most)]
-
-    def columns_of(share: int) -> Table:
-        rows = [_own_columns(c, recording.timeline) for c in shares[share]]
+    parts = []
+    for k in range(0, len(order), most):
+        share = [candidates[i] for i in order[k : k + most]]
+        rows = [_own_columns(c, recording.timeline) for c in share]
         own = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        return own | _sensed_columns(shares[share], recording)
-
-    parts = list(map_in_processes(columns_of, range(len(shares)), jobs))
+        parts.append(own | _sensed_columns(share, recording))
     table = {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}
     table["no_image"] *= table["no_image"].min() == 0
     return table | {

@@ -239,15 +239,13 @@ def judge(
     recording: Recording,
     *,
     clutter: float = 0.0,
-    jobs: int = 1,
 ) -> list[AgentCandidate]:
     """Keep the candidates that are there and can be true together, each named, with its confidence and what speaks against it.
 
-    At the place of the `ego` there is no other agent. `clutter`: from `evidence.clutter_nats`. `jobs`: processes that share the
-    candidates; the result is the same for any number.
+    At the place of the `ego` there is no other agent. `clutter`: from `evidence.clutter_nats`.
     """
     t_s, lidar = recording.t_s, bool(recording.log.lidars)
-    table = gather(candidates, recording, jobs)
+    table = gather(candidates, recording)
     there, right = probabilities(table, lidar=lidar, clutter=clutter)
     kept = [
         _rated(c.doubted(doubts), float(right[k]), recording.timeline)

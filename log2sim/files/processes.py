@@ -93,8 +93,9 @@ def in_background(work: Callable[[], Out], jobs: int) -> Iterator[Callable[[], O
 
 
 def _end(workers: Mapping[Connection, Any]) -> None:
-    for connection, process in workers.items():
+    for process in workers.values():
         process.kill()
+    for connection, process in workers.items():  # which free their memory at the same time
         process.join()
         connection.close()
 

@@ -25,7 +25,7 @@ def find_possible(labels: Labels) -> NDArray[np.bool_]:
 
 
 def drop_impossible_labels(log: Log) -> Log:
-    """Return the log without labels that no object can have, and with a note of how many there were; labels stay unread until they are asked for."""
+    """Return the log without labels that no object can have, and with a note of how many there were once they are read, which they are when they are asked for."""
     possible = cache(lambda: None if log.labels is None else find_possible(log.labels))
 
     def labels() -> Labels | None:
@@ -33,7 +33,7 @@ def drop_impossible_labels(log: Log) -> Log:
         return given if given is None or kept is None or kept.all() else given.take(kept)
 
     def notes() -> tuple[str, ...]:
-        kept = possible()
+        kept = possible() if possible.cache_info().currsize else None
         count = 0 if kept is None else int((~kept).sum())
         words = f"{count} label{'s' * (count != 1)} left out: no object is so large or so far away, or it has no size"
         return (*log.notes, words) if count else log.notes

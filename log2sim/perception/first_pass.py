@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -109,8 +109,8 @@ def _read_rays(kept: ArrayList, position: NDArray[np.float32], velocity_mps: NDA
 
 # Sweeps of each LiDAR that are kept for the next ticks, which may share some.
 SWEEPS_KEPT = 4
-# Ticks that are worked on together, at least.
-PART_TICKS = 5
+# Ticks that are worked on together, at least; at the end fewer, so that no process waits long for another.
+PART_TICKS, LAST_PART_TICKS = 5, 2
 
 # Groups that pictures are to confirm at every tick, as they have few points, and the least score of their boxes, a calibrated
 # probability. With 0.3 or 0, 4.6 or 5.0 of 5 parts of a picture are searched on KITTI instead of 4.2, with the same agents.
@@ -324,14 +324,20 @@ class FirstPass:
         self.log, self.schedule, self.plan, self.detectors, self.config = log, schedule, plan, detectors, config
         self.clouds = CloudMaker(log, schedule, plan, config, detectors.sweeps)
         self.frames = None if detectors.images is None else FrameDetector(log, schedule, detectors.images, plan)
-        # Ticks of a part: where frames are skipped between some of them, a multiple of these.
-        self.step = plan.detector_stride * -(-PART_TICKS // plan.detector_stride)
         if detectors.cache is not None:
             # Of the plan what this pass looks at, so that other later stages leave the key as it is.
             stages = [plan.keeps(s) for s in (Stage.IMAGE_DECODING, Stage.MOTION_COMPENSATION, Stage.HOMOGRAPHY)]
             planned = [plan.detector_stride, plan.picture_stride, plan.tiles_by_turns, plan.fusion, stages]
             settings = [config.measure.mode, config.measure.max_range_m, config.lidar.sweeps]
             detectors.cache.begin(log, [list(plan.cameras), planned, *settings, schedule.reference_row])
+
+    def parts(self) -> list[range]:
+        """Return the ticks of each part; where frames are skipped between some of them, a part has a multiple of these."""
+        total, stride = len(self.schedule), self.plan.detector_stride
+        step, last = (stride * -(-least // stride) for least in (PART_TICKS, LAST_PART_TICKS))
+        whole = max(total // step - 2, 0) * step
+        starts = [*range(0, whole, step), *range(whole, total, last)]
+        return [range(*of) for of in pairwise([*starts, total])]
 
     def observe(self, task: Task) -> tuple[Part, StageClock, tuple[int, int, str | None]]:
         """Detect and measure in some ticks; returns how many were known and how many were kept, and why no more, too."""
@@ -503,7 +509,7 @@ def observe(
     out = Observations(feet={c: [] for c in plan.cameras}, ground={c: [] for c in plan.cameras})
     obstacles = out.obstacles = ObstacleList(out.points)
     first_pass, cache = FirstPass(log, schedule, plan, detectors, config), detectors.cache
-    ranges = [range(k, min(k + first_pass.step, len(schedule))) for k in range(0, len(schedule), first_pass.step)]
+    ranges = first_pass.parts()
     jobs = 1 if plan.fusion is FusionLevel.POINTS else min(jobs, len(ranges))
     records = out.records = RecordSource(log)
     before: list[tuple[Key, Boxes3D]] = []

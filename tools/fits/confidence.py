@@ -73,8 +73,8 @@ def agents_of(case: Case, log: str) -> list[Rated]:
     gathered: list[tuple[Any, Table]] = []
     judged: list[Any] = []
 
-    def keep_table(candidates: Sequence[Any], recording: Any, jobs: int) -> Table:
-        gathered.append((list(candidates), gather(candidates, recording, jobs)))
+    def keep_table(candidates: Sequence[Any], recording: Any) -> Table:
+        gathered.append((list(candidates), gather(candidates, recording)))
         return gathered[-1][1] | {"confirmed": np.ones(len(candidates))}
 
     def keep_candidates(*arguments: Any, **options: Any) -> Any:
