@@ -92,7 +92,7 @@ def test_scenarios_of_any_number_of_processes_are_the_same(
     detector: str, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(first_pass, "PART_TICKS", 2)
-    monkeypatch.setattr("log2sim.agents.candidate.ROWS_A_PROCESS", 1)
+    monkeypatch.setattr("log2sim.agents.estimate.ROWS_A_PROCESS", 1)
     config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector}, **settings)
     made = [reconstruct(tiny_log()[0], config, jobs=jobs) for jobs in (1, 3)]
     assert len({json.dumps(result.scenario.to_dict(), sort_keys=True) for result in made}) == 1
