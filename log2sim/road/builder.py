@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from log2sim.config import MapConfig
 from log2sim.datatypes import Log, Scenario
-from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.localization.pose_refinement import refine_poses
 from log2sim.localization.replaced import replace_poses
 from log2sim.perception.frames import read_pictures, work_ahead
-from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.perception.records import RecordSource
-from log2sim.road.ground_map import GroundMap, Raster, coarsened_cell_m
+from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
+from log2sim.road.map_parts import OVERLAP_M, ROADSIDE_MARGIN_M, is_within, path_of, roadside_of, whole_map
 from log2sim.road.pictures import (
     ColorRaster,
     Image,
@@ -53,22 +52,23 @@ POINTS_A_METER = 200_000
 # What stands still, the same sensor shows again; several records of it average the noise and let moving shadows pass.
 STANDING_RECORDS = 7
 MAX_PICTURES, MAX_SWEEPS = 400, 160
-# Of this long only few ground pixels and points are finer than lane markings.
-MARGIN_M = 40.0
-# A roadside sensor 6 m above the road has a pixel of 0.5 m length at this distance, with 1500 px of focal length.
-ROADSIDE_MARGIN_M = 70.0
 
 
 def choose_records(
-    log: Log, scenario: Scenario, steps_m: Mapping[str, float], most: int
+    log: Log, scenario: Scenario, area_m: Extent, steps_m: Mapping[str, float], most: int
 ) -> dict[str, NDArray[np.int64]]:
-    """Choose the records of sensors by name: where the ego is a step, m, farther on, at most `most` of all sensors together."""
+    """Choose the records of sensors by name: where the ego is a step, m, farther on, at most `most` of all sensors together.
+
+    Those of sensors that are too far from an area to see much of it are left out.
+    """
     steps_m = {name: step_m for name, step_m in steps_m.items() if name in log.streams}
     most = max(most // max(len(steps_m), 1), STANDING_RECORDS)
     found = {}
     for name, step_m in steps_m.items():
         t_ns, end_ns = log.streams[name].t_ns, scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
         pose, known = log.map_T_sensor(name, t_ns)
+        sensor = log.cameras[name] if name in log.cameras else log.lidars[name]
+        known &= is_within(pose[:, :2, 3], area_m, ROADSIDE_MARGIN_M if sensor.mount == "map" else OVERLAP_M)
         usable = np.flatnonzero(known & (t_ns >= scenario.t0_ns) & (t_ns <= end_ns))
         place, chosen = pose[usable, :3, 3], [0]
         gone = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(place, axis=0), axis=1)))
@@ -81,22 +81,6 @@ def choose_records(
             chosen = np.unique(np.linspace(0, len(usable) - 1, STANDING_RECORDS).round().astype(int)).tolist()
         found[name] = usable[chosen[:most]].astype(np.int64) if len(usable) else usable.astype(np.int64)
     return found
-
-
-def path_of(log: Log, scenario: Scenario) -> Array:
-    """Places (K, 3), m, on the ground that the ego passed, about every half meter; none without known poses."""
-    if log.ego is None:
-        return np.zeros((0, 3))
-    end_ns = scenario.t0_ns + round(scenario.duration_s * NS_PER_S)
-    t_ns = log.ego.t_ns[(log.ego.t_ns >= scenario.t0_ns) & (log.ego.t_ns <= end_ns)]
-    t_ns = t_ns if len(t_ns) else np.array([scenario.t0_ns], dtype=np.int64)
-    map_T_ego, known = log.ego.at(t_ns)
-    ground = map_T_ego[known] @ np.array([0.0, 0.0, log.ground_z_ego_m, 1.0])
-    if not len(ground):
-        return np.zeros((0, 3))
-    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ground[:, :3], axis=0), axis=1))])
-    at = np.linspace(0, gone[-1], max(int(gone[-1] / 0.5), 1) + 1)
-    return np.column_stack([np.interp(at, gone, ground[:, k]) for k in range(3)])
 
 
 # Cells of heights along the edge of a cell of colors: curbs are 10 cm wide, and ten points lie on such a cell in a usual log.
@@ -119,6 +103,7 @@ class GroundMapBuilder:
 
     `log`: with refined poses, see `refine_poses`. `scenario`: its agents hide the ground: moving ones where they are at
     the time of a record, standing ones always. `records`: of this log; reads both and counts what cannot be read.
+    `area_m`: what is mapped, in whole meters; all that the log shows if None.
 
     `notes`: what could not be mapped, and why.
 
@@ -132,38 +117,30 @@ class GroundMapBuilder:
         settings: MapConfig,
         records: RecordSource | None = None,
         progress: Progress | None = None,
+        *,
+        area_m: Extent | None = None,
     ) -> None:
         self._log, self._scenario = log, scenario
         self._records, self._progress = records or RecordSource(log), progress or (lambda done, total: None)
         self._path = path_of(log, scenario)
-        # Sensors that are fixed in the map, on the ground.
-        fixed = [name for name, camera in log.cameras.items() if camera.mount == "map"]
-        fixed += [name for name, lidar in log.lidars.items() if lidar.mount == "map"]
-        roadside = np.array([log.map_T_sensor(name, scenario.t0_ns)[0][0, :3, 3] for name in fixed]).reshape(-1, 3)
-        if log.ego is None:
-            roadside[:, 2] = cloud_origin(log, scenario.t0_ns)[1]
-        around = [(self._path, MARGIN_M), (roadside, ROADSIDE_MARGIN_M)]
-        corners = [p[:, :2] + side * margin for p, margin in around for side in (-1, 1) if len(p)]
-        if not corners:
-            raise LogError(
-                "no pose of any sensor is known, so pictures and sweeps have no place in a map of the ground"
-            )
-        (x0, y0), (x1, y1) = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
-        # Whole meters, so that maps of one log lie on the same cells whichever part of it they show.
-        extent = float(np.floor(x0)), float(np.ceil(x1)), float(np.floor(y0)), float(np.ceil(y1))
+        extent = area_m or whole_map(log, scenario)
         cell_m = coarsened_cell_m(extent, settings.cell_m)
         self.notes: list[str] = []
         if cell_m > settings.cell_m:
             size = f"{extent[1] - extent[0]:.0f} x {extent[3] - extent[2]:.0f} m"
-            self.notes.append(f"the log covers {size}: cells of {cell_m:g} m instead of {settings.cell_m:g} m")
+            self.notes.append(f"the map covers {size}: cells of {cell_m:g} m instead of {settings.cell_m:g} m")
         self.raster = Raster.covering(extent, cell_m)
         self._coarse = self.raster.coarser(max(round(HEIGHT_CELL_M / self.raster.resolution_m), 1))
-        places = self._path if len(self._path) else roadside
-        self._anchors, self._z0_m = places, float(np.median(places[:, 2]))
-        self._sweeps = choose_records(log, scenario, {k: self._sweep_step_m(k) for k in log.lidars}, MAX_SWEEPS)
+        self._anchors = self._path if len(self._path) else roadside_of(log, scenario)
+        near = self._anchors[is_within(self._anchors, extent, ROADSIDE_MARGIN_M)]
+        self._z0_m = float(np.median(near[:, 2] if len(near) else self._anchors[:, 2]))
+        steps = {name: self._sweep_step_m(name) for name in log.lidars}
+        self._sweeps = choose_records(log, scenario, extent, steps, MAX_SWEEPS)
         # Cameras that the scenario was made with; all of the log where it names none.
         used = [str(c["name"]) for c in scenario.cameras if c.get("used") and c["name"] in log.cameras]
-        self._frames = choose_records(log, scenario, dict.fromkeys(used or log.cameras, PICTURE_STEP_M), MAX_PICTURES)
+        self._frames = choose_records(
+            log, scenario, extent, dict.fromkeys(used or log.cameras, PICTURE_STEP_M), MAX_PICTURES
+        )
         stamps = [log.streams[name].t_ns[i] for name, i in (*self._sweeps.items(), *self._frames.items())]
         self._users = RoadUsers(log, scenario, np.concatenate([*stamps, np.zeros(0, np.int64)]))
         self._standing: dict[str, tuple[View, list[tuple[Image, NDArray[np.uint8]]]]] = {}

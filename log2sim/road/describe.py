@@ -28,6 +28,7 @@ from log2sim.plan import Decision, Plan, Stage
 from log2sim.road.builder import GroundMapBuilder
 from log2sim.road.colors import ColorSampler
 from log2sim.road.lane_graph import infer_lanes
+from log2sim.road.map_parts import Part, join_parts, parts_of
 from log2sim.road.markings import find_markings
 from log2sim.road.signals import find_signals
 
@@ -54,20 +55,23 @@ def describe(
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if for_map is None else replace_poses(log, for_map)
     records = (observations.records or RecordSource(log)).of(drawn)
-    builder, features = None, MapFeatures() if plan.keeps(Stage.LANES) else None
+    parts, features = list[Part](), MapFeatures() if plan.keeps(Stage.LANES) else None
     if features is not None:
         try:
-            builder = GroundMapBuilder(drawn, scenario, settings, records)
+            parts = parts_of(drawn, scenario, settings.cell_m)
         except LogError as problem:
             features = MapFeatures(notes=(f"no map of the ground: {problem}",))
     look = partial(_appearance, scenario, log, plan, observations, records, earlier)
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
-        if builder is not None:
+        found = list[MapFeatures]()
+        for part in parts:
+            builder = GroundMapBuilder(drawn, scenario, settings, records, area_m=part.area_m)
             draw, of = partial(_draw, builder, clock, progress), [*builder.inputs(), drawn.ego]
-            features = (
+            found.append(
                 draw() if earlier is None else earlier.known("map", log, of, (MapFeatures, Marking, RoadBorder), draw)
             )
-            features = features.moved(lambda points_m: place_as_given(points_m, drawn, log))
+        if parts:
+            features = join_parts(parts, found).moved(lambda points_m: place_as_given(points_m, drawn, log))
         if features is not None:
             with clock.stage("lanes", progress):
                 lanes, notes = infer_lanes(features.markings, features.borders, scenario)
