@@ -207,7 +207,7 @@ PRIOR = -3.0
 PER_METER = 0.8  # of paint in line, which texture seldom continues
 MAX_BY_LENGTH = 5.5
 PER_METER_MORE, MAX_BY_MORE = 0.03, 1.5  # of longer lines
-DASHES = 1.5  # three or more dashes of one length at one distance
+PER_DASH, MAX_DASHES = 0.75, 4  # of one length at one distance, from the third on
 # Sun between two shadows and wet glare are ridges to a camera, too: more than that it alone does not say.
 MAX_BY_CAMERA = 3.0
 UNEVEN = -1.5  # a step beside which a little stands out
@@ -230,7 +230,7 @@ MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True) -> float:
     """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
     odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
-    odds += DASHES * min(max(dashes - 2, 0), 2) / 2
+    odds += PER_DASH * min(max(dashes - 2, 0), MAX_DASHES)
     by_camera = bool(np.isfinite(pieces.color).any())
     if by_camera:
         odds += _by_shape(pieces, alone=alone)

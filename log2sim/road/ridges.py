@@ -155,6 +155,7 @@ HIGH_PASS_M = 1.5
 # Contrasts of ordinary paint to asphalt, as logarithms: pixel values 1.6 times as large (their gamma has reflectances 3 times
 # as large), LiDAR intensity 3 times.
 EXPECTED_COLOR, EXPECTED_INTENSITY = 0.5, 1.1
+MIN_BRIGHT = 100  # cells that tell how much paint reflects
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +202,12 @@ def _join(tile: CoarseTile, cell_m: float) -> tuple[Layer, Layer, Layer]:
     if not by_camera:
         return intensity, intensity, intensity
     c, i = _spread(color, tile.seen), _spread(intensity, tile.hit)
-    ratio = (EXPECTED_INTENSITY / i**2) / (EXPECTED_COLOR / c**2)
+    # Paint under water returns no light to a LiDAR: by as much as what looks like paint stands out there, it counts.
+    bright = (color > EXPECTED_COLOR / 2) & (tile.hit > MIN_HIT)
+    shown = EXPECTED_INTENSITY
+    if np.count_nonzero(bright) >= MIN_BRIGHT:
+        shown = float(np.clip(np.median(intensity[bright]) / np.median(color[bright]) * EXPECTED_COLOR, 0, shown))
+    ratio = (shown / i**2) / (EXPECTED_COLOR / c**2)
     share = 1 / (1 + ratio)
 
     def joined(by_color: Layer) -> Layer:

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.ndimage import percentile_filter
 
 from log2sim.geometry import Array, median, runs_of
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import sample
+from log2sim.road.ridges import EXPECTED_COLOR, EXPECTED_INTENSITY, sample
 
 KNOT_M = 0.5
 # Change of curvature per meter that is ordinary: clothoids of A = 30 m (1 / A**2) at low speed; RAL 2012 has A of 90 m to
@@ -120,8 +121,11 @@ def thin(curve: Array) -> Array:
 
 STEP_M = 0.1
 SMOOTH_M = 0.5
+LAG = round(SMOOTH_M / STEP_M)
+MIN_NOISE = 0.03  # of logarithms of rounded values
 FLANKS_M = (0.08, 0.14, 0.2, 0.26)  # from the edge of the paint
 ON_SHARE = 0.4  # of the contrast that a line usually has where it is painted
+LEVEL_M, MIN_LEVEL = 30.0, 0.4  # over a period of dashes; of the whole line
 # Dashes and gaps are 1 m and more (MUTCD dotted lines: 2 ft dashes, 4 ft gaps; RMS: 1.5 m); flakes of worn paint are less.
 MIN_DASH_M, MIN_GAP_M = 0.5, 0.6
 MAX_DASH_M = 13.0  # Japan: 8 m; Germany: 6 m; ramps: 12 m
@@ -181,9 +185,19 @@ def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:
     sides = width_m / 2 + np.array(FLANKS_M)
     across = np.concatenate([inside, -sides, sides])
     seen = sample(ground, xy[:, :1] + normal[:, :1] * across[None, :], xy[:, 1:] + normal[:, 1:] * across[None, :])
-    by_color, by_lidar = (_ridge(a) for a in (seen.paint, seen.intensity))
-    soft = _normalized(by_color)
-    soft = np.where(np.isfinite(soft), soft, _normalized(by_lidar))
+    # Beside a bright curb a line hardly stands out by color, and under water not by intensity: both together, as the best filter for
+    # known contrasts in independent noise weighs them, see `ridges`.
+    total, weight = np.zeros(len(s)), np.zeros(len(s))
+    for values, expected in ((seen.paint, EXPECTED_COLOR), (seen.intensity, EXPECTED_INTENSITY)):
+        contrast = _ridge(values)
+        known = np.isfinite(contrast)
+        # Paint begins and ends at few places, so that most differences over half a meter are noise.
+        steps = np.abs(contrast[LAG:] - contrast[:-LAG])
+        steps = steps[np.isfinite(steps)]
+        noise = max(median(steps) / (0.6745 * np.sqrt(2)), MIN_NOISE) if len(steps) else 1.0
+        total[known] += contrast[known] * expected / noise**2
+        weight[known] += expected**2 / noise**2
+    soft = _normalized(np.divide(total, weight, out=np.full(len(s), np.nan), where=weight > 0))
     return Trace(s, np.nan_to_num(soft) > ON_SHARE, np.isfinite(soft))
 
 
@@ -213,8 +227,12 @@ def _normalized(contrast: Array) -> Array:
     total, count = (cv2.blur(a.reshape(-1, 1), size).ravel() for a in values)
     soft = np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
     # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
+    # Far away the same line stands out less than near the ego.
     level = float(np.quantile(soft[known], 0.875))
-    soft = soft / level if level > 0 else np.zeros(len(soft))
+    near = percentile_filter(soft[known], 87.5, round(LEVEL_M / STEP_M), mode="nearest")
+    scale = np.ones(len(soft))
+    scale[known] = np.maximum(near, MIN_LEVEL * level)
+    soft = soft / scale if level > 0 else np.zeros(len(soft))
     soft[~known] = np.nan
     return np.asarray(soft, np.float64)
 
