@@ -264,6 +264,10 @@ def find_borders(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[tupl
         known = coarse.known[k][cells] > 0
         if known.any():
             road[k] = np.median(coarse.values[k][cells][known])
+    # Under paint there is road, which would look like another surface.
+    paint = _draw_paint(coarse, ground, markings)
+    for k in np.flatnonzero(np.isfinite(road)).tolist():
+        coarse.values[k][paint] = road[k]
     points = _steps(coarse, ground, road)
     fitted = fit_lines(points, coarse.cell_m)
     pieces = no_pieces(len(fitted), xy=fitted[:, :2], direction=fitted[:, 2], length_m=fitted[:, 3])
@@ -286,6 +290,20 @@ def _coarsen(ground: GroundMap) -> _Coarse:
     means = [coarse_means(values, valid, factor) for values, valid in layers]
     values, known = (np.stack(column) for column in zip(*means))
     return _Coarse(values, (known > 0).astype(np.float32), factor * ground.resolution_m)
+
+
+def _draw_paint(coarse: _Coarse, ground: GroundMap, markings: tuple[Marking, ...]) -> NDArray[np.bool_]:
+    """Mask of the cells (R, C) that markings touch."""
+    mask = np.zeros(coarse.values.shape[1:], np.uint8)
+    for marking in markings:
+        rows, columns = ground.raster.cells_of(marking.points_m[:, :2])
+        at = (np.stack([columns, rows], axis=1) + 0.5) * ground.resolution_m / coarse.cell_m - 0.5
+        corners = np.rint(at).astype(np.int32)
+        if marking.is_lane_line or marking.kind == "stop_line":
+            cv2.polylines(mask, [corners], False, 1, round(marking.width_m / coarse.cell_m) + 1)
+        else:
+            cv2.fillPoly(mask, [corners], 1)
+    return mask > 0
 
 
 def _cells(coarse: _Coarse, ground: GroundMap, xy: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
