@@ -478,6 +478,13 @@ def test_only_whole_obstacles_with_enough_lidar_points_of_that_camera_give_feet(
     assert foot_points(camera, Measurements.empty(), EGO_T_MAP, 0).uv.shape == (0, 2)
 
 
+def test_four_points_almost_on_a_line_are_refused() -> None:
+    truth = make_camera()[1]
+    xy = np.array([[10.0, 1.0], [20.0, 1.001], [30.0, 0.999], [40.0, 1.001]])
+    fit = World(truth, to_image(truth, xy), xy, np.zeros(4, dtype=int), np.ones(4, dtype=bool)).fit()
+    assert "line" in fit.reason
+
+
 @pytest.mark.parametrize(("count", "agree", "needed"), [(8, 5, 6), (100, 15, 20)])
 def test_a_handful_that_agrees_among_many_that_do_not_is_refused(count: int, agree: int, needed: int) -> None:
     world, rng = make_world(30, ticks=1, each=count, noise_px=0.0, noise_m=0.0), np.random.default_rng(0)

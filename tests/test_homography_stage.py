@@ -82,9 +82,9 @@ def test_the_calibrations_homography_undoes_the_projection_of_flat_ground(pitch,
     assert np.isfinite(fit.condition)
 
 
-def fit(log, seen, plan=None, method="time-aware"):
+def fit(log, seen, plan=None):
     rng = np.random.default_rng(RNG_SEED)
-    return fit_homographies(log, seen, plan or plan_with(), TopdownConfig(method=method), rng=rng)
+    return fit_homographies(log, seen, plan or plan_with(), TopdownConfig(), rng=rng)
 
 
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():
