@@ -14,6 +14,7 @@ import pytest
 from damaged_bytes import damaged, quick, result_or_refusal
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mutation.damages import npy
 
 from log2sim.datatypes import CATEGORIES, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
 from log2sim.errors import RecordError
@@ -23,12 +24,6 @@ from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.records import read_sweep
-
-
-def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
 
 
 def npz(**arrays: np.ndarray) -> bytes:

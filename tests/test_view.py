@@ -50,7 +50,7 @@ def made(*agents: Agent, name: str = "made") -> Scenario:
 
 
 class Parts(HTMLParser):
-    """Tags of a page with their attributes, and the text in each of its scripts and styles."""
+    """Tags of a page with their attributes, and each text with the tag before it."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class Parts(HTMLParser):
         self.tags.append((tag, dict(attrs)))
 
     def handle_data(self, data: str) -> None:
-        if self.tags and self.tags[-1][0] in ("script", "style") and data.strip():
+        if self.tags and data.strip():
             self.texts.append((self.tags[-1][0], data))
 
 
