@@ -78,6 +78,17 @@ def own_cache(shared_folder: Path) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="session")
+def traffic_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scenarios of random traffic in which vehicles cut in, overtake and brake hard."""
+    from benchmarks.tag_worlds import traffic
+
+    root = tmp_path_factory.mktemp("traffic")
+    for seed in range(4):
+        traffic(seed, count=8, duration_s=12.0).scenario.save(root / f"{seed}" / "scenario.json")
+    return root
+
+
+@pytest.fixture(scope="session")
 def real_data(shared_folder: Path) -> Path:
     """The recorded logs in their native layout, laid out once; skips where they are not at hand."""
     restore = SHARED / "data" / "restore.py"

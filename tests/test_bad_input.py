@@ -270,15 +270,24 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(log_folder: 
         (("plot", "{s}", "--out", "x.png", "--replay", "{s}"), 3, ["replay_version"]),
         (("evaluate", "{s}", "--truth", "{s}", "--range", "-1"), 2, ["range", "-1"]),
         (("evaluate", "{s}", "--truth", "{s}", "--categories", "cars"), 2, ["'cars'", "did you mean 'car'"]),
+        (("edit", "{s}", "--out", "x"), 2, ["no edits"]),
+        (("edit", "{s}", "--out", "x", "--shift", "ego"), 2, ["--shift ego: expected an agent, '=' and a number"]),
+        (("edit", "{s}", "--out", "x", "--speed", "ego=0"), 2, ["expected a number from 0.01 to 100"]),
+        (("edit", "{s}", "--out", "x", "--lateral", "ego=nan"), 2, ["nan m for agent 'ego'"]),
+        (("convert", "{log}", "--out", "x", "--cameras", "frnt"), 2, ["no camera 'frnt' (did you mean 'front'?)"]),
+        (("convert", "{log}", "--out", "x", "--cameras", ","), 2, ["--cameras: is empty"]),
+        (("convert", "{log}", "--out", "x", "--start", "5"), 2, ["leave no record of 'front'"]),
+        (("convert", "{log}", "--out", "x", "--start", "0.5", "--stop", "0.1"), 2, ["leave no record"]),
         (("reconstrct",), 2, ["reconstrct", "Did you mean 'reconstruct'"]),
         (("reconstruct",), 2, ["LOG", "--help"]),
     ],
 )
 def test_a_wrong_argument_is_one_clear_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_scenario: Path, arguments: tuple[str, ...], code: int, words: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tiny_scenario: Path, tiny_folder: Path, arguments: tuple[str, ...], code: int,
+    words: list[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    ran = run(*(a.format(s=tiny_scenario) for a in arguments))
+    ran = run(*(a.format(s=tiny_scenario, log=tiny_folder) for a in arguments))
     assert ran.code == code
     assert all(word in ran.line for word in words), ran.err
     assert names(tmp_path) == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds import measured_row, scan, standing
+from worlds import apart, measured_row, scan, standing
 
 from log2sim.perception.boxes import (
     CORNER_ROUNDING_SHARE,
@@ -18,14 +18,8 @@ from log2sim.perception.boxes import (
     real_ends,
 )
 
-QUARTER = np.pi / 2
 # Of the corners of a car of 1.8 m.
 ROUNDING_M = CORNER_ROUNDING_SHARE * 1.8
-
-
-def apart(yaw, truth, period=QUARTER):
-    """Smallest difference of two angles up to multiples of a period."""
-    return abs((yaw - truth + period / 2) % period - period / 2)
 
 
 def completed(low, high, size, sensor, ends_visible=(False, False)):

@@ -22,23 +22,6 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
-    path = write(
-        tmp_path,
-        'seed = 7\ncameras = ["left", "right"]\nstart_s = 2\n[track]\nmax_gap_s = 1.5\n[measure]\nmode = "paper"\n',
-    )
-    config = Config.load(path)
-    assert (config.seed, config.cameras, config.start_s) == (7, ("left", "right"), 2.0)
-    assert config.track == TrackConfig(max_gap_s=1.5)
-    assert config.measure.mode == "paper"
-    assert (config.sync, config.detect, config.topdown, config.smooth) == (
-        Config().sync,
-        Config().detect,
-        Config().topdown,
-        Config().smooth,
-    )
-
-
 def test_the_later_word_counts(tmp_path: Path) -> None:
     path = write(tmp_path, "seed = 1\n[track]\nmax_gap_s = 1.0\nbirth_score = 0.1\nmin_life_s = 0.2\n")
     settings = ["track.max_gap_s=2.0", "seed=2", "track.birth_score=0.2", "track.birth_score=0.3"]

@@ -116,24 +116,6 @@ def test_labels_stay_with_their_cameras() -> None:
     assert cut_log(labeled, cameras=("left",)).reference_camera is None
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--cameras", "frnt"), "no camera 'frnt' (did you mean 'front'?)"),
-        (("--start", "5"), "leave no record of 'front'"),
-        (("--start", "0.5", "--stop", "0.1"), "leave no record"),
-        (("--cameras", ","), "--cameras: is empty"),
-    ],
-)
-def test_a_part_that_is_none_is_refused(
-    tiny_folder: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
-) -> None:
-    ran = run("convert", tiny_folder, "--out", tmp_path / "to", *arguments)
-    assert ran.code == 2
-    assert words in ran.line
-    assert names(tmp_path) == []
-
-
 @pytest.mark.parametrize("importing", [False, True])
 def test_nothing_is_lost_or_left_behind(
     log_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, importing: bool

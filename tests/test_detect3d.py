@@ -141,20 +141,6 @@ def decode(maps: NDArray[np.float32], top_m: float = 1.5) -> LevelBoxes:
     return decode_votes(maps, grid_of(maps, top_m), info(), LOW_VOTES)
 
 
-def test_two_objects_become_two_boxes_as_encoded() -> None:
-    maps = empty_maps(40, 40)
-    boxes = [(-4.2, -3.1, 0.8, *CAR, 0.7), (5.3, 4.4, 0.9, 0.6, 0.7, 1.75, -2.0)]
-    encode(maps, boxes[0], "car", low=LOW_VOTES, cells=3)
-    encode(maps, boxes[1], "pedestrian", low=LOW_VOTES, cells=1)
-    found = decode(maps)
-    order = np.argsort(found.group)
-    found = found.take(order)
-    assert found.category.tolist() == ["car", "pedestrian"]
-    np.testing.assert_allclose(np.column_stack([found.center_m, found.size_m, found.yaw_rad]), boxes, atol=1e-4)
-    np.testing.assert_allclose(found.heading_score, 1.0, atol=1e-5)
-    assert np.all(sigmoid(found.heat) > 0.999)
-
-
 def test_the_majority_decides_and_the_score_is_its_mean_probability() -> None:
     maps = empty_maps(40, 40)
     encode(maps, (0.2, 0.2, 0.8, *CAR, 0.0), "car", low=LOW_VOTES, cells=1)

@@ -29,7 +29,7 @@ from log2sim.evaluation.detection.evaluation import (
 from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.evaluation.detection.truth import LabelTracks, labeled_sweeps, truth_of_sweeps
 from log2sim.files.documents import check
-from log2sim.geometry import box_corners_bev, points_in_box, rectangle_overlap, upright_box_iou
+from log2sim.geometry import box_corners_bev, points_in_box, rectangle_overlap, rectangles_overlap, upright_box_iou
 from log2sim.perception.lidar.cloud import sweep_to_map
 
 NS = 1_000_000_000
@@ -333,6 +333,8 @@ def test_the_shared_area_of_random_rectangles_is_that_of_polygons():
     assert (truth > 0).sum() > 1000
     assert (truth == 0).sum() > 100
     np.testing.assert_allclose(rectangle_overlap(a, b), truth, atol=1e-7)
+    met = rectangles_overlap(*(b - a)[:, :2].T, a[:, 4], b[:, 4], a[:, 2:4], b[:, 2:4])
+    np.testing.assert_array_equal(met, truth > 0)
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2, np.pi, 0.3, 1e-12, 1e-9, 1e-5])

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import formats_table
 import numpy as np
 import pytest
 from command_line import names, run
@@ -105,11 +105,6 @@ def test_the_table_holds_every_waypoint(scenario: Scenario, tmp_path: Path) -> N
 
 def test_what_each_format_loses_stands_in_the_cookbook() -> None:
     """`python tools/formats_table.py` writes it."""
-    spec = importlib.util.spec_from_file_location("formats_table", ROOT / "tools" / "formats_table.py")
-    assert spec is not None
-    assert spec.loader is not None
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    page = tool.PAGE.read_text(encoding="utf-8")
-    assert tool.with_table(page) == page
-    assert tool.table().count("\n") == 2 + len(plugins.BUILT_IN["export"])
+    page = formats_table.PAGE.read_text(encoding="utf-8")
+    assert formats_table.with_table(page) == page
+    assert formats_table.table().count("\n") == 2 + len(plugins.BUILT_IN["export"])

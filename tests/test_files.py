@@ -29,7 +29,7 @@ from log2sim.files.arrays import (
     take_arrays,
 )
 from log2sim.files.cache import DIGITS, DiskCache
-from log2sim.files.documents import read_json, refuse_existing, replaced, write_json
+from log2sim.files.documents import read_json, replaced, write_json
 from log2sim.perception.first_pass import ObstacleList
 
 
@@ -53,14 +53,6 @@ def test_two_writers_do_not_meet(tmp_path: Path) -> None:
         second.write_text("second")
     assert target.read_text() == "first"  # the outer block ends last
     assert os.listdir(tmp_path) == ["result.json"]
-
-
-def test_an_existing_file_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
-    (tmp_path / "result.json").write_text("x")
-    with pytest.raises(ConfigError, match=r"result\.json: exists already.*--overwrite"):
-        refuse_existing(tmp_path / "result.json", overwrite=False)
-    refuse_existing(tmp_path / "result.json", overwrite=True)
-    refuse_existing(tmp_path / "new.json", overwrite=False)
 
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))

@@ -18,7 +18,6 @@ from log2sim.geometry import (
     apply,
     apply_homography,
     ground_homography,
-    homography_jacobian,
     inverse,
     project,
     rotation_from_rpy,
@@ -261,18 +260,6 @@ def test_jitter_of_a_nodding_camera_is_how_far_the_ground_moves() -> None:
     ]
     assert fit.jitter_m == pytest.approx(np.median(middle), rel=1e-4)
     assert 0.4 < fit.jitter_m < 1.2  # 20 m ahead: (18.5^2 / 1.6 + 1.6) * 0.2 degrees = 0.75 m
-
-
-def test_jacobian_is_that_of_differences() -> None:
-    h, uv = (
-        make_world(14, each=5, noise_px=0.0).fit().ground_H_image,
-        np.array([[300.0, 500.0], [640.0, 400.0], [900.0, 700.0]]),
-    )
-    step = 1e-3
-    for axis in range(2):
-        aside = np.eye(2)[axis] * step
-        slope = (apply_homography(h, uv + aside)[0] - apply_homography(h, uv - aside)[0]) / (2 * step)
-        np.testing.assert_allclose(homography_jacobian(h, uv)[:, :, axis], slope, rtol=1e-4, atol=1e-7)
 
 
 def test_shapes_and_methods_that_do_not_fit_are_the_callers_mistake() -> None:

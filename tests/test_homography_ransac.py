@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import pytest
 
-from log2sim.geometry import CHI2_2DOF_99, apply_homography, rotation_from_rpy
+from log2sim.geometry import apply_homography, rotation_from_rpy
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
 from log2sim.perception.homography.fit import HomographyFit, draw_samples, ground_covariances, solve_samples
@@ -17,7 +16,6 @@ from log2sim.perception.homography.normalized import (
     linearize,
     nearest_poses,
     noise_factors,
-    pose_tangent,
     scale_free_basis,
     squared_errors,
 )
@@ -211,45 +209,17 @@ def test_nearest_pose_is_the_polar_part() -> None:
     assert np.isnan(nearest_poses(K, np.ones((1, 3, 3)))).any()
 
 
-def test_the_tangent_of_a_pose_is_that_of_small_turns_and_shifts() -> None:
-    step = 1e-6
-    pose = np.linalg.inv(K) @ image_H_ground(3.0, 1.0)
-    full = np.column_stack([pose[:, 0], pose[:, 1], pose[:, 2]])
-    derivatives = pose_tangent(K, K @ full)
-    for k, axis in enumerate(np.eye(3)):
-        turned = full.copy()
-        turned[:, :2] = cv2.Rodrigues(axis * step)[0] @ full[:, :2]
-        np.testing.assert_allclose((K @ (turned - full)).ravel() / step, derivatives[:, k], rtol=1e-5, atol=1e-2)
-        shifted = full.copy()
-        shifted[:, 2] += axis * step
-        np.testing.assert_allclose((K @ (shifted - full)).ravel() / step, derivatives[:, 3 + k], rtol=1e-5, atol=1e-2)
-
-
 # Parts.
 
 
-def test_four_correspondences_give_the_homography_that_opencv_finds() -> None:
-    stream = make_stream(outliers=0.0)
-    rng = np.random.default_rng(1)
-    rows = draw_samples(stream, rng, 200, across_ticks=True)
-    found = solve_samples(stream, rows, max_hypotheses=10_000)
-    assert 100 < len(found) < 200  # some are drawn twice, some near a line
-    reference = []
-    for quad in rows.T:
-        if len(set(quad.tolist())) == 4:
-            g, p = (a[:2, quad].T.astype(np.float32) for a in (stream.ground, stream.image))
-            reference.append(cv2.getPerspectiveTransform(g, p))
-    flat = np.array([h.ravel() / np.linalg.norm(h) for h in reference])
-    for h in found:
-        near = np.abs(flat @ (h.ravel() / np.linalg.norm(h))).max()
-        assert near == pytest.approx(1.0, abs=1e-4)
-
-
-def test_hypotheses_see_their_own_points_in_front_and_exactly() -> None:
+@pytest.mark.parametrize("across_ticks", [False, True])
+def test_hypotheses_see_their_own_points_in_front_and_exactly(across_ticks: bool) -> None:
     stream = make_stream(outliers=0.3)
-    rows = draw_samples(stream, np.random.default_rng(2), 300, across_ticks=False)
-    for quad in rows.T:
-        for h in solve_samples(stream, quad[:, None], max_hypotheses=5):
+    rows = draw_samples(stream, np.random.default_rng(2), 300, across_ticks=across_ticks)
+    solved = [solve_samples(stream, quad[:, None], max_hypotheses=5) for quad in rows.T]
+    assert sum(map(len, solved)) > 100
+    for quad, found in zip(rows.T, solved):
+        for h in found:
             q = h @ stream.ground[:, quad]
             assert (q[2] > 0).all()
             np.testing.assert_allclose(q[:2] / q[2], stream.image[:, quad], atol=1e-6)
@@ -282,15 +252,6 @@ def test_derivatives_of_errors_are_those_of_differences() -> None:
         du, dv = (a - b) / (2 * step)
         np.testing.assert_allclose(at.slope[0, k, 0], du * wu, rtol=1e-4, atol=1e-2)
         np.testing.assert_allclose(at.slope[0, k, 1], (dv - shear * du) * wv, rtol=1e-4, atol=1e-2)
-
-
-def test_whitened_errors_of_clean_data_have_unit_variance() -> None:
-    stream = make_stream(5, outliers=0.0)
-    h = stream.image_N_px @ image_H_ground() @ np.linalg.inv(stream.ground_N_m)
-    at = linearize(stream, h[None])
-    assert np.mean(at.error[0] ** 2, axis=1) == pytest.approx([1.0, 1.0], abs=0.15)
-    assert np.mean(at.error[0, 0] * at.error[0, 1]) == pytest.approx(0.0, abs=0.12)
-    assert (at.squared[0] < CHI2_2DOF_99).mean() == pytest.approx(0.99, abs=0.012)
 
 
 @pytest.mark.parametrize(("pixel", "place"), [(1.0, 1.0), (2.0, 0.5), (0.5, 2.0), (0.7, 0.7)])

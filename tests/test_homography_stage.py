@@ -82,34 +82,14 @@ def test_the_calibrations_homography_undoes_the_projection_of_flat_ground(pitch,
     assert np.isfinite(fit.condition)
 
 
-def fit(log, seen, plan=None, method="time-aware"):
+def fit(log, seen, plan=None):
     rng = np.random.default_rng(RNG_SEED)
-    return fit_homographies(log, seen, plan or plan_with(), TopdownConfig(method=method), rng=rng)
+    return fit_homographies(log, seen, plan or plan_with(), TopdownConfig(), rng=rng)
 
 
 def test_nothing_is_fitted_when_the_plan_leaves_it_out():
     seen = Observations(measurements=[unplaced([[1, 2, 3, 4]])])
     assert fit(log_with(tilted()), seen, plan_with(HomographyScope.NONE)) == {}
-
-
-def correspondences(camera, count, rng, noise_px=0.0):
-    xy = np.column_stack([rng.uniform(6, 40, count), rng.uniform(-8, 8, count)])
-    ground = np.column_stack([xy, np.zeros(count)])
-    uv, _ = project(camera, apply(inverse(camera.mount_T_cam), ground))
-    return Correspondences(uv + rng.normal(0, noise_px, uv.shape), xy, np.arange(count) // 20)
-
-
-@pytest.mark.parametrize("method", ["time-aware", "min-frame", "per-frame"])
-def test_obstacles_give_the_homography_of_the_true_camera(method):
-    camera, rng = tilted(0.06, 0.01), np.random.default_rng(1)
-    seen = Observations(measurements=[unplaced([[500, 280, 700, 400]])])
-    seen.feet["front"] = [correspondences(camera, 300, rng, 0.5)]
-    fits = fit(log_with(camera), seen, method=method)
-    found, truth = fits["front"], calibrated_homography(log_with(camera), camera)
-    assert found.source == "obstacles"
-    uv = np.array([[600.0, 550], [400, 450], [900, 480]])
-    xy, _ = apply_homography(found.fit.ground_H_image, uv)
-    np.testing.assert_allclose(xy, apply_homography(truth.ground_H_image, uv)[0], atol=0.3)
 
 
 @pytest.mark.parametrize(("far", "yaw"), [((0, 0, 0), 0.0), ((5e5, 5e6, 80.0), 2.1), ((-40.0, 7, -3), -1.2)])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 from test_size import measured
-from worlds import measured_row, scan, standing
+from worlds import measured_row, rows_at, scan, standing
 
 from log2sim.agents import hypotheses
 from log2sim.agents.hypotheses import explain_track, main_place
@@ -22,24 +22,16 @@ from log2sim.agents.smooth.fixed_interval import (
     marginal_likelihood,
 )
 from log2sim.agents.static import MAX_SPEED_SIGMA_MPS, standing_speed_sigma
-from log2sim.datatypes import Detections, Measurements, Track
+from log2sim.datatypes import Measurements, Track
 
 RATES_HZ = [2.0, 5.0, 20.0]
 
 
 def track_of(t_s: np.ndarray, xy: np.ndarray, category: str = "car", sigma_m: float = 0.2) -> Track:
     """A track without LiDAR points: centers and their covariances alone."""
-    n = len(t_s)
-    found = Detections(np.zeros((n, 4)), np.full(n, 0.8), np.full(n, category))
-    m = replace(
-        Measurements.unplaced(found, t_ns=0, camera="front", sensor_m=np.zeros(3)),
-        t_ns=np.round(t_s * 1e9).astype(np.int64),
-        center_m=np.column_stack([xy, np.zeros(n)]),
-        covariance=np.tile(sigma_m**2 * np.eye(2), (n, 1, 1)),
-        source=np.full(n, "lidar"),
-        yaw_rad=np.zeros(n),
-    )
-    return Track(category, np.arange(n), m)
+    yaw = np.zeros(len(t_s))
+    m = rows_at(xy, category, sigma_m=sigma_m, source="lidar", t_ns=np.round(t_s * 1e9).astype(np.int64), yaw_rad=yaw)
+    return Track(category, np.arange(len(t_s)), m)
 
 
 def view_noise(t_s: np.ndarray, seed: int, sigma_m: float = 0.2) -> np.ndarray:

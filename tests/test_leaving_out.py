@@ -21,7 +21,7 @@ import log2sim.plan
 from log2sim import Config, Scenario, reconstruct, replay
 from log2sim.agents.estimate import simplify_waypoints
 from log2sim.datatypes import Detections, Frame, Lidar, Log, Measurements, Stream, Sweep
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import LogError
 from log2sim.files.documents import check
 from log2sim.geometry import PoseTrack, transform
 from log2sim.perception.detect.detectors import create_detector
@@ -146,17 +146,6 @@ def test_a_lidar_out_of_reach_is_not_read(tiny: Log, monkeypatch: pytest.MonkeyP
 
 
 # --- images and frames
-
-
-def test_boxes_of_the_log_need_no_image(tiny: Log) -> None:
-    def unreadable(i: int) -> Any:
-        raise RecordError(f"frame {i} is gone")
-
-    blind = replace(tiny, streams={**tiny.streams, "front": replace(tiny.streams["front"], read=unreadable)})
-    without, full = run(blind), run(tiny)
-    assert_same_agents(without.scenario, full.scenario, within=0.0)
-    assert without.report["unreadable"] == {}
-    assert not entry(full, "image decoding")["kept"]
 
 
 class Counting:

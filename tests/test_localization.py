@@ -22,7 +22,7 @@ from log2sim.localization.replaced import replace_poses
 from log2sim.localization.verdict import bridge_by_lidar, fit_to_given
 from log2sim.perception.lidar.cloud import sweep_to_map
 
-LIDAR, AUTO = ({"source": name} for name in ("lidar", "auto"))
+AUTO = {"source": "auto"}
 
 
 @cache

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from log_encoders.world import world_log
+from mutation.damages import npy
 
 from log2sim.datatypes import Log, Stream
 from log2sim.errors import RecordError
@@ -61,12 +62,6 @@ def npz(method: int = zipfile.ZIP_DEFLATED, **members: bytes) -> bytearray:
         for name, content in members.items():
             archive.writestr(f"{name}.npy", content)
     return bytearray(stream.getvalue())
-
-
-def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
 
 
 def header(text: str, version: bytes = b"\x01\x00") -> bytes:

@@ -14,22 +14,16 @@ import pytest
 from damaged_bytes import damaged, quick, result_or_refusal
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mutation.damages import npy
 
 from log2sim.datatypes import CATEGORIES, EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
-from log2sim.errors import LogError, RecordError
+from log2sim.errors import RecordError
 from log2sim.geometry import Camera, PoseTrack, RollingShutter, rotation_from_rpy, transform
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
-from log2sim.logs.kitti.labels import parse_oxts
 from log2sim.logs.native.writer import write_log
 from log2sim.logs.opening import open_log
 from log2sim.logs.pandaset.unpickle import read_pickled_table
 from log2sim.logs.records import read_sweep
-
-
-def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
 
 
 def npz(**arrays: np.ndarray) -> bytes:
@@ -78,17 +72,6 @@ def test_a_damaged_pickle_is_an_error_or_a_table(tmp_path: Path, packed: bool, d
     path.write_bytes(gzip.compress(content) if packed else content)
     columns = result_or_refusal(lambda: read_pickled_table(path, limit_bytes=10_000_000), RecordError, str(path))
     assert columns is None or len({len(values) for values in columns.values()}) <= 1
-
-
-WORDS = st.sampled_from(["0", "1", "-1", "Car", "DontCare", "nan", "1e400", "x", "3.5", "\n", "\n\n"])
-ANY_TEXT = st.text(max_size=200) | st.lists(WORDS, max_size=60).map(" ".join)
-
-
-@quick
-@given(text=ANY_TEXT)
-def test_any_text_is_a_log_error_or_rows_of_oxts(text: str) -> None:
-    rows = result_or_refusal(lambda: parse_oxts(text, "file"), LogError, "file, line")
-    assert rows is None or (rows.shape[1] == 30 and np.isfinite(rows).all())
 
 
 coordinate = st.floats(-500.0, 500.0).map(lambda v: round(v, 3))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
-from worlds import Solid, camera_ahead, cloud_at, outline_px, scan, standing
+from worlds import Solid, apart, camera_ahead, cloud_at, outline_px, scan, standing
 
 from log2sim.datatypes import Boxes3D, Detections
 from log2sim.geometry import apply, inverse, transform
@@ -53,10 +53,6 @@ def owners(cluster, world, owner):
     gap, which = KDTree(world).query(cluster[:, :3])
     assert gap.max() < 1e-4
     return owner[which]
-
-
-def apart(yaw, truth, period=np.pi / 2):
-    return abs((yaw - truth + period / 2) % period - period / 2)
 
 
 PLACES = [(10, 2, 20), (14, -4, -30), (18, 6, 75), (22, -3, 140), (28, 5, 5), (35, -8, 170), (12, 5, 100)]

@@ -10,7 +10,6 @@ import pytest
 from log2sim.evaluation.metrics.comparison import associate, mota, near_pairs, switches
 from log2sim.evaluation.metrics.correctness import normalized_errors, reliability
 from log2sim.evaluation.metrics.evaluator import hota
-from log2sim.geometry import choose_pairs
 
 
 def random_tracks(seed, truths=8, others=9, ticks=40, arena_m=14.0):
@@ -80,18 +79,6 @@ def test_hota_matches_the_identity_that_is_right_most_often_though_another_is_ne
     assert found["hota"] == pytest.approx((8 * np.sqrt(low * 10 / 11) + 10 * np.sqrt(high * 2 / 19)) / 19)
 
 
-def test_assignment_equals_the_dense_solver():
-    from scipy.optimize import linear_sum_assignment
-
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        dense = np.where(rng.random((12, 9)) < 0.25, rng.random((12, 9)), 0.0)
-        rows, cols = np.nonzero(dense)
-        chosen = choose_pairs(rows, cols, -dense[rows, cols], 0.0)
-        assert len(np.unique(rows[chosen])) == len(np.unique(cols[chosen])) == len(chosen)
-        assert dense[rows[chosen], cols[chosen]].sum() == pytest.approx(dense[linear_sum_assignment(-dense)].sum())
-
-
 def test_the_calibration_error_of_two_bins_by_hand():
     confidence = np.array([0.25, 0.25, 0.25, 0.25, 0.95, 1.0])
     table = reliability(confidence, np.array([True, False, False, False, True, False]))
@@ -102,16 +89,6 @@ def test_the_calibration_error_of_two_bins_by_hand():
     assert (low["count"], low["mean_confidence"], low["right"]) == (4, 0.25, 0.25)
     assert (high["count"], high["mean_confidence"], high["right"]) == (2, 0.975, 0.5)
     assert [b["right"] for b in table["bins"]].count(None) == 8
-
-
-def test_what_is_right_as_often_as_it_claims_is_calibrated():
-    rng = np.random.default_rng(0)
-    confidence = rng.uniform(size=100_000)
-    calibrated = reliability(confidence, rng.uniform(size=100_000) < confidence)
-    assert calibrated["expected_calibration_error"] < 0.01
-    overconfident = reliability(confidence, rng.uniform(size=100_000) < confidence**2)
-    # The integral of c - c^2 over 0 to 1.
-    assert overconfident["expected_calibration_error"] == pytest.approx(1 / 6, abs=0.01)
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])

@@ -43,11 +43,6 @@ def plan_of(log: Log | None = None, config: Config | None = None) -> Plan:
     return make_plan(log, config, select_sensors(log, config), T_NS)
 
 
-def decided(stage: Stage, log: Log | None = None, *settings: str) -> tuple[bool, str]:
-    found = plan_of(log, Config.load(settings=settings)).decision(stage)
-    return found.kept, found.reason
-
-
 def test_every_stage_is_decided_once_with_a_reason() -> None:
     decisions = plan_of(config=Config.load(settings=["detect.name=labels+lidar:labels"])).decisions
     # About the fusion of vehicle and road only logs with both say something.

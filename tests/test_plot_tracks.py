@@ -15,7 +15,6 @@ from replay_maneuvers import MANEUVERS, agent_from, scenario_of
 from worlds import waypoints
 
 from log2sim.datatypes import TYPICAL_SIZE_M, Agent, Finding, Scenario
-from log2sim.errors import ConfigError
 from log2sim.geometry import Array, box_corners_bev
 from log2sim.simulation.policy import Controls
 from log2sim.simulation.result import Replay
@@ -62,11 +61,6 @@ def test_the_suffix_chooses_the_format(tmp_path: Path, suffix: str, magic: bytes
     assert out.read_bytes().startswith(magic)
     assert out.stat().st_size > 5000
     assert [p.name for p in tmp_path.iterdir()] == [out.name]
-
-
-def test_an_unknown_suffix_lists_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"\.png, \.svg, \.pdf.*\.gif, \.mp4.*'\.bmp'"):
-        plot_tracks(crossing(), tmp_path / "a.bmp")
 
 
 def draw(scenario: Scenario, **overlays: object) -> FigureLayout:

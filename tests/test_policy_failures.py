@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
@@ -16,7 +15,7 @@ from worlds import waypoints
 from log2sim.datatypes import EGO, Agent, MapFeatures, Marking, Scenario, Signal
 from log2sim.errors import ConfigError
 from log2sim.scenarios import failure
-from log2sim.scenarios.failure import LIMITS, Outcome, drive, judge_run, report_page, search, with_ego
+from log2sim.scenarios.failure import LIMITS, drive, judge_run, report_page, search, with_ego
 from log2sim.scenarios.index import open_index
 from log2sim.scenarios.logical import Base, Logical, choose_base, fit
 from log2sim.scenarios.query import ask
@@ -63,16 +62,8 @@ def test_errors_of_a_policy_are_failures_of_it() -> None:
     assert found.estimate.low < 0.5 < found.estimate.high
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("found")
-    for seed in range(4):
-        traffic(seed, count=8, duration_s=12.0).scenario.save(root / f"{seed}" / "scenario.json")
-    return root
-
-
-def test_runs_are_judged_by_what_the_ego_did(folder, monkeypatch) -> None:
-    index = open_index(folder, jobs=1)
+def test_runs_are_judged_by_what_the_ego_did(traffic_folder, monkeypatch) -> None:
+    index = open_index(traffic_folder, jobs=1)
     rows = ask(index, "cut_in").rows
     logical, chosen = fit(rows), choose_base(fit(rows), rows)
     base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
@@ -166,21 +157,17 @@ def test_who_passes_the_stop_line_of_a_red_light_breaks_a_rule(red_from_s, expec
 def test_limits_that_are_none_are_refused(text, said) -> None:
     with pytest.raises(ConfigError, match=said):
         parse_limits([text], list(LIMITS))
-
-
-def test_outcomes_compare_by_their_margins() -> None:
     assert parse_limits(["min_ttc_s=1.5", "max_brake_mps2=6"], list(LIMITS)) == {
         "min_ttc_s": 1.5,
         "max_brake_mps2": 6.0,
     }
-    assert Outcome(-np.inf, {}, "x").margin < Outcome(-3.0, {}).margin < 0
 
 
 @pytest.mark.slow
-def test_a_policy_that_raises_in_every_run_is_told(folder, tmp_path) -> None:
+def test_a_policy_that_raises_in_every_run_is_told(traffic_folder, tmp_path) -> None:
     (tmp_path / "mine.py").write_text("def broken(seen):\n    raise ValueError('mine')\n")
     policy = f"{tmp_path / 'mine.py'}:broken"
-    broken = run("test", policy, folder, "cut_in", "-o", tmp_path / "u", "-q", "--runs", 40, "--jobs", 1)
+    broken = run("test", policy, traffic_folder, "cut_in", "-o", tmp_path / "u", "-q", "--runs", 40, "--jobs", 1)
     assert "raises in every run" in broken.line
     assert "mine" in broken.line
 

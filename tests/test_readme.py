@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import importlib.util
 import json
 import os
 import re
@@ -19,6 +18,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import demo
 import pytest
 import typer
 from command_line import run
@@ -88,11 +88,6 @@ def test_commands_of_the_readme_parse(line: str) -> None:
 
 
 def test_commands_of_the_demo_parse() -> None:
-    spec = importlib.util.spec_from_file_location("demo", ROOT / "tools/demo.py")
-    assert spec is not None
-    assert spec.loader is not None
-    demo = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(demo)
     for command in demo.COMMANDS:
         parse(shlex.join(["log2sim", *command, "--overwrite"]))
 

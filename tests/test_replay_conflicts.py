@@ -22,23 +22,6 @@ from log2sim.simulation.metrics.conflicts import (
 )
 from log2sim.simulation.runner import replay
 
-SIZE = np.array([[4.0, 2.0, 1.5]])
-
-
-def touch(dx, dy, vx, vy, yaw_a=0.0, yaw_b=0.0):
-    one = [np.array([v], float) for v in (dx, dy, vx, vy, yaw_a, yaw_b)]
-    return float(time_to_touch(*one, SIZE, SIZE)[0])
-
-
-def test_time_to_touch_is_the_gap_over_the_closing_speed():
-    assert touch(20, 0, -8, 0) == pytest.approx((20 - 4) / 8)
-    assert touch(20, 1.9, -8, 0) == pytest.approx((20 - 4) / 8)
-    assert touch(0, -9, 0, 2, 0.0, 0.0) == pytest.approx((9 - 2) / 2)
-    assert touch(20, 0, -8, 0, 0.0, np.pi / 2) == pytest.approx((20 - 3) / 8)
-    assert touch(12, 9, -6, -3, 0.0, np.pi / 2) == pytest.approx(max((12 - 3) / 6, (9 - 3) / 3))
-    # A corner ahead of a side: it reaches (4 + 2) / 2 / sqrt(2) from its center.
-    assert touch(20, 0, -8, 0, 0.0, np.pi / 4) == pytest.approx((20 - 2 - 3 / np.sqrt(2)) / 8)
-
 
 def test_time_to_touch_is_when_moments_see_the_first_overlap():
     rng = np.random.default_rng(1)

@@ -11,7 +11,6 @@ from replay_maneuvers import OFFSET_M, agent_from, driven, ramp, scenario_of
 from log2sim.simulation.runner import replay
 from log2sim.simulation.vehicles.vehicle import parameters_for
 
-STEPS_S = [0.001, 0.01, 0.1, 1.0]
 LONG_STEPS_S = [0.01, 0.1, 0.25, 1.0]  # for lives too long for steps of 1 ms in a quick test
 CAR = parameters_for([agent_from([0.0], [0.0], [0.0], [0.0], [0.0])])
 LOCK_1PM = float(np.tan(CAR.max_steer_rad[0]) / CAR.wheelbase_m[0])
@@ -34,19 +33,6 @@ def on_circle(speed, radius, duration_s, *, begin_s=0.0, rate_hz=10.0):
 def shifted(agent, *, x=0.0, y=0.0, t=0.0):
     w = agent.waypoints
     return changed(agent, waypoints=changed(w, x_m=w.x_m + x, y_m=w.y_m + y, t_s=w.t_s + t))
-
-
-# Speeds.
-
-
-@pytest.mark.parametrize("dt_s", STEPS_S)
-def test_a_vehicle_that_stands_does_not_move_at_all(dt_s):
-    t = np.arange(51) * 0.1
-    r = followed(agent_from(t, 0 * t + 3.0, 0 * t - 2.0, 0 * t + 2.5, 0 * t), dt_s=dt_s)
-    np.testing.assert_allclose(r.x_m, 3.0, atol=1e-6)
-    np.testing.assert_allclose(r.y_m, -2.0, atol=1e-6)
-    np.testing.assert_allclose(r.yaw_rad, 2.5, atol=1e-6)
-    assert np.all(r.speed_mps == 0)
 
 
 # Directions and limits.

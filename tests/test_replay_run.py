@@ -8,16 +8,12 @@ from dataclasses import replace as changed
 import numpy as np
 import pytest
 from replay_maneuvers import MANEUVERS, agent_from, scenario_of
+from replay_scenes import line
 
 from log2sim.errors import ScenarioError
 from log2sim.files.documents import check, write_json
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
-
-
-def straight(id="a", y=0.0, speed=5.0, duration_s=3.0, **options):
-    t = np.arange(round(duration_s * 10) + 1) * 0.1
-    return agent_from(t, speed * t, np.full(len(t), y), 0 * t, np.full(len(t), speed), id=id, **options)
 
 
 def test_exact_mode_goes_through_the_waypoints():
@@ -52,7 +48,7 @@ def test_a_replay_reads_back_as_it_was_written(tmp_path):
     result = replay(
         scenario_of(
             MANEUVERS["lane change"](),
-            straight("b", y=9),
+            line("b", 0.0, 9.0, speed=5.0, duration_s=3.0),
             agent_from([0.0], [5.0], [3.0], [1.0], [0.0], id="p", static=True),
         )
     )
@@ -74,7 +70,7 @@ def test_a_replay_reads_back_as_it_was_written(tmp_path):
     ],
 )
 def test_broken_replay_files_are_refused_by_field(tmp_path, change, said):
-    document = replay(scenario_of(straight())).to_dict()
+    document = replay(scenario_of(line("a", 0.0, speed=5.0, duration_s=3.0))).to_dict()
     change(document)
     path = tmp_path / "broken.json"
     write_json(path, document)
@@ -87,7 +83,11 @@ def test_broken_replay_files_are_refused_by_field(tmp_path, change, said):
 
 
 def test_one_waypoint_is_one_state():
-    result = replay(scenario_of(agent_from([1.0], [3.0], [4.0], [0.5], [2.0], id="seen once"), straight()))
+    result = replay(
+        scenario_of(
+            agent_from([1.0], [3.0], [4.0], [0.5], [2.0], id="seen once"), line("a", 0.0, speed=5.0, duration_s=3.0)
+        )
+    )
     r = result.agent("seen once")
     assert r.driver == "exact"
     assert (r.t_s[0], r.x_m[0], r.y_m[0], r.yaw_rad[0], r.speed_mps[0]) == (1.0, 3.0, 4.0, 0.5, 2.0)

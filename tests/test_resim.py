@@ -55,10 +55,15 @@ def world(recorded: tuple[Log, Scenario]) -> World:
     return build_world(log, truth, list(log.lidars), leave_out=lambda _, i: i % 5 == 2)
 
 
+def in_map(log: Log, name: str, t_ns: np.ndarray, xyz_m: np.ndarray) -> np.ndarray:
+    """Points of a sweep, each by the pose at its time."""
+    poses, moment, _ = poses_of(log, name, t_ns)
+    return np.einsum("nij,nj->ni", poses[moment, :3, :3], xyz_m) + poses[moment, :3, 3]
+
+
 def points_of(simulation: Simulation, name: str, i: int, log: Log) -> np.ndarray:
     sweep = simulation.sweep(name, i)
-    poses, moment, _ = poses_of(log, name, sweep.t_ns)
-    return np.einsum("nij,nj->ni", poses[moment, :3, :3], sweep.xyz_m) + poses[moment, :3, 3]
+    return in_map(log, name, sweep.t_ns, sweep.xyz_m)
 
 
 def count_in_box(points: np.ndarray, scenario: Scenario, id: str, t_s: float) -> int:
@@ -96,8 +101,8 @@ def test_an_agent_leaves_no_copy_and_stands_where_it_is_moved(recorded: tuple[Lo
     )
     before = count_in_box(points_of(Simulation(log, world, truth), name, 12, log), truth, there.id, t_s[12])
     assert before > 50
-    without = replace(truth, agents=tuple(a for a in truth.agents if a.id != there.id))
-    assert count_in_box(points_of(Simulation(log, world, without), name, 12, log), truth, there.id, t_s[12]) <= 2
+    gone = without(truth, there.id)
+    assert count_in_box(points_of(Simulation(log, world, gone), name, 12, log), truth, there.id, t_s[12]) <= 2
     w = there.waypoints
     aside = replace(there, waypoints=replace(w, y_m=w.y_m + 3.0))
     edited = replace(truth, agents=tuple(aside if a.id == there.id else a for a in truth.agents))
@@ -113,8 +118,7 @@ def test_agents_have_about_as_many_points_as_recorded(recorded: tuple[Log, Scena
     for i in (2, 7, 12):
         t_s = (log.streams[name].t_ns[i] - truth.t0_ns) / NS_PER_S - 0.05
         sweep = log.streams[name].read(i)
-        poses, moment, _ = poses_of(log, name, sweep.t_ns)
-        true = np.einsum("nij,nj->ni", poses[moment, :3, :3], sweep.xyz_m) + poses[moment, :3, 3]
+        true = in_map(log, name, sweep.t_ns, sweep.xyz_m)
         for row, points in enumerate((true, points_of(Simulation(log, world, truth), name, i, log))):
             counts[row] += [count_in_box(points, truth, agent.id, t_s) for agent in truth.others]
     seen = counts[0] >= 20
@@ -133,9 +137,7 @@ def test_wheels_that_reach_out_of_a_short_box_are_kept(recorded: tuple[Log, Scen
     log, truth = recorded
     (name,) = log.lidars
     shots, pattern = recorded_shots(log, name, log.streams[name].read(12)), world.models[name].pattern
-    poses, moment, _ = poses_of(log, name, shots.t_ns)
-    points = np.einsum("nij,nj->ni", poses[moment, :3, :3], shots.direction * shots.range_m[:, None])
-    points += poses[moment, :3, 3]
+    points = in_map(log, name, shots.t_ns, shots.direction * shots.range_m[:, None])
     t_s = (log.streams[name].t_ns[12] - truth.t0_ns) / NS_PER_S - 0.05
     seen = max(truth.others, key=lambda a: count_in_box(points, truth, a.id, t_s))
     length, width, height = seen.size_m
@@ -192,8 +194,7 @@ def test_surfaces_of_an_agent_lie_on_each_other_though_its_trajectory_is_off(rec
     every = []
     for i in range(len(t_s)):
         sweep = log.streams[name].read(i)
-        poses, moment, _ = poses_of(log, name, sweep.t_ns)
-        every.append(on_car(np.einsum("nij,nj->ni", poses[moment, :3, :3], sweep.xyz_m) + poses[moment, :3, 3], i))
+        every.append(on_car(in_map(log, name, sweep.t_ns, sweep.xyz_m), i))
     tree = cKDTree(np.concatenate(every))
     for scenario, aside_m in ((source, 0.0), (edited, 2.0)):
         found = [on_car(points_of(Simulation(log, built, scenario), name, i, log), i, aside_m) for i in (2, 7)]
@@ -221,7 +222,7 @@ def test_a_simulated_log_opens_with_its_truth(recorded: tuple[Log, Scenario], tm
     log, truth = recorded
     short = log.changed(streams={k: replace(s, t_ns=s.t_ns[:4]) for k, s in log.streams.items()})
     film = choose_film_file(tmp_path / "film.webm")
-    gone = replace(truth, agents=tuple(a for a in truth.agents if a.id != truth.others[0].id))
+    gone = without(truth, truth.others[0].id)
     resimulate(
         short, truth, truth, tmp_path / "out", then=lambda made: write_film(replace(made, scenario=gone), truth, film)
     )

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import measured_row, rows_at, scan, standing
+from worlds import apart, measured_row, rows_at, scan, standing
 
 from log2sim.agents.hypotheses import explain_track
 from log2sim.agents.size import ends_of, moving_geometry, static_geometry
@@ -57,10 +57,6 @@ def moved(track, shift, angle=0.0):
     )  # fmt: skip
 
 
-def apart(yaw, truth, period=np.pi):
-    return abs((yaw - truth + period / 2) % period - period / 2)
-
-
 PASSING = [(0.8 * k, 0.0, 1.9) for k in range(25)]  # the sensor drives past at 8 m/s
 
 
@@ -97,7 +93,7 @@ def test_a_parked_car_passed_by_is_found_with_its_size_and_yaw(x, y, yaw_deg):
     assert shape.is_likely
     # A hundredth of the points is cut at each end, and rays miss the very corners.
     np.testing.assert_allclose(shape.size_m, CAR, atol=0.2)
-    assert apart(shape.yaw_rad, yaw) < np.deg2rad(2)
+    assert apart(shape.yaw_rad, yaw, np.pi) < np.deg2rad(2)
     assert np.hypot(*(shape.xy_m - [x, y]).T).max() < 0.1
     np.testing.assert_array_equal(shape.xy_m, np.tile(shape.xy_m[0], (25, 1)))
     np.testing.assert_allclose(shape.z_m, 0.8, atol=0.1)
@@ -116,7 +112,7 @@ def test_a_size_that_is_not_seen_is_the_typical_one():
     shape = static_geometry(measured([(12, 0, 0.0)] * 12, sensors=behind))
     # Corners are sharp in this world, so that the car seems 3 % wider than the typical one, and is taken to be as much longer.
     assert shape.size_m[0] == pytest.approx(TYPICAL_SIZE_M["car"][0], abs=0.15)
-    assert apart(shape.yaw_rad, 0.0) < np.deg2rad(3)
+    assert apart(shape.yaw_rad, 0.0, np.pi) < np.deg2rad(3)
     assert np.sqrt(shape.covariance[0, 0, 0]) > 3 * np.sqrt(shape.covariance[0, 1, 1])
 
 
@@ -127,7 +123,7 @@ def test_shapes_move_and_turn_with_the_map(shift, angle):
     # Cells that tell persistent points from stray ones lie fixed in the map.
     np.testing.assert_allclose(there.size_m, here.size_m, atol=0.08)
     np.testing.assert_allclose(there.xy_m, rotate(here.xy_m, angle) + shift[:2], atol=0.08)
-    assert apart(there.yaw_rad, here.yaw_rad + angle) < np.deg2rad(1.5)
+    assert apart(there.yaw_rad, here.yaw_rad + angle, np.pi) < np.deg2rad(1.5)
     track, yaw = measured(oncoming(12)), np.full(12, np.pi)
     here, there = moving_geometry(track, yaw), moving_geometry(moved(track, np.array(shift), angle), yaw + angle)
     np.testing.assert_allclose(there.size_m, here.size_m, atol=1e-4)

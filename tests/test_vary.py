@@ -7,7 +7,6 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from benchmarks.tag_worlds import traffic
 from command_line import run
 
 from log2sim.datatypes import Scenario
@@ -64,20 +63,12 @@ def test_one_value_for_all_stays_that_value() -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    root = tmp_path_factory.mktemp("found")
-    for seed in range(4):
-        traffic(seed, count=8, duration_s=12.0).scenario.save(root / f"{seed}" / "scenario.json")
-    return root
-
-
-@pytest.fixture(scope="module")
-def found(folder):
-    index = open_index(folder, jobs=1)
+def found(traffic_folder):
+    index = open_index(traffic_folder, jobs=1)
     rows = ask(index, "cut_in").rows
     logical = fit(rows)
     chosen = choose_base(logical, rows)
-    return logical, Base.of(Scenario.load(folder / chosen["file"]), chosen)
+    return logical, Base.of(Scenario.load(traffic_folder / chosen["file"]), chosen)
 
 
 def test_concrete_scenarios_have_the_parameters_that_were_asked_for(found) -> None:
@@ -160,9 +151,16 @@ def test_hits_without_a_distribution_are_refused(rows, said) -> None:
         fit(rows)
 
 
-def test_the_command(folder, tmp_path) -> None:
+def test_the_command(traffic_folder, tmp_path) -> None:
     ran = run(
-        "vary", folder, "overtaking and relative_speed_mps > 2", "-o", tmp_path / "v", "--count", 6, "--openscenario"
+        "vary",
+        traffic_folder,
+        "overtaking and relative_speed_mps > 2",
+        "-o",
+        tmp_path / "v",
+        "--count",
+        6,
+        "--openscenario",
     )
     assert ran.code == 0, ran.err
     about = json.loads((tmp_path / "v" / "logical.json").read_text())
@@ -175,11 +173,13 @@ def test_the_command(folder, tmp_path) -> None:
     table = pq.read_table(tmp_path / "v" / "variations.parquet").to_pylist()
     assert len(table) == 6
     assert sum(row["file"] is not None for row in table) == len(written)
-    assert "exists already" in run("vary", folder, "overtaking", "-o", tmp_path / "v").line
-    assert "cut_in" in run("vary", folder, "standing", "-o", tmp_path / "w").line
-    closest = run("vary", folder, "cut_in and gap_m < 0.001", "-o", tmp_path / "w").line
+    assert "exists already" in run("vary", traffic_folder, "overtaking", "-o", tmp_path / "v").line
+    assert "cut_in" in run("vary", traffic_folder, "standing", "-o", tmp_path / "w").line
+    closest = run("vary", traffic_folder, "cut_in and gap_m < 0.001", "-o", tmp_path / "w").line
     assert "without 'gap_m < 0.001' there are" in closest
-    nothing = run("vary", folder, "cut_in and gap_m < 0.001 and ttc_s < 0", "-o", tmp_path / "w", "--probability", 0.9)
+    nothing = run(
+        "vary", traffic_folder, "cut_in and gap_m < 0.001 and ttc_s < 0", "-o", tmp_path / "w", "--probability", 0.9
+    )
     assert "each alone: 'cut_in' " in nothing.line
     assert "'probability >= 0.9' " in nothing.line
     assert not (tmp_path / "w").exists()

@@ -27,7 +27,7 @@ from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.result import Replay
 from log2sim.simulation.runner import replay
 from log2sim.simulation.warnings import warn
-from log2sim.visualization.page.document import SCALES, page_document, second_differences
+from log2sim.visualization.page.document import SCALES, page_document
 from log2sim.visualization.page.writer import page_html, write_page
 from log2sim.visualization.plot import style
 from log2sim.visualization.plot.viewport import assign_view_roles
@@ -50,7 +50,7 @@ def made(*agents: Agent, name: str = "made") -> Scenario:
 
 
 class Parts(HTMLParser):
-    """Tags of a page with their attributes, and the text in each of its scripts and styles."""
+    """Tags of a page with their attributes, and each text with the tag before it."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -62,19 +62,11 @@ class Parts(HTMLParser):
         self.tags.append((tag, dict(attrs)))
 
     def handle_data(self, data: str) -> None:
-        if self.tags and self.tags[-1][0] in ("script", "style") and data.strip():
+        if self.tags and data.strip():
             self.texts.append((self.tags[-1][0], data))
 
 
 # What is written
-
-
-def test_columns_come_back_from_their_second_differences() -> None:
-    values = np.random.default_rng(0).normal(0, 1e7, 300)
-    summed = np.cumsum(np.cumsum(second_differences(values, 1e3))) / 1e3
-    np.testing.assert_allclose(summed, values, atol=0.5e-3 + 1e-8)
-    assert second_differences([2.5], 10) == [25]
-    assert second_differences(np.arange(9.0), 1e4)[2:] == [0] * 7
 
 
 def test_the_document_holds_every_layer() -> None:

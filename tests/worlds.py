@@ -195,6 +195,11 @@ def camera_ahead(
     return Camera(name, 1200, 600, k, mount, mount_T_cam)
 
 
+def apart(yaw_rad: float, other_rad: float, period_rad: float = np.pi / 2) -> float:
+    """Smallest difference of two angles up to multiples of a period."""
+    return abs((yaw_rad - other_rad + period_rad / 2) % period_rad - period_rad / 2)
+
+
 def outline_px(camera: Camera, map_T_cam: Array, solid: Solid) -> Array:
     """The exact 2D box (4,) of a solid that lies wholly in front of the camera, cut at the image's border."""
     corners = apply(inverse(map_T_cam), box_corners(solid.center_m, solid.size_m, solid.yaw_rad)[0])

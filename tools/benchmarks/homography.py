@@ -270,13 +270,10 @@ def best_thresholds() -> dict[str, tuple[float, float]]:
     stream, out = make_stream(Case(), 999), {}
     each = [stream.tick == t for t in range(40)]
     for name, (peer, choices) in peers().items():
-        best = []
-        for rows in (each, [slice(None)]):
+        best = [choices[0]] * 2 if len(choices) == 1 else []
+        for rows in (each, [slice(None)]) if not best else ():
             off = []
-            for threshold in choices if name != "scikit-image ransac" else choices[:1]:
-                if len(choices) == 1:
-                    off.append(0.0)
-                    continue
+            for threshold in choices:
                 found = np.array([asked(peer, threshold, stream.xy[r], stream.uv[r]) for r in rows])
                 found = np.broadcast_to(found, (40, 3, 3))
                 near, far = (np.nanmedian(errors_m(found, stream, r)) for r in (NEAR_M, FAR_M))

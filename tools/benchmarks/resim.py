@@ -244,10 +244,8 @@ def around(log: Log, source: Scenario, edited: Scenario, name: str) -> list[tupl
 
 def shares(counts: list[Figures]) -> Figures:
     """Turn counts of several records to shares."""
-    n = {key: sum(c[key] for c in counts) for key in counts[0]}
-    rest = mean(
-        [{k: v for k, v in c.items() if k not in ("recorded", "found again", "simulated", "right")} for c in counts]
-    )
+    n = {key: sum(c[key] for c in counts) for key in ("recorded", "found again", "simulated", "right")}
+    rest = {key: value for key, value in mean(counts).items() if key not in n}
     again, right = (n[a] / n[b] if n[b] else np.nan for a, b in (("found again", "recorded"), ("right", "simulated")))
     return {**rest, "boxes": n["recorded"], "found again": again, "right": right}
 

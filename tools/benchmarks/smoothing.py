@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import UnivariateSpline, make_smoothing_spline
 from scipy.signal import savgol_filter
 
@@ -61,9 +62,9 @@ def truth_of(maneuver: str, period_s: float = PERIOD_S) -> Truth:
     frames = round((FRAMES - 1) * PERIOD_S / period_s) + 1
     t = np.arange((frames - 1) * SUBSTEPS + 1, dtype=np.float64) * (period_s / SUBSTEPS)
     speed, yaw_rate = _controls(maneuver, t)
-    yaw = 0.4 + _integral(yaw_rate, t)
+    yaw = 0.4 + cumulative_trapezoid(yaw_rate, t, initial=0.0)
     velocity = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-    xy = np.stack([_integral(velocity[:, 0], t), _integral(velocity[:, 1], t)], axis=1)
+    xy = cumulative_trapezoid(velocity, t, axis=0, initial=0.0)
     curvature = np.divide(yaw_rate, speed, out=np.zeros_like(t), where=speed > MOVING_MPS / 2)
     every = slice(None, None, SUBSTEPS)
     return Truth(t[every], xy[every], velocity[every], speed[every], yaw[every], curvature[every])
@@ -94,10 +95,6 @@ def _controls(maneuver: str, t: Array) -> tuple[Array, Array]:
         speeds = [0.0, 0.0, 3.0, 3.0, 0.0, 0.0, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0]
         return np.interp(t, times, speeds), np.zeros_like(t)
     raise ValueError(f"unknown maneuver {maneuver!r}; known: {', '.join(MANEUVERS)}")
-
-
-def _integral(values: Array, t: Array) -> Array:
-    return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(t))])
 
 
 def worlds(sigma_m: float, outlier_share: float = 0.0, seeds: int = 6) -> Iterator[World]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -218,28 +217,6 @@ def one_frame() -> Outcome:
 
 
 # --- calibrations
-
-
-def manifest(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
-    def edit(folder: Path) -> None:
-        document = json.loads((folder / "log.json").read_text())
-        change(document)
-        (folder / "log.json").write_text(json.dumps(document))
-
-    return edit
-
-
-FIELDS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "quaternion not of length 1": (
-        lambda m: m["sensors"][0].update(rotation_wxyz=[0.5, -0.5, 0.6, -0.5]),
-        "rotation_wxyz",
-    ),
-    "focal length 0 in the file": (lambda m: m["sensors"][0]["intrinsics"].update(fx_px=0), "fx_px"),
-}
-for _name, (_change, _word) in FIELDS.items():
-    case(f"calibration: {_name}", "refused, naming the field")(
-        lambda c=_change, w=_word: refused(lambda: result_of(manifest(c)), w)
-    )
 
 
 def with_array(sensor: str, name: str, place: Any, change: Callable[[Array], Array]) -> Log:
