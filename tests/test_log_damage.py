@@ -27,7 +27,7 @@ from log2sim.logs.checks import drop_impossible_labels, list_calibration_problem
 from log2sim.logs.excerpt import cut_log
 from log2sim.logs.native.reader import read_csv_table
 from log2sim.logs.native.writer import write_log
-from log2sim.logs.opening import open_log
+from log2sim.logs.opening import open_log, validate_log
 from log2sim.plan import select_sensors
 
 LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
@@ -267,8 +267,11 @@ def test_labels_of_no_object_are_left_out_and_told(column: str, value: float, ro
     labels = replace(log.labels, **{column: changed})
     checked = drop_impossible_labels(log.changed(labels=labels))
     words = "1 label left out: no object is so large or so far away, or it has no size"
-    assert (words in checked.notes) == (not row_is_kept)
+    assert words not in checked.notes  # labels that nobody asks for are not read
     assert checked.labels is not None
+    assert (words in checked.notes) == (not row_is_kept)
+    unread = drop_impossible_labels(log.changed(labels=labels, format="log2sim"))
+    assert (words in validate_log(unread)) == (not row_is_kept)
     assert len(checked.labels.t_ns) == len(labels.t_ns) - (not row_is_kept)
     assert checked.labels.track_id.tolist() == np.delete(labels.track_id, [] if row_is_kept else [2]).tolist()
 

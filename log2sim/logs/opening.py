@@ -234,7 +234,8 @@ def validate_log(
     each record. Raises `LogError` when the log cannot be opened at all.
     """
     log = path if isinstance(path, Log) else open_log(path, format=format, sequence=sequence)
-    # Notes on other formats say what the format lacks; those on native logs say what is wrong with the stamps.
+    log.labels  # noqa: B018  what is wrong with them is noted when they are read
+    # Notes on other formats say what the format lacks; those on native logs say what is wrong with stamps and labels.
     problems = list(log.notes) if log.format == "log2sim" else []
     total = sum(len(s.t_ns) for s in log.streams.values())
     done = 0
