@@ -4,7 +4,7 @@
 
 Each scene is rendered in its conditions, reconstructed and compared with its truth as `log2sim evaluate` does: precision and
 recall of lane lines at 0.3 m within 40 m of the ego's path where a sensor saw the ground, lateral error, kinds, false length,
-stop lines and crosswalks, and how much of the true paths lies in a found lane. `--rig` leaves out the other sensors.
+stop lines and crosswalks, borders of the roads, and how much of the true paths lies in a found lane. `--rig` leaves out the other sensors.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from log2sim.synth.synthesis import write_synthetic
 Rig = Literal["all", "cameras", "lidar"]
 HEADER = [
     "scene", "condition", "precision", "recall", "within 20 m", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
-    "crosswalks", "lanes precision", "recall", "center off by", "paths inside",
+    "crosswalks", "borders precision", "recall", "lanes precision", "recall", "center off by", "paths inside",
 ]  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def measure(case: Case, rig: Rig, folder: Path) -> dict[str, Any]:
 
 def row(case: Case, found: dict[str, Any]) -> list[str]:
     """A row of the table."""
-    lines, lanes = found.get("lane_lines") or {}, found.get("lanes") or {}
+    lines, borders, lanes = (found.get(name) or {} for name in ("lane_lines", "borders", "lanes"))
 
     def count(kind: str) -> str:
         n = found.get(kind) or {}
@@ -108,7 +108,7 @@ def row(case: Case, found: dict[str, Any]) -> list[str]:
         Path(case.scene).stem, case.condition, *(cell(lines.get(k)) for k in ("precision", "recall", "recall_20_m")),
         *(cell(lines.get(k), 3, " m") for k in ("lateral_median_m", "lateral_p95_m")), cell(lines.get("kind_accuracy")),
         cell(lines.get("false_m_per_100_m"), 1, " m"), count("stop_lines"), count("crosswalks"),
-        *(cell(lanes.get(k)) for k in ("precision", "recall")), cell(lanes.get("center_median_m"), 2, " m"), cell(lanes.get("inside")),
+        *(cell(of.get(k)) for of in (borders, lanes) for k in ("precision", "recall")), cell(lanes.get("center_median_m"), 2, " m"), cell(lanes.get("inside")),
     ]  # fmt: skip
 
 
