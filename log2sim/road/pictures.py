@@ -208,6 +208,9 @@ def sample_nearest(image: NDArray[Pixel], warp: Warp, shrink: int, outside: Pixe
 # Cells between those that are compared for the exposure.
 STEP = 4
 MIN_COMMON_CELLS = 100
+# What an overlap tells of an exposure counts as much as that it is usual, as in Brown and Lowe: noise of 10 levels of 100 against a
+# tenth. Counted whole, what is brighter far away than near, as wet roads are, would make each picture brighter than the last.
+OVERLAP_SHARE = 0.5
 # An exposure may differ from what is mapped so far by at most one stop.
 MAX_LOG_GAIN = 0.7
 # Finer pixels do not show more of a cell, but they are those of the nearest view.
@@ -221,8 +224,8 @@ class ColorRaster:
     """Accumulate pictures that were warped onto a raster.
 
     Weights are the fourth power of the pixels along a cell's edge, so that the nearest view decides and far ones only fill the
-    rest. The gain of a picture is the median ratio of its colors to those mapped so far, after Brown and Lowe (2007), section
-    6, but one picture after the other; without an overlap it is that of the last picture of its camera.
+    rest. The gain of a picture is between 1 and the median ratio of its colors to those mapped so far, after Brown and Lowe (2007),
+    section 6, but one picture after the other; without an overlap it is that of the last picture of its camera.
     """
 
     def __init__(self, raster: Raster) -> None:
@@ -266,7 +269,8 @@ class ColorRaster:
         else:
             mapped = self._sum.reshape(-1, 3)[cell[some]] / self._weight.reshape(-1)[cell[some], None]
             ratio = mapped / color[some]
-            gain = np.exp(np.clip(np.log(np.maximum(np.median(ratio, axis=0), 1e-3)), -MAX_LOG_GAIN, MAX_LOG_GAIN))
+            log_ratio = np.log(np.maximum(np.median(ratio, axis=0), 1e-3))
+            gain = np.exp(np.clip(OVERLAP_SHARE * log_ratio, -MAX_LOG_GAIN, MAX_LOG_GAIN))
         last.append(np.asarray(gain, dtype=np.float64))
         return last[-1]
 
