@@ -127,7 +127,7 @@ Line = Marking | RoadBorder
 
 
 def join_parts(parts: Sequence[Part], found: Sequence[MapFeatures]) -> MapFeatures:
-    """Return what all parts of a map show, each in its core; notes that hold for all of them."""
+    """Return what all parts of a map show, each in its core; notes that hold for all of them, and all where they show nothing."""
     if len(parts) == 1:
         return found[0]
     markings: list[Marking] = []
@@ -141,7 +141,8 @@ def join_parts(parts: Sequence[Part], found: Sequence[MapFeatures]) -> MapFeatur
     joined = _join(lines)
     markings += [line for line in joined if isinstance(line, Marking)]
     borders = [line for line in joined if isinstance(line, RoadBorder)]
-    notes = [note for note in found[0].notes if all(note in other.notes for other in found)]
+    notes = dict.fromkeys(chain(*(features.notes for features in found)))
+    notes = {note: None for note in notes if not lines or all(note in features.notes for features in found)}
     return MapFeatures(
         tuple(replace(m, id=f"marking-{k + 1}") for k, m in enumerate(sorted(markings, key=lambda m: -m.confidence))),
         tuple(replace(b, id=f"border-{k + 1}") for k, b in enumerate(sorted(borders, key=lambda b: -b.confidence))),
