@@ -180,6 +180,18 @@ def inferred(markings: Sequence[Marking], borders: Sequence[RoadBorder], world: 
     return list(lanes)
 
 
+def test_a_lane_with_parked_cars_in_it_is_as_wide_as_its_lines_are_apart() -> None:
+    ego, oncoming = agent(along(3.5)[:, :2], "ego"), agent(along(7.1)[::-1, :2], "b")  # past cars at both sides
+    lines = [paint("right", 0.0), paint("middle", 5.3, "dashed"), paint("left", 10.6)]
+    one, two = inferred(lines, [], scenario(ego, oncoming))
+    assert (one.left, one.right, two.left, two.right) == ("middle", "right", "middle", "left")
+    assert np.median(one.width_m) == pytest.approx(5.3, abs=0.05)
+    # Room for two narrow lanes, whose line was not seen, is no lane.
+    assert {lane.inferred_from for lane in inferred([paint("right", 0.0), paint("left", 5.8)], [], scenario(ego))} == {
+        "paths"
+    }
+
+
 @pytest.mark.parametrize("radius_m", [np.inf, 60.0])
 def test_two_lanes_between_three_lines(radius_m: float) -> None:
     ego, oncoming = (agent(along(y, radius_m=radius_m)[::way, :2], name) for y, way, name in ((1.6, 1, "ego"), (5.5, -1, "b")))  # fmt: skip

@@ -77,8 +77,7 @@ def test_stretches_of_a_line_are_joined_in_order_and_those_of_another_kind_or_be
     parts = [Part(core, core) for core in CORES]
     joined = join_parts(parts, found).markings
     ends = sorted((m.kind, *sorted(np.round(m.points_m[[0, -1], 0]).tolist())) for m in joined)
-    inside = all(abs(m.points_m[:, 1]).max() < 20 for m in joined)
-    if inside:
+    if all(abs(m.points_m[:, 1]).max() < 20 for m in joined):
         assert ends == [("dashed", 120.0, 160.0), ("solid", 0.0, 120.0), ("solid", 0.0, 160.0)]
     for m in joined:
         step = np.diff(m.points_m[:, 0])
@@ -100,17 +99,15 @@ def test_parts_hold_all_that_is_near_the_path_once_and_are_small(cell_m: float) 
     rng = np.random.default_rng(3)
     path = np.cumsum(np.cumsum(rng.normal(0, 0.1, (900, 2)), axis=0).clip(-1.5, 1.5), axis=0)
     parts = parts_of(*drive(path), cell_m)
-    whole = parts_of(*drive(path), 10.0)
-    assert len(whole) == 1
-    assert whole[0].area_m == whole[0].core_m
+    (whole,) = parts_of(*drive(path), 10.0)
+    assert whole.area_m == whole.core_m
     assert len(parts) > 3
     around = (path[:, None] + rng.uniform(-20, 20, (900, 20, 2))).reshape(-1, 2)
-    count = np.zeros(len(around), int)
+    x, y, count = *around.T, np.zeros(len(around), int)
     for part in parts:
         (x0, x1, y0, y1), (a0, a1, b0, b1) = part.core_m, part.area_m
-        core = (around[:, 0] >= x0) & (around[:, 0] < x1) & (around[:, 1] >= y0) & (around[:, 1] < y1)
-        drawn = (around[:, 0] >= a0) & (around[:, 0] <= a1) & (around[:, 1] >= b0) & (around[:, 1] <= b1)
-        assert drawn[core].all()
+        core = (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+        assert ((x >= a0) & (x <= a1) & (y >= b0) & (y <= b1))[core].all()
         count += core
         assert (a1 - a0) * (b1 - b0) <= (map_parts.PART_CELLS * cell_m) ** 2
     assert (count == 1).all()

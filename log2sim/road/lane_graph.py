@@ -44,8 +44,8 @@ from log2sim.road.sections import (
 
 # Stations at which the distance to the next line is taken.
 STRIP_STEP_M = 1.0
-# Of a lane: from the narrowest of roadworks (2.2 m) to the widest of ramps.
-MIN_WIDTH_M, MAX_WIDTH_M = 2.2, 5.0
+# Of a lane: from the narrowest of roadworks to the widest with parked cars in it, as two are 5.5 m wide at least (RASt 06: 2.75 m each).
+MIN_WIDTH_M, MAX_WIDTH_M = 2.2, 5.5
 # Lines nearer than this belong together: double lines, a curb beside an edge line.
 SAME_LINE_M = 1.0
 # Edges of a lane differ less in heading, also where it widens.
