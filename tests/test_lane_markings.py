@@ -173,6 +173,15 @@ def test_markings_turn_with_the_map() -> None:
     assert cKDTree(dense(after.points_m[:, :2])).query(dense(quarter))[0].max() < 0.08
 
 
+def test_a_line_beside_a_bright_sidewalk_is_found_by_what_the_lidar_sees() -> None:
+    painter = Painter(EXTENT)
+    painter.lay(painter.cover([outline_of(line_of(lambda x: 6.1 + 0 * x, -1, 51), 4.0)]), (165, 165, 165))
+    truth = [line_of(lambda x: 3.95 + 0 * x, 0, 50), line_of(lambda x: 0 * x, 0, 50)]
+    painter.lines(truth, 0.15, (170, 170, 170), worn=0.3)
+    precision, recall, _ = compare(find_markings(painter.ground())[0], truth)
+    assert min(precision, recall) > 0.9
+
+
 @pytest.mark.parametrize(("curb_m", "inset_m"), [(0.0, None), (0.12, None), (0.0, 0.65), (0.0, 0.2)])
 def test_borders_are_where_the_road_ends(curb_m: float, inset_m: float | None) -> None:
     """`inset_m`: of lines along the sides, which are paint on the road and none of its ends."""
