@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from log2sim.geometry import Array, Camera, ground_homography
 from log2sim.road.lane_picture import find_markings_in_picture
 from log2sim.road.markings import find_markings
+from log2sim.road.paint import log_odds_of_line, no_pieces
 from log2sim.road.strokes import stretches_of
 
 GRAVEL = (120, 125, 130)
@@ -146,6 +147,18 @@ def test_crosswalk_stop_line_and_arrow_are_told_from_lane_lines() -> None:
     assert abs(crosswalk.width_m - 4) < 0.5
     assert abs(area - 4 * 14.5) < 6
     assert abs(cv2.contourArea(other.points_m[:, :2].astype(np.float32)) - 1.0) < 0.25
+
+
+def test_rings_that_return_what_the_road_does_are_no_paint() -> None:
+    """Without a camera: rings between darker ones stand out as much as paint beside the road."""
+    each = {"reflected": 0.6, "reflected_sigma": 0.05, "width_m": 0.5, "color": np.nan}
+    rings, paint = (
+        no_pieces(6, **{name: np.full(6, value) for name, value in (each | {"above_road": above}).items()})
+        for above in (0.0, 0.6)
+    )
+    assert (
+        log_odds_of_line(rings, 14.0, dashes=6, alone=False) < 0 < log_odds_of_line(paint, 14.0, dashes=6, alone=False)
+    )
 
 
 def test_dashes_that_a_camera_sees_blurred_are_no_symbols() -> None:

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import Layer, RidgePoints, Samples, sample
+from log2sim.road.ridges import Layer, RidgePoints, Samples, log_intensity, sample
+from log2sim.road.surface import USUAL
 
 AROUND_M = 0.25
 
@@ -68,6 +69,7 @@ class Pieces:
     # where LiDAR saw too little
     reflected: Array
     reflected_sigma: Array
+    above_road: Array  # (N,): logarithm by which LiDAR intensity is above what the road around the ego's way returns
 
     def __len__(self) -> int:
         """Count the pieces."""
@@ -120,7 +122,8 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     around = [_quiet(np.nanquantile, np.where(part, color, np.nan), q=0.75) for part in far]
     # Beside a road there are brighter grounds; the road itself is on one side at least.
     outshines = _quiet(np.nanmean, np.where(inside, color, np.nan)) - np.fmin(*around)
-    return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, edge, outshines, yellow, *by_lidar[:2])
+    above_road = _quiet(np.nanmean, np.where(inside, reflected, np.nan)) - float(log_intensity(np.array(USUAL)))
+    return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, edge, outshines, yellow, *by_lidar[:2], above_road)
 
 
 def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
@@ -224,6 +227,8 @@ MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
 MAX_BY_LIDAR, MAX_BY_LIDAR_ALONE = 6.0, 3.0
 ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
 MIN_REFLECTING = 2  # pieces
+# Paint returns three times as much as the road; worn and blurred, a sixth more.
+MIN_ABOVE_ROAD, NO_BRIGHTER = 0.15, -4.0
 MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
 
@@ -246,8 +251,10 @@ def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bo
     lidar = by_lidar(pieces)
     if by_camera:
         return odds + lidar
-    # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen.
-    return min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
+    # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen. Rings of the road
+    # between darker ones stand out as paint does, but return no more than the road.
+    odds = min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
+    return odds + (NO_BRIGHTER if _median_known(pieces.above_road) < MIN_ABOVE_ROAD else 0.0)
 
 
 def _by_shape(pieces: Pieces, *, alone: bool) -> float:
