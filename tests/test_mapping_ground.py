@@ -16,7 +16,7 @@ from log2sim.datatypes import Agent, Stream, Sweep
 from log2sim.geometry import Array, Camera, apply, rotation_from_rpy, transform, undistort
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap, Raster
-from log2sim.road.pictures import ColorRaster, View, Warp, sample_at, warp_onto
+from log2sim.road.pictures import ColorRaster, View, Warp, warp_onto
 from log2sim.road.road_users import RoadUsers, draw_outlines
 from log2sim.road.surface import MAX_POINTS, Surface, take_sweep
 
@@ -215,7 +215,7 @@ def lay(
     for image, view in pictures:
         warp = warp_onto(view, flat, z_m, raster)
         if warp is not None:
-            colors.add(view.camera.name, sample_at(image, warp.u, warp.v, warp.scale), warp)
+            colors.add(view.camera.name, image, warp)
     return GroundMap(*colors.image(), unknown, unknown, raster.resolution_m, raster.extent_m)
 
 
@@ -224,10 +224,11 @@ def test_pictures_that_are_brighter_ahead_do_not_brighten_the_map_more_and_more(
     colors, cells = ColorRaster(raster), np.arange(raster.shape[0] * raster.shape[1])
     column, one = cells % raster.shape[1], np.ones(4000, np.float32)
     for k in range(37):  # each shows 4 m, of which the half ahead is a fifth brighter than it will be from nearby
-        seen = cells[(column >= 10 * k) & (column < 10 * k + 40)]
-        bright = np.where(seen % raster.shape[1] < 10 * k + 20, 60, 72).astype(np.uint8)
-        scale = np.where(bright == 60, 4.0, 2.0).astype(np.float32)
-        colors.add("front", np.repeat(bright[:, None], 3, axis=1), Warp(seen, one, one, scale, one, one))
+        chosen = cells[(column >= 10 * k) & (column < 10 * k + 40)]
+        ahead = chosen % raster.shape[1] >= 10 * k + 20
+        image = np.repeat(np.where(ahead, 72, 60).astype(np.uint8)[None, :, None], 3, axis=2)
+        scale = np.where(ahead, 0.5, 1.0).astype(np.float32)
+        colors.add("front", image, Warp(chosen, np.arange(4000, dtype=np.float32), 0 * one, scale, one, one))
     assert colors.image()[0].max() < 90
 
 

@@ -278,7 +278,7 @@ def pair_sweeps(
         return None
     records = RecordSource(log)
 
-    def look(i: int) -> tuple[bool, tuple[int, Array, Surfaces] | None]:
+    def surfaces_at(i: int) -> tuple[bool, tuple[int, Array, Surfaces] | None]:
         """Whether the points of a sweep are given in the map, and its surfaces."""
         record = records.get(lidar, i)
         in_map = record is not None and record.frame == "map"
@@ -286,7 +286,7 @@ def pair_sweeps(
 
     chosen = choose_sweeps(track, log.streams[lidar].t_ns, during_ns).tolist()
     places, surfaces = [], []
-    for done, (in_map, found) in enumerate(work_ahead(look, chosen)):
+    for done, (in_map, found) in enumerate(work_ahead(surfaces_at, chosen)):
         report(done, len(chosen))
         if in_map:
             return None

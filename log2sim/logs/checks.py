@@ -25,7 +25,10 @@ def find_possible(labels: Labels) -> NDArray[np.bool_]:
 
 
 def drop_impossible_labels(log: Log) -> Log:
-    """Return the log without labels that no object can have, and with a note of how many there were once they are read, which they are when they are asked for."""
+    """Return the log without labels that no object can have.
+
+    They are read when they are asked for; only then a note tells how many were left out.
+    """
     possible = cache(lambda: None if log.labels is None else find_possible(log.labels))
 
     def labels() -> Labels | None:

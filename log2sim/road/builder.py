@@ -19,17 +19,7 @@ from log2sim.perception.frames import read_pictures, work_ahead
 from log2sim.perception.records import RecordSource
 from log2sim.road.ground_map import Extent, GroundMap, Raster, coarsened_cell_m
 from log2sim.road.map_parts import OVERLAP_M, ROADSIDE_MARGIN_M, is_within, path_of, roadside_of, whole_map
-from log2sim.road.pictures import (
-    ColorRaster,
-    Image,
-    View,
-    Warp,
-    find_hidden,
-    median_picture,
-    sample_at,
-    sample_nearest,
-    warp_onto,
-)
+from log2sim.road.pictures import ColorRaster, Image, View, find_hidden, median_picture, sample_nearest, warp_onto
 from log2sim.road.road_users import MASK_SHRINK, RoadUsers, covered, draw_footprints, draw_outlines
 from log2sim.road.surface import (
     MAX_POINTS,
@@ -156,32 +146,23 @@ class GroundMapBuilder:
         """Lay the pictures on the ground, each where the surface that the sweeps show appears in it."""
         if self._colors is None:
             return
-        self._laid, self._likely_ground  # noqa: B018  made here, before threads ask for them
-        pictures = read_pictures(self._records, self._frames, progress)
-        for view, image, users, seen in filter(None, work_ahead(self._place, pictures)):
-            if view.camera.mount == "map":
-                self._standing.setdefault(view.camera.name, (view, []))[1].append((image, users))
-            elif seen is not None:
-                self._colors.add(view.camera.name, *seen)
+        for camera, index, image in read_pictures(self._records, self._frames, progress):
+            t_ns = int(self._log.streams[camera].t_ns[index])
+            map_T_cam, valid = self._log.map_T_sensor(camera, t_ns)
+            if not valid[0]:
+                continue
+            view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
+            users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
+            if view.camera.mount == "map":  # the median of all of them is laid
+                self._standing.setdefault(camera, (view, []))[1].append((image, users))
+            else:
+                self._lay(self._colors, view, image, users)
 
-    def _place(
-        self, frame: tuple[str, int, Image]
-    ) -> tuple[View, Image, NDArray[np.uint8], tuple[NDArray[np.uint8], Warp] | None] | None:
-        """Mask the road users in a picture and, unless its camera stands, find what it shows of the ground; None without a pose."""
-        camera, index, image = frame
-        t_ns = int(self._log.streams[camera].t_ns[index])
-        map_T_cam, known = self._log.map_T_sensor(camera, t_ns)
-        if not known[0]:
-            return None
-        view = View(self._log.cameras[camera], map_T_cam[0], t_ns, self._log)
-        users = draw_outlines(self._users.at(t_ns), view.camera, view.map_T_cam)
-        return view, image, users, None if view.camera.mount == "map" else self._seen_ground(view, image, users)
-
-    def _seen_ground(self, view: View, image: Image, users: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Warp] | None:
-        """Colors (N, 3) and cells of the ground in a picture, but where its mask shows road users, or something stands before it."""
+    def _lay(self, colors: ColorRaster, view: View, image: Image, users: NDArray[np.uint8]) -> None:
+        """Lay a picture on the ground but where its mask shows road users, or where something stands before the ground."""
         warp = warp_onto(view, self._laid, self._z0_m, self.raster)
         if warp is None:
-            return None
+            return
         kept = sample_nearest(users, warp, MASK_SHRINK, np.uint8(0)) == 0
         kept &= self._likely_ground.ravel().take(warp.cell) > 0
         if view.camera.mount == "ego":
@@ -192,8 +173,7 @@ class GroundMapBuilder:
             ]
             if hiding:
                 kept &= ~find_hidden(view, warp, np.concatenate(hiding))
-        warp = warp.take(kept)
-        return sample_at(image, warp.u, warp.v, warp.scale), warp
+        colors.add(view.camera.name, image, warp.take(kept))
 
     def build(self) -> GroundMap:
         """Return the map of all that was added, as far as anything is known; once, since what it is made of is let go."""
@@ -203,9 +183,7 @@ class GroundMapBuilder:
             color, alpha = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8)
         else:
             for view, pictures in self._standing.values():
-                seen = self._seen_ground(view, *median_picture(*zip(*pictures)))
-                if seen is not None:
-                    self._colors.add(view.camera.name, *seen)
+                self._lay(self._colors, view, *median_picture(*zip(*pictures)))
             self._standing.clear()
             color, alpha = self._colors.image()
             self._colors = None

@@ -20,6 +20,7 @@ from log2sim.errors import LogError
 from log2sim.geometry import NS_PER_S, Array
 from log2sim.perception.lidar.cloud import cloud_origin
 from log2sim.road.ground_map import Extent
+from log2sim.road.markings import MIN_LINE_M
 
 # Of this long only few ground pixels and points are finer than lane markings.
 MARGIN_M = 40.0
@@ -31,7 +32,6 @@ PART_CELLS = 3800
 OVERLAP_M = 20.0
 # Two parts see the same line: what ends so near to each other in both, in about the same direction, goes on.
 JOIN_M, JOIN_COS = 0.5, float(np.cos(np.deg2rad(15)))
-MIN_LENGTH_M = 2.0  # shorter rests of lines tell no lane
 
 
 @dataclass(frozen=True)
@@ -70,20 +70,25 @@ def roadside_of(log: Log, scenario: Scenario) -> Array:
 
 def whole_map(log: Log, scenario: Scenario) -> Extent:
     """Return what a map of all that a log shows covers; raises `LogError` when no pose is known."""
-    found = _around(log, scenario, None)
-    if found is None:
+    extent = _extent_around(_places(log, scenario), None)
+    if extent is None:
         raise LogError("no pose of any sensor is known, so pictures and sweeps have no place in a map of the ground")
-    return found
+    return extent
 
 
-def _around(log: Log, scenario: Scenario, core_m: Extent | None) -> Extent | None:
-    """Extent of what is seen from the places of the sensors that see anything of a core, or of all; None where there are none.
+def _places(log: Log, scenario: Scenario) -> list[tuple[Array, float]]:
+    """Places (K, 3), m, of sensors, and how far around them, m, the ground is mapped."""
+    return [(path_of(log, scenario), MARGIN_M), (roadside_of(log, scenario), ROADSIDE_MARGIN_M)]
+
+
+def _extent_around(places: list[tuple[Array, float]], core_m: Extent | None) -> Extent | None:
+    """Extent of what is mapped from the places that see anything of a core, or from all; None where there are none.
 
     In whole meters, so that maps of one log lie on the same cells whichever part of it they show.
     """
     corners = []
-    for places, margin in ((path_of(log, scenario), MARGIN_M), (roadside_of(log, scenario), ROADSIDE_MARGIN_M)):
-        near = places if core_m is None else places[is_within(places, core_m, margin)]
+    for xyz, margin in places:
+        near = xyz if core_m is None else xyz[is_within(xyz, core_m, margin)]
         corners += [near[:, :2] - margin, near[:, :2] + margin]
     xy = np.concatenate(corners)
     if not len(xy):
@@ -112,13 +117,13 @@ def parts_of(log: Log, scenario: Scenario, cell_m: float) -> list[Part]:
         np.round(np.linspace(low, high, int(np.ceil((high - low) / edge_m)) + 1)).tolist()
         for low, high in (whole[:2], whole[2:])
     )
-    parts = []
+    parts, places = [], _places(log, scenario)
     for (x0, x1), (y0, y1) in product(pairwise(columns), pairwise(rows)):
         core = (x0, x1, y0, y1)
-        seen = _around(log, scenario, core)
-        if seen is not None:
-            west, south = (max(seen[k], core[k] - OVERLAP_M) for k in (0, 2))
-            east, north = (min(seen[k], core[k] + OVERLAP_M) for k in (1, 3))
+        around = _extent_around(places, core)
+        if around is not None:
+            west, south = (max(around[k], core[k] - OVERLAP_M) for k in (0, 2))
+            east, north = (min(around[k], core[k] + OVERLAP_M) for k in (1, 3))
             parts.append(Part((west, east, south, north), core))
     return [part for part in parts if part.area_m[0] < part.area_m[1] and part.area_m[2] < part.area_m[3]]
 
@@ -185,7 +190,7 @@ def _join(lines: list[tuple[int, Line]]) -> list[Line]:
             end = following if following is not None and following // 2 in left else None
         if run:
             out.append(_one_of(run))
-    return [line for line in out if _length_m(line) >= MIN_LENGTH_M]
+    return [line for line in out if _length_m(line) >= MIN_LINE_M]
 
 
 def _one_of(run: list[tuple[Line, bool]]) -> Line:

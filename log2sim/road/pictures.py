@@ -235,9 +235,9 @@ class ColorRaster:
         self._opacity = np.zeros(raster.shape, dtype=np.uint8)
         self.gains: dict[str, list[Array]] = {}
 
-    def add(self, camera: str, seen: NDArray[np.uint8], warp: Warp) -> None:
-        """Add the colors (N, 3) that a picture of a camera shows of cells."""
-        color = seen.astype(np.float32)
+    def add(self, camera: str, image: Image, warp: Warp) -> None:
+        """Add a picture of a camera, as far as a warp shows it."""
+        color = sample_at(image, warp.u, warp.v, warp.scale).astype(np.float32)
         weight = warp.opacity * np.minimum(warp.scale, MAX_SCALE) ** 4
         gain = self._gain(camera, color, weight, warp)
         color *= weight[:, None] * gain.astype(np.float32)

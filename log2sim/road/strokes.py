@@ -125,7 +125,9 @@ LAG = round(SMOOTH_M / STEP_M)
 MIN_NOISE = 0.03  # of logarithms of rounded values
 FLANKS_M = (0.08, 0.14, 0.2, 0.26)  # from the edge of the paint
 ON_SHARE = 0.4  # of the contrast that a line usually has where it is painted
-LEVEL_M, MIN_LEVEL = 30.0, 0.4  # over a period of dashes; of the whole line
+# Contrasts are compared with those of the paint within this length, which holds a period of dashes, but with no less than a share
+# of what the whole line has: far away it stands out less than near the ego, and where it has ended there is noise alone.
+LEVEL_M, MIN_LEVEL = 30.0, 0.4
 # Dashes and gaps are 1 m and more (MUTCD dotted lines: 2 ft dashes, 4 ft gaps; RMS: 1.5 m); flakes of worn paint are less.
 MIN_DASH_M, MIN_GAP_M = 0.5, 0.6
 MAX_DASH_M = 13.0  # Japan: 8 m; Germany: 6 m; ramps: 12 m
@@ -227,7 +229,6 @@ def _normalized(contrast: Array) -> Array:
     total, count = (cv2.blur(a.reshape(-1, 1), size).ravel() for a in values)
     soft = np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
     # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
-    # Far away the same line stands out less than near the ego.
     level = float(np.quantile(soft[known], 0.875))
     near = percentile_filter(soft[known], 87.5, round(LEVEL_M / STEP_M), mode="nearest")
     scale = np.ones(len(soft))
