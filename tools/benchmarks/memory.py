@@ -1,4 +1,4 @@
-"""Peak memory of a reconstruction against the length of its log, which is driven several times in a row.
+"""Peak memory of a reconstruction, and what it finds of the road, against the length of its log, which is driven several times in a row.
 
     python tools/bench.py memory LOG --times 4 --times 30
     python tools/bench.py memory LOG --times 4 --times 30 --world
@@ -26,10 +26,14 @@ RUN = """
 import json, sys
 from log2sim import Config, open_log, reconstruct
 from benchmarks.memory import loop_log
+from log2sim.evaluation.road import sampled
 path, times, saved = json.loads(sys.argv[1])
 result = reconstruct(loop_log(open_log(path), times), Config.load(detect={"name": "lidar:vehicle"}))
 result.scenario.save(saved)
-print(json.dumps({"ticks": result.report["ticks"], "stages": result.report["stages"], "agents": len(result.scenario.agents)}))
+road = result.scenario.map_features
+lines = {"lane lines": [m for m in road.markings if m.is_lane_line], "borders": road.borders}
+road = {name: sum(len(xy) * step_m for xy, _, step_m in (sampled(m.points_m) for m in some)) / times for name, some in lines.items()}
+print(json.dumps({"ticks": result.report["ticks"], "stages": result.report["stages"], "agents": len(result.scenario.agents), "road": road}))
 """
 WORLD = """
 import json, resource, sys
@@ -73,6 +77,7 @@ def main(log: Path, times: list[int] = [1, 4, 16], world: bool = False) -> None:
     names = dict.fromkeys(name for of_run in peaks for name in of_run)
     rows = [[name, *(f"{of_run[name]:.0f} MiB" if name in of_run else "-" for of_run in peaks)] for name in names]
     rows.append(["agents", *(str(run["agents"]) for run in runs)])
+    rows += [[f"{name} a turn", *(f"{run['road'][name]:.0f} m" for run in runs)] for name in runs[0]["road"]]
     more = [
         (max(p.values()) - max(peaks[0].values())) / (r["ticks"] - runs[0]["ticks"])
         for r, p in zip(runs[1:], peaks[1:])
