@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,6 +16,8 @@ from log2sim.agents.heading import decide_headings
 from log2sim.agents.judge import extend_static, judge
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log
+from log2sim.errors import ConfigError
+from log2sim.files.cluster import client_of
 from log2sim.files.processes import default_jobs
 from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack
@@ -43,6 +46,7 @@ def reconstruct(
     progress: Progress | None = None,
     cache: bool = True,
     jobs: int | None = None,
+    scheduler: str | None = None,
 ) -> Result:
     """Reconstruct the scenario of a log.
 
@@ -52,12 +56,17 @@ def reconstruct(
     takes. A list joins one for pictures and one for sweeps, such as `[find_cars, "lidar:vehicle"]`. `progress`: called as
     `progress(stage, done, total)`, with a total of 0 when a stage of unknown length begins. `cache`: whether what is detected and
     measured is taken from the user's cache, and kept there. `jobs`: processes that share the work, with the same result; None for
-    all usable cores, or one with a detector from elsewhere, which need not work in a forked process. Raises `LogError`, `ConfigError`
-    and `MissingExtra` for logs and settings that cannot work, `PluginError` when the detector fails or returns something else,
+    all usable cores, or one with a detector from elsewhere, which need not work in a forked process. `scheduler`: address of a Dask
+    scheduler whose workers detect and measure, in the same folders, with the same result. Raises `LogError`, `ConfigError` and `MissingExtra` for logs and settings that cannot work, `PluginError` when the detector fails or returns something else,
     `NothingToReconstruct` when neither an ego nor any agent was found.
     """
-    run = start(log, config or Config(), detector=detector, progress=progress, cache=cache, jobs=jobs)
-    return infer_scenario(run, observe_log(run))
+    with nullcontext() if scheduler is None else client_of(scheduler) as client:
+        run = start(log, config or Config(), detector=detector, progress=progress, cache=cache, jobs=jobs)
+        if client is not None and not run.detectors.own:
+            raise ConfigError(
+                f"--scheduler: workers have no {run.detectors.name}; only detectors of log2sim can be used there"
+            )
+        return infer_scenario(run, observe_log(replace(run, client=client)))
 
 
 def start(
@@ -105,7 +114,8 @@ def observe_log(run: Run) -> Observations:
     progress = partial(run.progress, "detect and measure")
     progress(0, len(run.schedule))
     return observe(
-        run.log, run.schedule, run.plan, detectors=run.detectors, config=run.config, clock=run.clock, progress=progress, jobs=run.jobs
+        run.log, run.schedule, run.plan, detectors=run.detectors, config=run.config, clock=run.clock, progress=progress, jobs=run.jobs,
+        client=run.client,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from log2sim.perception.run_detectors import Detectors, StageCache
 from log2sim.perception.sync import Schedule
 from log2sim.plan import DESCRIBING, Decision, HomographyScope, Plan, Stage, explain_missing_poses
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 Progress = Callable[[str, int, int], None]
 
 
@@ -34,7 +37,8 @@ class Run:
 
     `poses` says where the poses of `log` come from, `faults` what is wrong with poses, clocks and mounts, and
     `registration` how each roadside unit was registered. `progress` is called as `progress(stage, done, total)`. `jobs` is the number
-    of processes that share the work. `earlier` knows what stages of earlier runs made; None to do all again.
+    of processes that share the work; workers of the scheduler of `client`, if there is one, share the first pass. `earlier` knows
+    what stages of earlier runs made; None to do all again.
     """
 
     log: Log
@@ -49,6 +53,7 @@ class Run:
     faults: tuple[Finding, ...] = ()
     registration: Sequence[dict[str, Any]] = ()
     earlier: StageCache | None = None
+    client: Client | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,8 +18,11 @@ from batch_logs import FAST, install_reader, lay_out_logs, tell
 from benchmarks.tag_worlds import traffic
 from command_line import run
 
+from log2sim import open_log, reconstruct
 from log2sim.batch.discovery import find_logs
 from log2sim.batch.folder import BatchFolder, Row, make_jobs
+from log2sim.errors import ConfigError
+from log2sim.files.cluster import Sent
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 120
@@ -210,3 +215,31 @@ def test_the_workers_of_a_scheduler_find_situations_drive_a_policy_and_replay(tm
     ran = run("batch", tmp_path / "found", "-o", tmp_path / "replays", "--format", "scenario", "--scheduler", scheduler)
     assert ran.code == 0, ran.err
     assert len(list((tmp_path / "replays").glob("logs/*/replay.json"))) == 4
+
+
+def test_the_workers_of_a_scheduler_share_the_ticks_of_one_log(
+    tiny_folder: Path, tmp_path: Path, scheduler: str
+) -> None:
+    made = []
+    for name, workers in (("there", ("--scheduler", scheduler)), ("here", ("--jobs", 1))):
+        out = tmp_path / f"{name}.json"
+        options = ("--report", tmp_path / f"{name}-report.json", "--no-cache", *workers)
+        ran = run("reconstruct", tiny_folder, "-o", out, "--detector", "labels+lidar:labels", *options)
+        assert ran.code == 0, ran.err
+        made.append(json.loads(out.read_text()))
+    assert made[0] == made[1]
+    assert len(made[0]["agents"]) > 1
+    with pytest.raises(ConfigError, match="only detectors of log2sim"):
+        reconstruct(open_log(tiny_folder), detector=lambda image: [], scheduler=scheduler)
+
+
+def test_a_worker_refuses_what_another_version_sent_and_says_which_folder_it_lacks(
+    log_folder: Path, site: Path
+) -> None:
+    pytest.importorskip("cloudpickle")
+    sent = Sent.of(open_log(log_folder))
+    shutil.rmtree(log_folder)
+    with pytest.raises(ConfigError, match=rf"worker on .*{log_folder.name}: no such folder.*same folders"):
+        sent.received()
+    with pytest.raises(ConfigError, match=r"worker on .*: has log2sim .*, and this is 0\.0"):
+        replace(sent, version="0.0").received()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,8 +21,9 @@ from log2sim.files import plugins
 from log2sim.files.images import decode_image
 from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, apply, inverse, project
+from log2sim.localization.replaced import replace_poses, shift_stream
 from log2sim.logs.checks import list_calibration_problems, list_time_problems
-from log2sim.logs.opening import open_log
+from log2sim.logs.opening import Reopening, open_log
 from log2sim.perception.lidar.cloud import deskew, transform_rigidly
 
 # Opening may read the index, and where a size is stated nowhere else the first image; images are nearly all of a log.
@@ -217,6 +219,27 @@ def bytes_read() -> int:
 
 def test_its_format_is_recognized(name: str, path: Path) -> None:
     assert open_log(path).format == name
+
+
+def test_what_was_made_of_a_log_reads_the_same_in_another_process(name: str, copy: Path) -> None:
+    """It is opened there again, so that no open file and no lock is sent; another log in its place is refused."""
+    cloudpickle = pytest.importorskip("cloudpickle")
+    opened = open_log(copy, format=name)
+    later = {n: shift_stream(stream, 1000) for n, stream in opened.streams.items()}
+    made = replace_poses(opened, opened.ego).changed(streams=later) if opened.ego is not None else opened
+    sent = cloudpickle.dumps(made)
+    there = pickle.loads(sent)
+    for sensor, stream in made.streams.items():
+        assert np.array_equal(stream.t_ns, there.streams[sensor].t_ns)
+        here, other = stream.read(1), there.streams[sensor].read(1)
+        pairs = vars(here).items() if isinstance(here, Sweep) else [("", here)]
+        for column, value in pairs:
+            assert np.array_equal(value, getattr(other, column) if column else other)
+    assert (made.labels is None) == (there.labels is None)
+    assert made.labels is None or np.array_equal(made.labels.center_m, there.labels.center_m)
+    assert made.ground_z_ego_m == there.ground_z_ego_m
+    with pytest.raises(LogError, match="another log"):
+        Reopening(str(copy), name, plugins.load("log", name).sequences(copy)[0], False, "of another")()
 
 
 @pytest.mark.matrix

@@ -42,7 +42,7 @@ def raising(problem: BaseException) -> Callable[[int], Any]:
 def with_front(read: Callable[[int], Any]) -> Log:
     log = world_log()
     stream = Stream("front", log.streams["front"].t_ns, read, read)
-    return guard_log(replace(log, streams={**log.streams, "front": stream}), "folder")
+    return guard_log(replace(log, streams={**log.streams, "front": stream}), "folder", world_log)
 
 
 @pytest.mark.parametrize("problem", RAISED, ids=lambda p: type(p).__name__)

@@ -36,7 +36,8 @@ from log2sim.batch.folder import (
 )
 from log2sim.config import Config
 from log2sim.datatypes import Scenario
-from log2sim.errors import ConfigError, Log2SimError, MissingExtra
+from log2sim.errors import ConfigError, Log2SimError
+from log2sim.files.cluster import client_of, import_dask
 from log2sim.files.documents import write_json
 from log2sim.files.inputs import following_links, follows_links
 from log2sim.files.outputs import replaced_folder
@@ -70,8 +71,6 @@ def _batch_of(out: str, token: str) -> tuple[BatchFolder, Config]:
 # Of the local cluster. Its processes take pickles from each other, which can do anything, so they ask for
 # certificates, too: other users of the machine do not get in.
 HOST = "127.0.0.1"
-PROTOCOLS = ("tcp://", "tls://")
-CONNECT_TIMEOUT_S = 20
 START_TIMEOUT_S = 120
 SETTINGS: dict[str, Any] = {
     # A log whose worker dies is repeated at the end, on a new process; no log that merely waited there is blamed.
@@ -109,7 +108,13 @@ class Workers:
 
 def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:
     """Return so many worker processes on this machine, one for each core by default, or the workers of a scheduler."""
-    return local_workers(jobs or usable_threads()) if scheduler is None else workers_of(scheduler)
+    return local_workers(jobs or usable_threads()) if scheduler is None else _workers_of(scheduler)
+
+
+@contextmanager
+def _workers_of(address: str) -> Iterator[Workers]:
+    with client_of(address) as client:
+        yield Workers(client, are_ours=False)
 
 
 @contextmanager
@@ -147,38 +152,6 @@ def local_workers(count: int) -> Iterator[Workers]:
         # Dask cannot stop a worker that it is just starting in place of one that died.
         with suppress(TimeoutError):
             client.wait_for_workers(count, timeout=START_TIMEOUT_S)
-
-
-@contextmanager
-def workers_of(address: str) -> Iterator[Workers]:
-    """Use the workers of a scheduler that somebody started.
-
-    Raises `MissingExtra` without Dask. Raises `ConfigError` when the address is none, or nobody answers there.
-    """
-    if not address.startswith(PROTOCOLS):
-        raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")
-    distributed, _ = import_dask()
-    try:
-        client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S)
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"--scheduler {address}: no Dask scheduler answers: {str(error).splitlines()[0]}; start one with dask scheduler"
-        ) from None
-    with client:
-        yield Workers(client, are_ours=False)
-
-
-def import_dask() -> tuple[Any, Any]:
-    """Return `distributed` and `dask`; raise `MissingExtra` where one of the packages that a batch needs is missing."""
-    try:
-        import cryptography  # noqa: F401  (for the certificates of a local cluster)
-        import dask
-        import distributed
-        import pyarrow  # noqa: F401  (for the tables at the end)
-    except ImportError:
-        raise MissingExtra("log2sim batch", "cluster") from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    return distributed, dask
 
 
 Progress = Callable[[int, int], None]

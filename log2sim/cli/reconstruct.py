@@ -134,6 +134,8 @@ def reconstruct(
     jobs: Annotated[int | None, opt.option(
         "Processes that share the work; the result is the same for any number.", "N", min=1,
         default="the usable cores")] = None,
+    scheduler: Annotated[str | None, opt.option(
+        "Detect and measure on the workers of this Dask scheduler, which see the same folders.", "tcp://HOST:PORT")] = None,
     no_cache: opt.NoCache = False,
     overwrite: opt.Overwrite = False,
     verbose: opt.Verbose = False,
@@ -179,7 +181,7 @@ def reconstruct(
         notes.append(weakness)
     opt.say_all("note", notes)
     with progress() as report_progress:
-        result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs)
+        result = run(opened, chosen, progress=report_progress, cache=not no_cache, jobs=jobs, scheduler=scheduler)
     if by_hand is not None:
         corrected = correct(result.scenario, by_hand)
         result = replace(result, scenario=corrected.scenario)

@@ -172,17 +172,10 @@ def _runs(
     if scheduler is None:
         yield lambda work, tasks: map_in_processes(work, tasks, jobs or default_jobs())
         return
-    from log2sim.batch.run import workers_of
+    from log2sim.files.cluster import client_of, map_on_workers
 
-    with workers_of(scheduler) as workers:
-        yield partial(map_on_workers, workers.client)
-
-
-def map_on_workers(client: Any, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Any]:
-    """Yield what a function makes of tasks on the workers of a client, in their order; each result is freed once it was taken."""
-    futures = client.map(work, tasks, pure=False)
-    while futures:
-        yield futures.pop(0).result()
+    with client_of(scheduler) as client:
+        yield partial(map_on_workers, client)
 
 
 def _overview(index: Index, *, fields: bool) -> list[tuple[str, str, str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +28,16 @@ def drop_impossible_labels(log: Log) -> Log:
 
     They are read when they are asked for; only then a note tells how many were left out.
     """
-    possible = cache(lambda: None if log.labels is None else find_possible(log.labels))
+    left_out: list[int] = []
 
     def labels() -> Labels | None:
-        kept, given = possible(), log.labels
-        return given if given is None or kept is None or kept.all() else given.take(kept)
+        given = log.labels
+        possible = None if given is None else find_possible(given)
+        left_out[:] = [0 if possible is None else int((~possible).sum())]
+        return given if given is None or possible is None or possible.all() else given.take(possible)
 
     def notes() -> tuple[str, ...]:
-        kept = possible() if possible.cache_info().currsize else None
-        count = 0 if kept is None else int((~kept).sum())
+        count = sum(left_out)
         words = f"{count} label{'s' * (count != 1)} left out: no object is so large or so far away, or it has no size"
         return (*log.notes, words) if count else log.notes
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
@@ -12,7 +14,7 @@ import numpy as np
 from log2sim.datatypes import Log, Sweep
 from log2sim.errors import ConfigError, Log2SimError, LogError, PluginError, RecordError
 from log2sim.files import plugins
-from log2sim.files.inputs import following_links
+from log2sim.files.inputs import following_links, follows_links
 from log2sim.logs.checks import drop_impossible_labels, list_calibration_problems, list_time_problems
 from log2sim.logs.excerpt import summarize_stamps
 from log2sim.logs.records import guard_log, translate_parser_errors
@@ -138,7 +140,8 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
         with plugins.blaming("log", name):
             opened = reader.open(root, chosen)
         plugins.require_type("log", name, opened, Log)
-        log = drop_impossible_labels(guard_log(opened, str(root)))
+        again = Reopening(str(root.absolute()), name, chosen, follows_links(), opened.digest)
+        log = drop_impossible_labels(guard_log(opened, str(root), again))
     notes = list(defects)
     if format == "auto" and root.is_dir():  # of downloads, perhaps
         others = [other for other, some in readers.items() if other != name and _seems_to_match(other, some, root)]
@@ -146,6 +149,29 @@ def _open(root: Path, format: str, sequence: str | None) -> Log:
             notes.insert(0, f"{root} holds logs of other formats, too: {', '.join(others)}; --format chooses one")
     # Notes may wait for labels.
     return log.changed(notes=lambda: (*notes, *log.notes, *list_calibration_problems(log), *list_time_problems(log)))
+
+
+@dataclass(frozen=True)
+class Reopening:
+    """Opens a log in another process, where the same folder has the same name, as it was opened in this one."""
+
+    path: str
+    format: str
+    sequence: str
+    follow_links: bool
+    digest: str  # of the log
+
+    def __call__(self) -> Log:
+        """Return the log, which is opened once; `LogError` where another one is there."""
+        return _reopened(self)
+
+
+@lru_cache(maxsize=1)
+def _reopened(place: Reopening) -> Log:
+    log = open_log(place.path, format=place.format, sequence=place.sequence, follow_links=place.follow_links)
+    if log.digest != place.digest:
+        raise LogError(f"{place.path}: is another log than the one that this is to be a part of")
+    return log
 
 
 def find_reader(root: Path) -> str:

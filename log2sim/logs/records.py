@@ -12,6 +12,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -126,11 +127,40 @@ def translate_parser_errors(where: str, error: type[LogError]) -> Iterator[None]
 MAX_KEPT_BYTES = 256 * 1024 * 1024
 
 
-def guard_log(log: Log, where: str) -> Log:
+@dataclass(frozen=True, eq=False)
+class OfLog:
+    """A function that reads something of an opened log; one that is sent to another process opens the log there.
+
+    `of`: the name of a stream and of its field, or "" and the name of a field of the log.
+    """
+
+    read: Callable[..., Any]
+    reopen: Callable[[], Log]
+    of: tuple[str, str]
+
+    def __call__(self, *index: int) -> Any:
+        """Read it."""
+        return self.read(*index)
+
+    def __reduce__(self) -> Any:
+        """Leave out the reader, which holds open files and locks."""
+        return _open_for, (self.reopen, self.of)
+
+
+def _open_for(reopen: Callable[[], Log], of: tuple[str, str]) -> Callable[..., Any]:
+    stream, name = of
+    if name in ("read", "encoded"):
+        reading: Callable[[int], Any] = getattr(reopen().streams[stream], name)
+        return reading
+    return lambda: getattr(reopen().streams[stream] if stream else reopen(), name)
+
+
+def guard_log(log: Log, where: str, reopen: Callable[[], Log]) -> Log:
     """Return the log of a reader with its streams guarded, and with labels, notes and stamps that are guarded when they are read.
 
-    The sweeps that were read last are kept, up to `MAX_KEPT_BYTES`. `where`: its path, for errors. Raises `LogError` for poses of the
-    ego that are not finite, or farther from the origin of the map than any place on Earth.
+    The sweeps that were read last are kept, up to `MAX_KEPT_BYTES`. `where`: its path, for errors. `reopen`: opens it in another
+    process that has been sent the log, or what was made of it; it can be pickled, and opens it once. Raises `LogError` for poses
+    of the ego that are not finite, or farther from the origin of the map than any place on Earth.
     """
     if log.ego is not None:
         wrong = np.flatnonzero(~(np.abs(log.ego.map_T_ego) <= MAX_POSITION_M).all(axis=(1, 2)))
@@ -141,12 +171,12 @@ def guard_log(log: Log, where: str) -> Log:
                 f"{MAX_POSITION_M:g} m; {len(wrong)} of {len(log.ego.t_ns)} poses are so"
             )
 
-    def guarded(read: Callable[[], Any], what: str) -> Callable[[], Any]:
+    def guarded(read: Callable[[], Any], what: str, stream: str, name: str) -> Callable[[], Any]:
         def reading() -> Any:
             with translate_parser_errors(f"{where}: {what}", LogError):
                 return read()
 
-        return reading
+        return OfLog(reading, reopen, (stream, name))
 
     sweeps: OrderedDict[tuple[str, int], tuple[Sweep, int]] = OrderedDict()  # those read last, with their bytes
     lock = threading.Lock()
@@ -170,14 +200,18 @@ def guard_log(log: Log, where: str) -> Log:
                         sweeps.popitem(last=False)
             return found
 
-        stamps = guarded(lambda: stream.t_ns, f"the stamps of '{stream.name}' cannot be read")
-        encoded = None if stream.encoded is None else partial(record, stream.encoded)
-        return Stream(stream.name, stamps, read_or_keep, encoded)
+        name, stamps = stream.name, f"the stamps of '{stream.name}' cannot be read"
+        encoded = None if stream.encoded is None else OfLog(partial(record, stream.encoded), reopen, (name, "encoded"))
+        read = OfLog(read_or_keep, reopen, (name, "read"))
+        return Stream(name, guarded(lambda: stream.t_ns, stamps, name, "t_ns"), read, encoded)
 
     return log.changed(
         streams={name: guarded_stream(stream) for name, stream in log.streams.items()},
-        labels=guarded(lambda: log.labels, "the labels cannot be read"),
-        notes=guarded(lambda: log.notes, "cannot be read"),
+        labels=guarded(lambda: log.labels, "the labels cannot be read", "", "labels"),
+        notes=guarded(lambda: log.notes, "cannot be read", "", "notes"),
+        ground_z_ego_m=guarded(
+            lambda: log.ground_z_ego_m, "the height of the road cannot be read", "", "ground_z_ego_m"
+        ),
     )
 
 

@@ -9,8 +9,10 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, pairwise
-from typing import Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,9 +32,10 @@ from log2sim.datatypes import (
 )
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
+from log2sim.files.cluster import Sent, count_workers, map_on_workers
 from log2sim.files.packing import digest_of
 from log2sim.files.processes import map_in_processes
-from log2sim.files.stages import StageClock
+from log2sim.files.stages import StageClock, usable_threads
 from log2sim.geometry import Array, inverse, line_stamps_ns
 from log2sim.perception.cooperative import align_parts
 from log2sim.perception.detect.layouts import groups_of
@@ -56,9 +59,12 @@ from log2sim.perception.lidar.measure import Frame as MeasuredFrame
 from log2sim.perception.lidar.measure import measure, outside_ego
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, project_points, view_of
 from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
-from log2sim.perception.run_detectors import Detectors
+from log2sim.perception.run_detectors import Detectors, GivenDetectors, create_detectors, open_store
 from log2sim.perception.sync import Schedule
 from log2sim.plan import FusionLevel, Plan, Stage
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 
 class ObstacleList(Sequence["Obstacles | None"]):
@@ -331,6 +337,11 @@ class FirstPass:
             settings = [config.measure.mode, config.measure.max_range_m, config.lidar.sweeps]
             detectors.cache.begin(log, [list(plan.cameras), planned, *settings, schedule.reference_row])
 
+    def __reduce__(self) -> Any:
+        """Return how another process makes it, with detectors of its own."""
+        of = self.log, self.schedule, self.plan, self.config, self.detectors.cache is not None
+        return _with_own_detectors, of
+
     def parts(self) -> list[range]:
         """Return the ticks of each part; where frames are skipped between some of them, a part has a multiple of these."""
         total, stride = len(self.schedule), self.plan.detector_stride
@@ -480,6 +491,22 @@ class FirstPass:
         return view_of(self.log, camera, t_ns)
 
 
+def _with_own_detectors(log: Log, schedule: Schedule, plan: Plan, config: Config, cached: bool) -> FirstPass:
+    cv2.setNumThreads(usable_threads())
+    store = open_store() if cached else None
+    return FirstPass(log, schedule, plan, create_detectors(log, config, GivenDetectors(config), store=store), config)
+
+
+_WORKING = Lock()  # threads of one worker, which share detectors and clouds
+
+
+def observe_on_worker(run: Sent, task: Task) -> tuple[Part, StageClock, tuple[int, int, str | None]]:
+    """Observe some ticks of a first pass that was sent to this process, and is made here once."""
+    with _WORKING:
+        first_pass: FirstPass = run.received()
+        return first_pass.observe(task)
+
+
 def base_poses(log: Log, t_ns: NDArray[np.int64]) -> Array:
     """Poses (N, 4, 4) at stamps (N,) of what carries the cameras: the ego, or the map itself for a roadside log."""
     return np.tile(np.eye(4), (len(t_ns), 1, 1)) if log.ego is None else log.ego.at(t_ns)[0]
@@ -495,13 +522,15 @@ def observe(
     clock: StageClock,
     progress: Callable[[int, int], None] = lambda done, total: None,
     jobs: int = 1,
+    client: Client | None = None,
 ) -> Observations:
     """Run detection and measurement over all ticks.
 
     `detectors`: those of pictures search the frames of the plan's cameras, those of sweeps the clouds of the reference
     sensor; ticks that their cache knows are not looked at again. `config`: how to measure, and how many successive clouds
-    are searched as one. `jobs`: processes that share the ticks. The result is the same for any number; with fusion of
-    points each cloud needs the one before, so that one process does all.
+    are searched as one. `jobs`: processes that share the ticks. `client`: of a Dask scheduler whose workers share them in place of
+    processes. The result is the same for any number; with fusion of points each cloud needs the one before, so that this process
+    does all.
 
     Whether a record repeats another depends on all before it. A part is made with what is known when it begins; its records are
     judged again when all before are known, and it is made again, by then in this process, where that changes anything.
@@ -510,13 +539,19 @@ def observe(
     obstacles = out.obstacles = ObstacleList(out.points)
     first_pass, cache = FirstPass(log, schedule, plan, detectors, config), detectors.cache
     ranges = first_pass.parts()
-    jobs = 1 if plan.fusion is FusionLevel.POINTS else min(jobs, len(ranges))
+    if plan.fusion is FusionLevel.POINTS:
+        jobs, client = 1, None
+    jobs = min(jobs, len(ranges)) if client is None else count_workers(client)
     records = out.records = RecordSource(log)
     before: list[tuple[Key, Boxes3D]] = []
     compensated: dict[tuple[str, int], str] = {}
     skipped: Counter[str] = Counter()
 
-    parts = map_in_processes(first_pass.observe, (Task(ticks, records.watch, before) for ticks in ranges), jobs)
+    tasks = (Task(ticks, records.watch, before) for ticks in ranges)
+    if client is None:
+        parts = map_in_processes(first_pass.observe, tasks, jobs)
+    else:
+        parts = map_on_workers(client, observe_on_worker, tasks, Sent.of(first_pass))
     with closing(parts):
         for ticks, (part, spent, known) in zip(ranges, parts):
             if [records.watch.judge(look) for look in part.looks] != [look.state for look in part.looks]:

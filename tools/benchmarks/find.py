@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.tag_worlds import traffic
 from log2sim.batch.run import local_workers
-from log2sim.cli.situations import map_on_workers
+from log2sim.files.cluster import map_on_workers
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import cpu_seconds, peak_memory_mib
 from log2sim.scenarios.index import INDEX_FILE, open_index

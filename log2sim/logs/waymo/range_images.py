@@ -230,6 +230,10 @@ class LabelsOnRequest(Mapping[str, ImageLabels]):
                 self._found[camera] = self._read(camera)
             return self._found[camera]
 
+    def __reduce__(self) -> Any:
+        """Read all of them for another process."""
+        return dict, (dict(self),)
+
     def __iter__(self) -> Iterator[str]:
         """Return the cameras."""
         return iter(self._cameras)
