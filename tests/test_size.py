@@ -223,9 +223,12 @@ def test_a_low_hood_that_no_ray_meets_does_not_make_a_long_car_short(size, box, 
     assert shape.size_m[0] == pytest.approx(size[0], abs=0.5)
 
 
-@pytest.mark.parametrize(("category", "share"), [("cyclist", 0.5), ("car", 1.0)])
-def test_of_a_length_that_is_not_seen_boxes_of_riders_tell_half_and_others_all(category, share):
-    size, typical = np.array((1.75, 0.65, 1.7) if category != "car" else CAR), TYPICAL_SIZE_M[category][0]
+@pytest.mark.parametrize(
+    ("category", "size", "share"),
+    [("cyclist", (1.75, 0.65, 1.7), 0.5), ("pedestrian", (0.4, 0.6, 1.7), 0.5), ("car", CAR, 1.0)],
+)
+def test_of_a_length_that_is_not_seen_boxes_of_riders_and_people_tell_half_and_others_all(category, size, share):
+    typical = TYPICAL_SIZE_M[category][0]
     box = (0.8 * typical, *TYPICAL_SIZE_M[category][1:])
     track = measured([(12, 0, 0.0)] * 12, size, category, sensors=[(0.0, 0.0, 0.9)] * 12)
     boxes = replace(
@@ -234,6 +237,14 @@ def test_of_a_length_that_is_not_seen_boxes_of_riders_tell_half_and_others_all(c
     )  # fmt: skip
     length_m = moving_geometry(replace(track, measurements=boxes), np.zeros(12)).size_m[0]
     assert length_m == pytest.approx(box[0] ** share * typical ** (1 - share), rel=0.05)
+
+
+def test_a_person_who_sways_is_not_as_long_as_the_way_of_the_points():
+    sway_m = 0.2 * np.sin(np.arange(15))
+    states = [(12 + sway, 5, 0.0) for sway in sway_m.tolist()]
+    shape = static_geometry(measured(states, (0.5, 0.6, 1.7), "pedestrian", sensors=PASSING[:15]))
+    # The points reach over .9 m.
+    assert shape.size_m[:2] == pytest.approx([0.5, 0.6], abs=0.3)
 
 
 def test_what_goes_on_beyond_its_ends_is_less_sure_and_tells_no_size():
