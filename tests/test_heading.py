@@ -133,6 +133,11 @@ def test_a_motion_seen_in_few_detections_of_a_car_may_be_of_several_that_stand(c
     assert decided(replace(moving, track=track), path=np.zeros((0, 3)))[0] == [heading]
 
 
+def test_a_truck_that_drives_off_over_less_than_its_length_points_ahead_whatever_its_boxes_say():
+    driving = candidate(30.0, 40.0, 0.0, 1.4, front=np.pi, category="truck", score=0.999)
+    assert decided(driving, path=np.zeros((0, 3)))[0] == [0]
+
+
 def test_a_lone_car_is_doubted_and_says_so_in_its_quality():
     (heading,), (agent,) = decided(candidate(30.0, 40.0, 1.0), path=np.zeros((0, 3)))
     assert heading == 57

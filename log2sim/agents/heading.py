@@ -405,7 +405,7 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
             both = bool(odds and outline)
             odds = NETWORK_WEIGHT * odds + OUTLINE_WEIGHT * outline if both else odds + outline
             limit = min(COURSE_LOG_ODDS_PER_DETECTION * len(m), limit)
-        alone.append(odds if c.agent.static else odds + course_log_odds(w, c.agent.size_m[0], limit))
+        alone.append(odds if c.agent.static else odds + course_log_odds(w, limit))
     own = continued_log_odds([c.agent.waypoints for c in road_users], np.array(alone))
     # Tentative tracks may be clutter, which tells nothing of traffic and of rows.
     confirmed = [is_confirmed(c.track) for c in road_users]

@@ -71,22 +71,21 @@ def forward_log_odds(speed_mps: float) -> float:
     return FORWARD_LOG_ODDS + FORWARD_LOG_ODDS_PER_MPS * speed_mps
 
 
-def course_log_odds(w: Waypoints, length_m: float, limit: float = MAX_COURSE_LOG_ODDS) -> float:
+def course_log_odds(w: Waypoints, limit: float = MAX_COURSE_LOG_ODDS) -> float:
     """Return the log-odds that the front of a vehicle is where its yaw points, by the ways that it drives either way.
 
-    `limit`: greatest log-odds of the way in one direction.
-
-    The center of a standing vehicle seems to move by up to its length while more and more of it comes into view.
+    `limit`: greatest log-odds of the way in one direction. The center of a standing vehicle seems to move while more and more of it
+    comes into view, which its standard deviation holds.
     """
     step_s = np.gradient(w.t_s) if len(w.t_s) > 1 else np.zeros(1)
-    certain_m = max(length_m, CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m)))
+    certain_m = CERTAIN_SIGMAS * float(np.median(w.sigma_xy_m))
     odds = 0.0
     for sign in (1, -1):
         speed_mps = np.maximum(sign * w.speed_mps, 0.0)
         distance_m, time_s = float(speed_mps @ step_s), float(step_s[speed_mps > 0].sum())
         if time_s > 0:
             one_way = min(forward_log_odds(distance_m / time_s), limit)
-            odds += sign * one_way * min(distance_m / certain_m, 1.0)
+            odds += sign * one_way * (1.0 if distance_m >= certain_m else distance_m / certain_m)
     return odds
 
 
