@@ -192,26 +192,33 @@ def extend_static(
         if len(near):
             inside, through, _ = count_at(boxes.take(near), 0, cloud.origin, cloud.free)
             free[near, tick] = (inside + through >= MIN_TICK_RAYS) & (through > inside)
-    out = [*agents, *([] if ego is None else [ego])]
+    out, places = list(agents), boxes.rectangles(np.arange(len(rows)), np.zeros(len(rows), dtype=np.intp))
+    moving = [*(a for a in agents if not a.static), *([] if ego is None else [ego])]
     low, high = (
-        np.array([[f(a.waypoints.x_m), f(a.waypoints.y_m)] for a in out], dtype=np.float64) for f in (np.min, np.max)
+        np.array([[f(a.waypoints.x_m), f(a.waypoints.y_m)] for a in moving], dtype=np.float64).reshape(-1, 2)
+        for f in (np.min, np.max)
     )
-    half_m = np.array([np.hypot(*a.size_m[:2]) for a in out]) / 2
-    tables: dict[int, AgentTable] = {}
+    static_half_m, half_m = (np.array([np.hypot(*a.size_m[:2]) for a in some]) / 2 for some in (boxes.agents, moving))
+    tables: dict[int, tuple[NDArray[np.intp], AgentTable]] = {}  # of moving agents, at the ticks of their lives
     # The surest first: what it takes, the others cannot have.
     for n in sorted(range(len(rows)), key=lambda n: -agents[rows[n]].confidence):
-        agent, w = agents[rows[n]], agents[rows[n]].waypoints
-        taken, reach_m = free[n].copy(), half_m[rows[n]] + half_m
-        place = np.array([w.x_m[0], w.y_m[0], *agent.size_m[:2], w.yaw_rad[0]])
+        place, taken, w = places[n], free[n].copy(), agents[rows[n]].waypoints
+        near = np.flatnonzero(np.hypot(*(places[:, :2] - place[:2]).T) <= static_half_m + static_half_m[n])
+        near = near[near != n]
+        shared = overlap_of_smaller(np.tile(place, (len(near), 1)), places[near])
+        for k in near[shared > TOUCHING].tolist():
+            taken[_ticks_of(out[rows[k]], t_s)] = True
+        reach_m = static_half_m[n] + half_m
         away_m = np.hypot(*np.maximum(np.maximum(low - place[:2], place[:2] - high), 0.0).T)
-        may_meet = away_m <= reach_m + np.hypot(*(high - low).T)
-        may_meet[rows[n]] = False
         ticks, there = [], []
-        for k in np.flatnonzero(may_meet).tolist():
+        for k in np.flatnonzero(away_m <= reach_m + np.hypot(*(high - low).T)).tolist():
             if k not in tables:
-                tables[k] = AgentTable.of([out[k]], t_s)
-            ticks.append(np.flatnonzero(np.hypot(*(tables[k].xy_m[0] - place[:2]).T) <= reach_m[k]))
-            there.append(tables[k].rectangles(0, ticks[-1]))
+                life = _ticks_of(moving[k], t_s)
+                tables[k] = life, AgentTable.of([moving[k]], t_s[life])
+            life, table = tables[k]
+            at = np.flatnonzero(np.hypot(*(table.xy_m[0] - place[:2]).T) <= reach_m[k])
+            ticks.append(life[at])
+            there.append(table.rectangles(0, at))
         if ticks:  # at which another is in its place
             others = np.concatenate(there)
             shared = overlap_of_smaller(np.tile(place, (len(others), 1)), others)
@@ -223,9 +230,14 @@ def extend_static(
             index = np.concatenate([0 * before, np.arange(len(w)), 0 * after + len(w) - 1])
             seen = np.concatenate([np.zeros(len(before), bool), w.observed, np.zeros(len(after), bool)])
             life_s = np.concatenate([t_s[before], w.t_s, t_s[after]])
-            out[rows[n]] = replace(agent, waypoints=replace(w.take(index), t_s=life_s, observed=seen))
-            tables.pop(rows[n], None)
-    return out[: len(agents)]
+            out[rows[n]] = replace(agents[rows[n]], waypoints=replace(w.take(index), t_s=life_s, observed=seen))
+    return out
+
+
+def _ticks_of(agent: Agent, t_s: Array) -> NDArray[np.intp]:
+    """Return the ticks at which an agent is there."""
+    first_s, last_s = agent.waypoints.t_s[[0, -1]].tolist()
+    return np.flatnonzero((t_s >= first_s - MARGIN_S) & (t_s <= last_s + MARGIN_S))
 
 
 # A reason that makes an agent e times less likely is told.
