@@ -31,6 +31,7 @@ from log2sim.perception.run_detectors import Detectors
 from log2sim.perception.sync import synchronize
 from log2sim.pipeline import observe_log, start
 from log2sim.plan import make_plan, select_sensors
+from log2sim.road import map_parts
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux alone")
 ROOT = Path(__file__).resolve().parents[1]
@@ -93,11 +94,15 @@ def test_scenarios_of_any_number_of_processes_are_the_same(
 ) -> None:
     monkeypatch.setattr(first_pass, "PART_TICKS", 2)
     monkeypatch.setattr("log2sim.agents.estimate.ROWS_A_PROCESS", 1)
+    monkeypatch.setattr("log2sim.road.map_parts.PART_CELLS", 500)
     config = Config.load(settings=["lidar.sweeps=2"], detect={"name": detector}, **settings)
     made = [reconstruct(tiny_log()[0], config, jobs=jobs) for jobs in (1, 3)]
     assert len({json.dumps(result.scenario.to_dict(), sort_keys=True) for result in made}) == 1
     assert len({str(result.report["detections"]) for result in made}) == 1
     assert all(stage["seconds"] > 0 for stage in made[1].report["stages"] if stage["stage"] in ("cloud", "measure"))
+    if not settings:  # the map is drawn in parts, which processes share
+        assert len(map_parts.parts_of(made[0].log, made[0].scenario, Config().map.cell_m)) > 1
+        assert made[1].scenario.map_features is not None and made[1].scenario.map_features.markings
 
 
 def test_frames_are_skipped_alike(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -405,6 +405,12 @@ class RecordWatch:
             n: replace(w, log=no_log, repeated=last(w.repeated), points=last(w.points)) for n, w in self.lidars.items()
         }
         return {"cameras": cameras, "lidars": lidars}
+
+    def copied(self) -> RecordWatch:
+        """Return a watch that goes on from here by itself."""
+        other, known = RecordWatch(self._log), {id(self._log): self._log}
+        other.cameras, other.lidars = deepcopy(self.cameras, known), deepcopy(self.lidars, known)
+        return other
 
     def attach(self, log: Log) -> None:
         """Give the log to a watch that came from another process."""

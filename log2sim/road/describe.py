@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from log2sim.config import MapConfig
 from log2sim.datatypes import Log, MapFeatures, Marking, RoadBorder, Scenario, Signal
 from log2sim.errors import LogError
-from log2sim.files.processes import in_background
+from log2sim.files.processes import in_background, map_in_processes
 from log2sim.files.stages import StageClock
 from log2sim.geometry import PoseTrack
 from log2sim.localization.pose_refinement import place_as_given
@@ -50,7 +51,7 @@ def describe(
 
     `observations`: what the first pass found of the records. `for_map`: poses by which the ground is drawn, None for those of the
     log. `earlier`: where maps of earlier runs are known. `jobs`: with more than one, vehicles and lights are looked at in a process of
-    their own while the ground is drawn.
+    their own while the ground is drawn, and parts of a large map at the same time.
     """
     log = log.changed(cameras={name: log.cameras[name] for name in plan.cameras})
     drawn = log if for_map is None else replace_poses(log, for_map)
@@ -64,12 +65,16 @@ def describe(
     look = partial(_appearance, scenario, log, plan, observations, records, earlier)
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         found = list[MapFeatures]()
-        for part in parts:
-            builder = GroundMapBuilder(drawn, scenario, settings, records, area_m=part.area_m)
-            draw, of = partial(_draw, builder, clock, progress), [*builder.inputs(), drawn.ego]
-            found.append(
-                draw() if earlier is None else earlier.known("map", log, of, (MapFeatures, Marking, RoadBorder), draw)
-            )
+        shared = min(jobs, len(parts)) if len(parts) > 1 else 1
+        told = (clock, progress) if shared == 1 else (StageClock(), lambda stage, done, total: None)
+        draw = partial(_draw, drawn, scenario, settings, records, earlier, *told)
+        with nullcontext() if shared == 1 else clock.stage("pictures", progress):
+            for made, known, failed in map_in_processes(draw, parts, shared):
+                found.append(made)
+                progress("pictures", len(found), len(parts))
+                records.add({}, failed)
+                if earlier is not None:
+                    earlier.found = [*dict.fromkeys([*earlier.found, *known])]
         if parts:
             features = join_parts(parts, found).moved(lambda points_m: place_as_given(points_m, drawn, log))
         if features is not None:
@@ -102,14 +107,33 @@ def describe(
     return described, decisions, figures
 
 
-def _draw(builder: GroundMapBuilder, clock: StageClock, progress: Callable[[str, int, int], None]) -> MapFeatures:
-    """Draw the ground and find markings and borders on it."""
-    with clock.stage("pictures", progress):
-        builder.lay_pictures(lambda done, total: progress("pictures", done, total))
-    with clock.stage("lanes", progress):
-        ground = builder.build()
-        markings, borders, notes = find_markings(ground)
-        return MapFeatures(markings, borders, notes=(*ground.notes, *notes))
+def _draw(
+    log: Log,
+    scenario: Scenario,
+    settings: MapConfig,
+    records: RecordSource,
+    earlier: StageCache | None,
+    clock: StageClock,
+    progress: Callable[[str, int, int], None],
+    part: Part,
+) -> tuple[MapFeatures, list[str], dict[str, list[str]]]:
+    """Draw the ground of a part and find markings and borders on it; with what stages were known, and the records that cannot be read."""
+    records = records.of(log)
+    records.watch = records.watch.copied()  # so that no part depends on those before it
+    builder = GroundMapBuilder(log, scenario, settings, records, area_m=part.area_m)
+
+    def draw() -> MapFeatures:
+        with clock.stage("pictures", progress):
+            builder.lay_pictures(lambda done, total: progress("pictures", done, total))
+        with clock.stage("lanes", progress):
+            ground = builder.build()
+            markings, borders, notes = find_markings(ground)
+            return MapFeatures(markings, borders, notes=(*ground.notes, *notes))
+
+    if earlier is None:
+        return draw(), [], records.failed
+    of = [*builder.inputs(), log.ego]
+    return earlier.known("map", log, of, (MapFeatures, Marking, RoadBorder), draw), earlier.found, records.failed
 
 
 def _appearance(
