@@ -102,7 +102,8 @@ def test_scenarios_of_any_number_of_processes_are_the_same(
     assert all(stage["seconds"] > 0 for stage in made[1].report["stages"] if stage["stage"] in ("cloud", "measure"))
     if not settings:  # the map is drawn in parts, which processes share
         assert len(map_parts.parts_of(made[0].log, made[0].scenario, Config().map.cell_m)) > 1
-        assert made[1].scenario.map_features is not None and made[1].scenario.map_features.markings
+        assert made[1].scenario.map_features is not None
+        assert made[1].scenario.map_features.markings
 
 
 def test_frames_are_skipped_alike(monkeypatch: pytest.MonkeyPatch) -> None:
