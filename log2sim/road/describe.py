@@ -71,7 +71,8 @@ def describe(
         with nullcontext() if shared == 1 else clock.stage("pictures", progress):
             for made, known, failed in map_in_processes(draw, parts, shared):
                 found.append(made)
-                progress("pictures", len(found), len(parts))
+                if shared > 1:
+                    progress("pictures", len(found), len(parts))
                 records.add({}, failed)
                 if earlier is not None:
                     earlier.found = [*dict.fromkeys([*earlier.found, *known])]
