@@ -173,6 +173,20 @@ def test_the_covariance_of_a_homography_is_that_of_its_errors_near_and_far(metho
     assert ((np.mean(nees, axis=0) > 0.6) & (np.mean(nees, axis=0) < 1.6)).all()
 
 
+@pytest.mark.parametrize(("outliers", "noise_px"), [(0.6, 0.5), (0.6, 2.0)])
+def test_many_outliers_do_not_widen_the_covariance(outliers: float, noise_px: float) -> None:
+    ground = np.array([[x, y] for x in (*NEAR_M, *FAR_M) for y in (-0.3 * x, 0.3 * x)])
+    uv, nees = through(image_H_ground(), ground), []
+    for seed in range(60):
+        world = pitching_stream(seed, ticks=20, outliers=outliers, noise_px=noise_px)
+        fit = world.fit()
+        assert fit.covariance is not None
+        away = through(fit.ground_H_image, uv) - ground
+        each = np.linalg.solve(ground_covariances(fit.ground_H_image, fit.covariance, uv), away[:, :, None])
+        nees.append((away * each[:, :, 0]).sum(axis=1).mean() / 2)
+    assert 0.75 < np.mean(nees) < 1.3
+
+
 # Calibrated.
 
 

@@ -89,7 +89,7 @@ OPTIMIZED_HYPOTHESES = 2
 OPTIMIZATION_ROWS = 160
 # The pose nearest to a homography misses what the homography fits, most of all with few correspondences.
 POSE_GATES = (100 * CHI2_2DOF_99, 16 * CHI2_2DOF_99, 4 * CHI2_2DOF_99, CHI2_2DOF_99)
-FINAL_ROUNDS = 3
+NOISE_ROUNDS, FINAL_ROUNDS = 2, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +146,12 @@ def ransac(
         if best is not None and np.count_nonzero(best.inliers) > min_inlier_share * count:
             break
     if best is not None and refined:
-        h, _ = newton_step(best, image_K)
-        data = data.scale_noise(*noise_factors(best, 8 if image_K is None else 6))
-        best = refine(linearize(data, h), FINAL_ROUNDS, image_K)
+        # The gate of the assumed noise may let outliers in, so the noise is estimated again behind that of the first estimate.
+        for _ in range(NOISE_ROUNDS):
+            h = newton_step(best, image_K)[0]
+            data = data.scale_noise(*noise_factors(best, 8 if image_K is None else 6))
+            best = linearize(data, h)
+        best = refine(best, FINAL_ROUNDS, image_K)
     return RobustFit(data, best)
 
 
