@@ -143,7 +143,8 @@ def ransac(
                 linear = linearize(data, h)
             if linear.loss < (np.inf if best is None else best.loss):  # NaN where there is no such pose
                 best = linear
-        if best is not None and np.count_nonzero(best.inliers) > min_inlier_share * count:
+        # The four rows of a sample agree by themselves.
+        if best is not None and np.count_nonzero(best.inliers) - 4 > min_inlier_share * (count - 4):
             break
     if best is not None and refined:
         # The gate of the assumed noise may let outliers in, so the noise is estimated again behind that of the first estimate.
