@@ -43,13 +43,15 @@ def fit_frames(data: NormalizedCorrespondences, estimate: FrameEstimator, *, kee
             continue
         robust = estimate(data.take(slice(start, start + count)))
         fit = validated_fit(robust)
-        if fit.ok and robust.h is not None:
+        if fit.ok and robust.linear is not None:
             per_tick[k] = fit.ground_H_image
-            hypotheses.append(robust.h)
+            hypotheses.append(robust.linear.h)
     if not hypotheses:
         return refused_fit("no frame has correspondences that determine a homography", data.image.shape[1])
-    best = hypotheses[int(np.argmin(bounded_losses(data, np.array(hypotheses))))]
-    fit = validated_fit(RobustFit(best, data, linearize(data, best[None])))
+    best = hypotheses[
+        int(np.argmin(bounded_losses(data.products, data.sigma_image, data.sigma_ground, np.array(hypotheses))))
+    ]
+    fit = validated_fit(RobustFit(data, linearize(data, best)))
     return replace(fit, per_tick=per_tick if keep_all and fit.ok else None)
 
 
@@ -102,9 +104,8 @@ def ransac_skimage(data: NormalizedCorrespondences, rng: np.random.Generator, tr
             rng=rng,
         )
     if not isinstance(model, HomographyModel):
-        return RobustFit(None, data)
-    h = model.h / np.linalg.norm(model.h)
-    return RobustFit(h, data, linearize(data, h[None]))
+        return RobustFit(data, None)
+    return RobustFit(data, linearize(data, model.h / np.linalg.norm(model.h)))
 
 
 # Fewer LiDAR points leave the nearest side of an obstacle undetermined.

@@ -24,7 +24,7 @@ from log2sim.perception.homography.fit import (
     refused_fit,
     validated_fit,
 )
-from log2sim.perception.homography.normalized import NormalizedCorrespondences, scaled
+from log2sim.perception.homography.normalized import NormalizedCorrespondences, first_of_each, scaled
 from log2sim.perception.homography.pitch_roll import (
     PITCH_SIGMA_PX,
     HeldOutErrors,
@@ -94,14 +94,13 @@ def estimate_homography(
         known = xy[np.isfinite(xy).all(axis=1)]
         range_m = 2.0 * float(np.sqrt(known.var(axis=0).sum())) if len(known) else 0.0
         sigma_m = max(sigma_m, SIZE_SIGMA_SHARE * range_m)
-    ticks, number = np.unique(correspondences.tick, return_inverse=True)
-    rows = np.flatnonzero(np.isfinite(uv[:, 0]) & np.isfinite(uv[:, 1]) & np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1]))
+    order, finite = np.argsort(correspondences.tick, kind="stable"), np.isfinite(uv) & np.isfinite(xy)
+    tick = correspondences.tick[order]
+    ticks, rows = tick[first_of_each(tick)], order[(finite[:, 0] & finite[:, 1])[order]]
     if len(rows) < 4:
         return refused_fit(f"{len(rows)} correspondences, at least 4 are needed", len(uv), ticks)
-    rows = rows[np.argsort(number[rows], kind="stable")]
-    of_rows = number[rows]
-    dense = np.cumsum(np.diff(of_rows, prepend=of_rows[0]) > 0, dtype=np.int64)
-    data = NormalizedCorrespondences.of(uv[rows], xy[rows], dense, options.sigma_px, sigma_m)
+    tick = correspondences.tick[rows]
+    data = NormalizedCorrespondences.of(uv[rows], xy[rows], tick, options.sigma_px, sigma_m)
     if of_stream:
         image_K = None
         if method == "calibrated":
@@ -109,17 +108,19 @@ def estimate_homography(
             if not (np.isfinite(K).all() and np.linalg.cond(K) < MAX_CONDITION):
                 return refused_fit("the intrinsics K are singular", len(uv), ticks)
             image_K = data.image_N_px @ K
-        pitch_sigma = PITCH_SIGMA_PX * data.image_N_px[0, 0] if options.pitch_roll else 0.0
-        schedule = options.schedule(RANSAC_SCHEDULE)
-        robust = ransac(data, rng, pitch_sigma=pitch_sigma, image_K=image_K, schedule=schedule)
-        if robust.h is None or not options.pitch_roll:
+        schedule, drawn_from = options.schedule(RANSAC_SCHEDULE), data
+        if options.pitch_roll:
+            moving_sigma = float(np.hypot(data.sigma_image, PITCH_SIGMA_PX * data.image_N_px[0, 0]))
+            drawn_from = replace(data, sigma_image=moving_sigma)
+        robust = ransac(drawn_from, rng, image_K=image_K, schedule=schedule, refined=not options.pitch_roll)
+        if robust.linear is None or not options.pitch_roll:
             fit = validated_fit(robust, image_K)
         else:
-            moving, warps, tick_sigmas = fit_pitch_roll(data, robust.h, image_K)
+            moving, warps, tick_sigmas = fit_pitch_roll(data, robust.linear.h, image_K)
             fit = validated_fit(moving, image_K)
-            if fit.ok and moving.h is not None:
+            if fit.ok and moving.linear is not None:
                 tick_sigmas = fit.ground_H_image @ np.linalg.inv(data.image_N_px) @ tick_sigmas @ data.image_N_px
-                fit = replace(fit, per_tick=data.to_ground_H_image(warps @ moving.h), tick_sigmas=tick_sigmas)
+                fit = replace(fit, per_tick=data.to_ground_H_image(warps @ moving.linear.h), tick_sigmas=tick_sigmas)
     else:
         estimate = partial(ransac, rng=rng, schedule=options.schedule(RANSAC_SCHEDULE_OF_A_FRAME))
         if method == "per-frame-skimage":
@@ -127,7 +128,7 @@ def estimate_homography(
         fit = fit_frames(data, estimate, keep_all=method != "min-frame")
     # From the rows that were used to all. A tick without any gets NaN, or the homography of the stream where there is one, and
     # may have any angle that other ticks have.
-    inliers, of_ticks = np.zeros(len(uv), dtype=bool), of_rows[data.start]
+    inliers, of_ticks = np.zeros(len(uv), dtype=bool), np.searchsorted(ticks, tick[data.start])
     inliers[rows] = fit.inliers
     per_tick, sigmas = fit.per_tick, fit.tick_sigmas
     if per_tick is not None:

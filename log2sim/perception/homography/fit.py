@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.files.documents import rounded
-from log2sim.geometry import CHI2_2DOF_99, Array, apply_homography
+from log2sim.geometry import CHI2_2DOF_99, Array, apply_homography, median
 from log2sim.perception.homography.normalized import (
     Linearization,
     NormalizedCorrespondences,
@@ -21,18 +21,16 @@ from log2sim.perception.homography.normalized import (
     normalize,
     pose_tangent,
     refine,
-    refine_many,
     scale_free_basis,
-    squared_errors,
 )
 
 # No three of four points may be collinear: twice the area of their smallest triangle, for data of spread 1.
 MIN_TRIANGLE_AREA = 1e-7
-# Rows that all hypotheses are scored on before the better ones are scored on all rows.
-PRESCORE_ROWS = 80
+# Rows that hypotheses are scored on.
+SCORED_ROWS = 120
 # A homography through four noisy points misses the other points by more than the noise, so hypotheses are scored with
 # standard deviations this much larger.
-MINIMAL_SAMPLE_SIGMA_SCALE = 2.0
+SAMPLE_SIGMA_SCALE = 2.0
 
 
 def draw_samples(
@@ -56,57 +54,50 @@ def solve_samples(data: NormalizedCorrespondences, rows: NDArray[np.int64], max_
     Three points are a basis in which the fourth has coordinates that are areas of triangles, so the homography between
     two such bases needs no decomposition (Hartley & Zisserman, Multiple View Geometry, 2004, section 2.3).
     """
-    in_image, on_ground = _triangle_areas(data.image[:, rows]), _triangle_areas(data.ground[:2, rows])
-    min_image, min_ground = (np.abs(a).min(axis=0) for a in (in_image, on_ground))
+    points = np.concatenate([data.image, data.ground[:2]]).take(rows, axis=1).reshape(2, 2, *rows.shape)
+    # Twice the signed areas (4, 2, count) of the triangles in the image and on the ground: in rows 0 to 2 the fourth point
+    # replaces one of the first three; row 3 is the triangle of the first three.
+    (ax, bx, cx), (ay, by, cy) = (points[:, :, 1:] - points[:, :, :1]).transpose(1, 2, 0, 3)
+    areas = np.empty((4, *ax.shape))
+    areas[3] = ax * by - ay * bx
+    areas[2] = ax * cy - ay * cx
+    areas[1] = by * cx - bx * cy
+    areas[0] = areas[3] - areas[2] - areas[1]
     # The depths of the four points have one sign if the signs of the areas agree, or disagree, for all triangles.
-    agree = (in_image * on_ground > 0).sum(axis=0)
-    spread = min_image * min_ground
-    one_side = (agree == 0) | (agree == 4)
-    usable = np.flatnonzero(one_side & (min_image > MIN_TRIANGLE_AREA) & (min_ground > MIN_TRIANGLE_AREA))
+    product = areas[:, 0] * areas[:, 1]
+    lowest, highest = product.min(axis=0), product.max(axis=0)
+    spread = np.maximum(lowest, -highest)
+    usable = np.flatnonzero(spread > MIN_TRIANGLE_AREA**2)
     if len(usable) > max_hypotheses:
         usable = usable[np.argpartition(-spread[usable], max_hypotheses)[:max_hypotheses]]
-    depth = np.abs(in_image[:3, usable] / on_ground[:3, usable]) * np.sign(on_ground[3, usable])
-    columns = np.empty((len(usable), 3, 3))
-    columns[:, :2] = (data.image[:, rows[:3, usable]] * depth).transpose(2, 0, 1)
-    columns[:, 2] = depth.T
-    ground, adjugate = data.ground[:2, rows[:3, usable]], np.empty((len(usable), 3, 3))
-    for k in range(3):
-        (ax, bx), (ay, by) = ground[:, [(k + 1) % 3, (k + 2) % 3]]
-        adjugate[:, k, 0], adjugate[:, k, 1], adjugate[:, k, 2] = ay - by, bx - ax, ax * by - ay * bx
-    return np.asarray(columns @ adjugate, dtype=np.float64)
-
-
-def _triangle_areas(points: Array) -> Array:
-    """Compute twice the signed areas (4, count) of the triangles of points (2, 4, count).
-
-    In rows 0 to 2 the fourth point replaces one of the first three; row 3 is the triangle of the first three.
-    """
-    ax, bx, cx = points[0, 1:] - points[0, 0]
-    ay, by, cy = points[1, 1:] - points[1, 0]
-    ab, ac, bc = ax * by - ay * bx, ax * cy - ay * cx, bx * cy - by * cx
-    return np.stack([ab - ac + bc, -bc, ac, ab])
+    (u, v), ground = points[:, :, :3].take(usable, axis=3)
+    in_image, on_ground = areas.take(usable, axis=2).transpose(1, 0, 2)
+    depth = np.abs(in_image[:3] / on_ground[:3]) * np.sign(on_ground[3])
+    columns, adjugate = np.concatenate([u * depth, v * depth, depth]).reshape(3, *u.shape), np.empty((3, *u.shape))
+    (x1, x2), (y1, y2) = ground[:, [[1, 2, 0], [2, 0, 1]]]
+    adjugate[0], adjugate[1], adjugate[2] = y1 - y2, x2 - x1, x1 * y2 - y1 * x2
+    return np.asarray(columns.transpose(2, 0, 1) @ adjugate.transpose(2, 1, 0), dtype=np.float64)
 
 
 # Rounds: samples of four to draw, how many of them are solved and scored, and the share of inliers below which the next one runs.
+# Of 500 samples six are free of outliers where two thirds are outliers, of which about half are scored.
 RansacSchedule = tuple[tuple[int, int, float], ...]
-RANSAC_SCHEDULE: RansacSchedule = ((500, 64, 0.35), (3000, 256, 0.0))
+RANSAC_SCHEDULE: RansacSchedule = ((500, 64, 0.35), *[(500, 64, 0.3)] * 6)
 RANSAC_SCHEDULE_OF_A_FRAME: RansacSchedule = ((120, 48, 0.5), (500, 96, 0.0))
-# Local optimization of the best hypotheses, on some rows, with gates that narrow from step to step.
-OPTIMIZED_HYPOTHESES, OPTIMIZED_POSES = 3, 2
+# Local optimization of the best hypotheses, on some rows.
+OPTIMIZED_HYPOTHESES = 2
 OPTIMIZATION_ROWS = 160
-OPTIMIZATION_GATES = (4 * CHI2_2DOF_99, 1.5 * CHI2_2DOF_99)
 # The pose nearest to a homography misses what the homography fits, most of all with few correspondences.
 POSE_GATES = (100 * CHI2_2DOF_99, 16 * CHI2_2DOF_99, 4 * CHI2_2DOF_99, CHI2_2DOF_99)
-NOISE_ROUNDS, FINAL_ROUNDS = 1, 2
+NOISE_ROUNDS, FINAL_ROUNDS = 2, 2
 
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
     """A homography estimated from correspondences with outliers, in normalized units."""
 
-    h: Array | None  # (3, 3): ground to image; None where no four correspondences determine a homography
     data: NormalizedCorrespondences  # all correspondences, with the noise as estimated
-    linear: Linearization | None = None  # errors of `h` on them
+    linear: Linearization | None  # errors on them; None where no four correspondences determine a homography
     # (N, 3, 3): image homography of each correspondence's tick on top of `h`, see `pitch_roll`
     warps: Array | None = None
     effective_parameters: float = 0.0  # effective number of parameters of `warps`
@@ -116,61 +107,53 @@ def ransac(
     data: NormalizedCorrespondences,
     rng: np.random.Generator,
     *,
-    pitch_sigma: float = 0.0,
     image_K: Array | None = None,
     schedule: RansacSchedule = RANSAC_SCHEDULE,
+    refined: bool = True,
 ) -> RobustFit:
     """Estimate the homography of least bounded loss from samples of single ticks and of all ticks.
 
-    `pitch_sigma`: standard deviation of an image shift along v that differs from tick to tick, normalized units. With it
-    the result is not refined, which is left to the fit of pitch and roll. `image_K`: (3, 3): normalized intrinsics; with
-    them the result is a pose of that camera.
+    `image_K`: (3, 3): normalized intrinsics; with them the result is a pose of that camera. `refined`: over all inliers, whose
+    errors tell the noise.
 
     LO-RANSAC (Chum, Matas & Kittler, 2003) with the bounded loss of MSAC (Torr & Zisserman, 2000).
     """
-    candidates, count = np.zeros((0, 3, 3)), data.image.shape[1]
-    for samples, scored, min_inlier_share in schedule:
-        rows = np.concatenate(
-            [draw_samples(data, rng, samples // 2, across_ticks=across) for across in (False, True)], axis=1
-        )
-        h = solve_samples(data, rows, scored)
-        if len(h):
-            # Only the best on some rows are scored on all.
-            if count > 2 * PRESCORE_ROWS and len(h) > 2 * OPTIMIZED_HYPOTHESES:
-                some = data.coarse(np.sort(rng.permutation(count)[:PRESCORE_ROWS]), MINIMAL_SAMPLE_SIGMA_SCALE)
-                h = h[np.argsort(bounded_losses(some, h, pitch_sigma), kind="stable")[: 2 * OPTIMIZED_HYPOTHESES]]
-            loss = bounded_losses(data.coarse(slice(None), MINIMAL_SAMPLE_SIGMA_SCALE), h, pitch_sigma)
-            h = h[np.argsort(loss, kind="stable")[:OPTIMIZED_HYPOTHESES]]
-            # A few Gauss-Newton steps on some of the rows.
-            few = count <= 2 * OPTIMIZATION_ROWS
-            part = data if few else data.take(np.sort(rng.permutation(count)[:OPTIMIZATION_ROWS]))
-            part = replace(part, sigma_image=float(np.hypot(part.sigma_image, pitch_sigma)))
-            h = refine_many(part, h, OPTIMIZATION_GATES)
+    count, best_score = data.image.shape[1], np.inf
+    best: Linearization | None = None
+    sigmas = SAMPLE_SIGMA_SCALE * data.sigma_image, SAMPLE_SIGMA_SCALE * data.sigma_ground
+    scored = data.products.take(rng.permutation(count)[:SCORED_ROWS], axis=1).astype(np.float32)
+    part = data if count <= 2 * OPTIMIZATION_ROWS else data.take(rng.permutation(count)[:OPTIMIZATION_ROWS])
+    for k, (samples, solved, min_inlier_share) in enumerate(schedule):
+        # Ticks where the first round finds nothing may hold fewer than four inliers each.
+        sources = (True,) if k else (False, True)
+        rows = [draw_samples(data, rng, samples // len(sources), across_ticks=across) for across in sources]
+        hypotheses = solve_samples(data, np.concatenate(rows, axis=1), solved)
+        losses = bounded_losses(scored, *sigmas, hypotheses)
+        if losses.min(initial=np.inf) < best_score:
+            best_score, found = losses.min(), []
+            for h in hypotheses[losses.argsort()[:OPTIMIZED_HYPOTHESES]]:
+                linear = linearize(part, h)
+                found.append(linearize(data, newton_step(linear, share=linear.bounded_weights)[0]))
+            linear = min(found, key=lambda of: of.loss)
             if image_K is not None:
-                h = nearest_poses(image_K, h[np.argsort(bounded_losses(part, h), kind="stable")[:OPTIMIZED_POSES]])
-                h = h[np.isfinite(h).all(axis=(1, 2))]
-                for gate in POSE_GATES if len(h) else ():
+                h = nearest_poses(image_K, linear.h[None])[0]
+                for gate in POSE_GATES:
                     linear = linearize(part, h)
-                    h = np.array([newton_step(linear, pose, image_K, gate, k) for k, pose in enumerate(h)])
-            candidates = np.concatenate([candidates, h])
-        if len(candidates):
-            squared = squared_errors(data, candidates, pitch_sigma)
-            best = int(np.argmin(np.minimum(squared, CHI2_2DOF_99).sum(axis=1)))
-            candidates = candidates[[best]]
-            if np.count_nonzero(squared[best] < CHI2_2DOF_99) > min_inlier_share * squared.shape[1]:
-                break
-    if len(candidates) == 0:
-        return RobustFit(None, data)
-    best_h: Array = candidates[0]
-    if pitch_sigma:
-        return RobustFit(best_h, data)
-    # Refined over all inliers, whose errors tell the noise.
-    for _ in range(NOISE_ROUNDS):
-        linear = linearize(data, best_h[None])
-        best_h = newton_step(linear, best_h, image_K)
-        data = data.scale_noise(*noise_factors(data, linear, 8 if image_K is None else 6))
-    best_h, linear = refine(data, best_h, FINAL_ROUNDS, image_K)
-    return RobustFit(best_h, data, linear)
+                    h, _ = newton_step(linear, image_K, linear.squared < gate)
+                linear = linearize(data, h)
+            if linear.loss < (np.inf if best is None else best.loss):  # NaN where there is no such pose
+                best = linear
+        # The four rows of a sample agree by themselves.
+        if best is not None and np.count_nonzero(best.inliers) - 4 > min_inlier_share * (count - 4):
+            break
+    if best is not None and refined:
+        # The gate of the assumed noise may let outliers in, so the noise is estimated again behind that of the first estimate.
+        for _ in range(NOISE_ROUNDS):
+            h = newton_step(best, image_K)[0]
+            data = data.scale_noise(*noise_factors(best, 8 if image_K is None else 6))
+            best = linearize(data, h)
+        best = refine(best, FINAL_ROUNDS, image_K)
+    return RobustFit(data, best)
 
 
 # Ratio of the eighth to the first singular value of the normalized DLT matrix: about 0.3 for points that spread over the
@@ -182,28 +165,24 @@ MIN_INLIER_SHARE = 0.2
 # Largest predicted standard deviation on the ground, one spread of the inliers from their mean, as a share of the spread.
 MAX_RELATIVE_SIGMA = 0.25
 # Ground points at which it is predicted, in units of that spread.
-PROBES = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+PROBES = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
 
 
-def homography_covariance(
-    h: Array, linear: Linearization, use: NDArray[np.bool_], image_K: Array | None
-) -> Array | None:
-    """Compute the covariance (9, 9) of the elements of `inv(h)`, row by row, ground to image and normalized units for `h` (3, 3).
+def homography_covariance(h: Array, back: Array, normal: Array, image_K: Array | None) -> Array | None:
+    """Compute the covariance (9, 9) of the elements of `back`, the inverse of `h` (3, 3), row by row; ground to image and normalized units for `h`.
 
-    `use` (N,): correspondences that it was fitted to. None where they do not determine it.
+    `normal` (9, 9): normal matrix of the correspondences that it was fitted to. None where they do not determine it.
     """
     basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
-    slope = (linear.slope[0] * use).reshape(9, -1)
-    normal = basis.T @ (slope @ slope.T) @ basis
-    size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
+    normal = basis.T @ normal @ basis
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     try:
         inverse = np.linalg.inv(normal / size[:, None] / size)
     except np.linalg.LinAlgError:
         return None
     if not np.abs(inverse).max() < 1e13:
         return None
-    back = np.linalg.inv(h)
-    by_parameters = -by_elements(back, back) @ basis / size
+    by_parameters = by_elements(back, back) @ (basis / size)
     return np.asarray(by_parameters @ inverse @ by_parameters.T)
 
 
@@ -214,11 +193,12 @@ def by_elements(left: NDArray[np.floating[Any]], right: NDArray[np.floating[Any]
 
 def ground_covariances(ground_H_image: Array, covariance: Array, uv: Array) -> Array:
     """Compute the covariances (N, 2, 2) that a homography (3, 3) of covariance (9, 9) gives the ground positions of pixels (N, 2)."""
-    pixel = np.column_stack([uv, np.ones(len(uv))])
-    q = pixel @ ground_H_image.T
-    by_h = np.zeros((len(uv), 2, 9))
-    by_h[:, 0, 0:3] = by_h[:, 1, 3:6] = pixel / q[:, 2:]
-    by_h[:, :, 6:] = -(q[:, :2] / q[:, 2:])[:, :, None] * by_h[:, :1, 0:3]
+    pixel = np.ones((len(uv), 3))
+    pixel[:, :2] = uv
+    q, by_h = pixel @ ground_H_image.T, np.zeros((len(uv), 2, 9))
+    pixel /= q[:, 2:]
+    by_h[:, 0, 0:3] = by_h[:, 1, 3:6] = pixel
+    by_h[:, :, 6:] = -(q[:, :2] / q[:, 2:])[:, :, None] * pixel[:, None]
     return np.asarray(by_h @ covariance @ by_h.swapaxes(1, 2))
 
 
@@ -357,34 +337,36 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
     Every two effective parameters of single ticks make one correspondence an inlier without evidence, so as many inliers
     more are required.
     """
-    data, rows = robust.data, robust.data.image.shape[1]
-    if robust.h is None or robust.linear is None:
+    data, linear, rows = robust.data, robust.linear, robust.data.image.shape[1]
+    if linear is None:
         return refused_fit("every sample of four is collinear or coincident", rows)
-    inliers, absorbed = robust.linear.squared[0] < CHI2_2DOF_99, robust.effective_parameters / 2
-    count, minimum = int(inliers.sum()), 4 if rows < MIN_INLIERS else MIN_INLIERS
+    inliers, absorbed = linear.inliers, robust.effective_parameters / 2
+    count, minimum = int(np.count_nonzero(inliers)), 4 if rows < MIN_INLIERS else MIN_INLIERS
     needed = max(minimum, int(np.ceil(absorbed + MIN_INLIER_SHARE * (rows - absorbed))))
     if count < needed:
         return refused_fit(f"{count} of {rows} correspondences agree, at least {needed} are needed", rows)
     # Singular values, descending, of the DLT matrix of the inliers, normalized anew.
-    (u, v), (x, y) = (normalize(a[:2, inliers])[1] for a in (data.image, data.ground))
-    p, gram = np.stack([u, v, np.ones_like(u)]), np.zeros((9, 9))
-    gram[0:3, 0:3] = gram[3:6, 3:6] = p @ p.T
-    gram[0:3, 6:9] = gram[6:9, 0:3] = -(p * x) @ p.T
-    gram[3:6, 6:9] = gram[6:9, 3:6] = -(p * y) @ p.T
-    gram[6:9, 6:9] = (p * (x * x + y * y)) @ p.T
-    s = np.sqrt(np.clip(np.linalg.eigvalsh(gram)[::-1], 0.0, None))
+    rows_in = np.flatnonzero(inliers)
+    image, ground = data.image.take(rows_in, axis=1), data.ground[:2].take(rows_in, axis=1)
+    inlier_N_ground, (x, y) = normalize(ground)
+    image_rows = np.concatenate([normalize(image)[1], np.ones((1, count))])
+    products, gram = np.concatenate([image_rows, image_rows * x, image_rows * y]), np.zeros((9, 9))
+    sums = products @ products.T
+    gram[0:3, 0:3] = gram[3:6, 3:6] = sums[0:3, 0:3]
+    gram[0:6, 6:9] = -sums[3:9, 0:3]
+    gram[6:9, 0:6] = gram[0:6, 6:9].T
+    gram[6:9, 6:9] = sums[3:6, 3:6] + sums[6:9, 6:9]
+    s = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[::-1], 0.0))
     if image_K is None and s[7] < MIN_S8_S1 * s[0]:
         return refused_fit(f"the {count} correspondences that agree lie on a line or a point", rows)
-    covariance = homography_covariance(robust.h, robust.linear, inliers, image_K)
+    back = np.asarray(np.linalg.inv(linear.h), dtype=np.float64)
+    covariance = homography_covariance(linear.h, back, linear.inlier_equations[0], image_K)
     # The standard deviation on the ground that it predicts one spread of the inliers from their mean, normalized units.
-    ground_xy = data.ground[:2, inliers]
-    mean = ground_xy.mean(axis=1, keepdims=True)
-    spread, sigma = float(np.sqrt(((ground_xy - mean) ** 2).sum(axis=0).mean() / 2)), float("inf")
-    if spread > 0 and covariance is not None:
-        q: Array = robust.h @ np.vstack([mean + spread * PROBES, np.ones((1, 4))])
-        seen: Array = (q[:2, q[2] > 0] / q[2, q[2] > 0]).T
-        inverse = np.asarray(np.linalg.inv(robust.h), dtype=np.float64)
-        variance = ground_covariances(inverse, covariance, seen).trace(axis1=1, axis2=2)
+    spread, sigma = float(1.0 / inlier_N_ground[0, 0]), float("inf")
+    if covariance is not None:
+        q: Array = linear.h @ np.linalg.solve(inlier_N_ground, PROBES)
+        q = q[:, q[2] > 0]
+        variance = ground_covariances(back, covariance, (q[:2] / q[2]).T).trace(axis1=1, axis2=2)
         sigma = float(np.sqrt(variance.max())) if len(variance) else sigma
     scale = data.ground_N_m[0, 0]
     if not sigma < MAX_RELATIVE_SIGMA * spread:
@@ -393,13 +375,24 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
             f"{sigma / scale:.1f} m where they spread over {spread / scale:.1f} m"
         )
         return refused_fit(reason, rows)
-    image = np.vstack([data.image, np.ones((1, rows))])
     if robust.warps is not None:
-        image = np.linalg.solve(robust.warps, image.T[:, :, None])[:, :, 0].T
-    back = np.linalg.inv(robust.h) @ image
-    error_m = float(np.median(np.hypot(*(back[:2] / back[2] - data.ground[:2])[:, inliers]) / scale))
-    condition, h = float(s[0] / s[7]) if s[7] > 0 else float("inf"), data.to_ground_H_image(robust.h)
-    unscaled = np.linalg.inv(data.ground_N_m) @ np.linalg.inv(robust.h) @ data.image_N_px
-    to_px = by_elements(np.linalg.inv(data.ground_N_m), data.image_N_px) / np.linalg.norm(unscaled[2])
-    covariance = None if covariance is None else to_px @ covariance @ to_px.T
-    return HomographyFit(True, "", h, inliers, error_m, condition, sigma_m=float(sigma / scale), covariance=covariance)
+        still = np.linalg.solve(robust.warps[inliers], np.vstack([image, np.ones(count)]).T[:, :, None])[:, :, 0].T
+        image = still[:2] / still[2]
+    q = back[:, :2] @ image + back[:, 2:]
+    error_m = median(np.hypot(*(q[:2] / q[2] - ground))) / scale
+    condition, m_N_ground = float(s[0] / s[7]) if s[7] > 0 else float("inf"), np.linalg.inv(data.ground_N_m)
+    ground_H_image = m_N_ground @ back @ data.image_N_px
+    size = np.linalg.norm(ground_H_image[2])
+    if covariance is not None:
+        to_px = by_elements(m_N_ground, data.image_N_px) / size
+        covariance = to_px @ covariance @ to_px.T
+    return HomographyFit(
+        True,
+        "",
+        ground_H_image / size,
+        inliers,
+        error_m,
+        condition,
+        sigma_m=float(sigma / scale),
+        covariance=covariance,
+    )

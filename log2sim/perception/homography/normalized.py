@@ -6,6 +6,7 @@ while its effect on the ground grows with the square of the range.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -39,9 +40,9 @@ class NormalizedCorrespondences:
         image_N_px, image = normalize(np.ascontiguousarray(uv_px.T))
         ground_N_m, ground_xy = normalize(np.ascontiguousarray(xy_m.T))
         ground = np.concatenate([ground_xy, np.ones((1, len(uv_px)))])
-        start = np.flatnonzero(np.diff(tick, prepend=tick[0] - 1))
+        first = first_of_each(tick)
         sigmas = sigma_px * image_N_px[0, 0], sigma_m * ground_N_m[0, 0]
-        return cls(image, ground, tick, start, *sigmas, image_N_px, ground_N_m)
+        return cls(image, ground, np.cumsum(first) - 1, np.flatnonzero(first), *sigmas, image_N_px, ground_N_m)
 
     @cached_property
     def count(self) -> NDArray[np.int64]:
@@ -49,28 +50,22 @@ class NormalizedCorrespondences:
         return np.diff(self.start, append=self.image.shape[1])
 
     @cached_property
+    def ground_products(self) -> Array:
+        """Products (6, N) of ground coordinates: x x, x y, x, y y, y, 1."""
+        x, y, _ = self.ground
+        return np.concatenate([self.ground * x, self.ground[1:] * y, self.ground[2:]])
+
+    @cached_property
     def products(self) -> NDArray[np.floating[Any]]:
         """Products (12, N): ground x, y, 1; the same times u; the same times v; then u u, v v, u v."""
         (u, v), ground = self.image, self.ground
-        return np.concatenate([ground, ground * u, ground * v, [u * u, v * v, u * v]])
+        return np.concatenate([ground, ground * u, ground * v, self.image * self.image, (u * v)[None]])
 
-    def coarse(self, rows: Any, sigma_scale: float) -> NormalizedCorrespondences:
-        """Select rows with enlarged noise and single-precision products, for scoring hypotheses."""
-        part = self.take(rows, sigma_scale)
-        part.__dict__["products"] = self.products[:, rows].astype(np.float32)
-        return part
-
-    def take(self, rows: Any, sigma_scale: float = 1.0) -> NormalizedCorrespondences:
-        """Select rows in the same units and renumber the ticks."""
-        tick = self.tick[rows]
-        first = np.concatenate([[True], tick[1:] != tick[:-1]])
-        start = np.flatnonzero(first)
-        tick = np.cumsum(first) - 1
-        sigmas = self.sigma_image * sigma_scale, self.sigma_ground * sigma_scale
-        normalizations = self.image_N_px, self.ground_N_m
-        return NormalizedCorrespondences(
-            self.image[:, rows], self.ground[:, rows], tick, start, *sigmas, *normalizations
-        )
+    def take(self, rows: Any) -> NormalizedCorrespondences:
+        """Select rows in the same units, as if of one tick."""
+        image, ground = self.image[:, rows], self.ground[:, rows]
+        tick, start = np.zeros(image.shape[1], dtype=np.int64), np.zeros(1, dtype=np.int64)
+        return replace(self, image=image, ground=ground, tick=tick, start=start)
 
     def scale_noise(self, image: float, ground: float) -> NormalizedCorrespondences:
         """Scale the standard deviations of pixels and ground positions by these factors."""
@@ -81,6 +76,13 @@ class NormalizedCorrespondences:
         return scaled(np.linalg.inv(self.ground_N_m) @ np.linalg.inv(image_H_ground) @ self.image_N_px)
 
 
+def first_of_each(tick: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mark the first row of each tick (N,), ascending."""
+    first = np.ones(len(tick), dtype=bool)
+    np.not_equal(tick[1:], tick[:-1], out=first[1:])
+    return first
+
+
 def scaled(h: Array) -> Array:
     """Scale homographies (..., 3, 3) so that their third rows are unit vectors."""
     return np.asarray(h / np.linalg.norm(h[..., 2, :], axis=-1)[..., None, None], dtype=np.float64)
@@ -88,64 +90,67 @@ def scaled(h: Array) -> Array:
 
 def normalize(points: Array) -> tuple[Array, Array]:
     """Return the similarity (3, 3) that gives points (2, N) mean 0 and spread 1 an axis, and the normalized points."""
-    center = points.mean(axis=1, keepdims=True)
-    offset = points - center
-    spread = float(np.sqrt((offset * offset).mean()))
+    center = points.sum(axis=1) / points.shape[1]
+    offset = points - center[:, None]
+    spread = float(np.sqrt(np.vdot(offset, offset) / offset.size))
     scale = 1.0 / spread if spread > 0 else 1.0
     offset *= scale
-    similarity = np.array([[scale, 0, -scale * center[0, 0]], [0, scale, -scale * center[1, 0]], [0, 0, 1.0]])
-    return similarity, offset
+    x, y = (-scale * center).tolist()
+    return np.array([[scale, 0.0, x], [0.0, scale, y], [0.0, 0.0, 1.0]]), offset
+
+
+# Share of the variance along v that is independent of u, below which single precision does not tell it from zero.
+MIN_OWN_VARIANCE = 1e-5
 
 
 def squared_errors(
-    data: NormalizedCorrespondences, image_H_ground: Array, pitch_sigma: float = 0.0
+    products: NDArray[np.floating[Any]], sigma_image: float, sigma_ground: float, image_H_ground: Array
 ) -> NDArray[np.floating[Any]]:
-    """Compute squared whitened errors (K, N) of homographies (K, 3, 3); infinite behind the camera.
+    """Compute squared whitened errors (K, N) of homographies (K, 3, 3) in the precision of `products`; infinite behind the camera.
 
-    `pitch_sigma` is a further standard deviation along v, for cameras that pitch, in normalized units.
+    `products` (12, N): of `NormalizedCorrespondences`. `sigma_image`, `sigma_ground`: standard deviations, normalized units.
 
     Sampson's distance: the error of the cross-multiplied equations weighted by its first-order covariance. Errors, depth
     and covariance are linear in products of the coordinates, so one matrix product gives them for all homographies.
     """
     # Factors (6, K, 12) of `products` that give two errors, the depth and three entries of the covariance.
-    c, (a, b, d) = np.zeros((6, len(image_H_ground), 12)), image_H_ground.transpose(1, 0, 2)
+    c, (a, b, d) = np.zeros((6, len(image_H_ground), 12), products.dtype), image_H_ground.transpose(1, 0, 2)
     c[0, :, 0:3], c[0, :, 3:6] = -a, d
     c[1, :, 0:3], c[1, :, 6:9] = -b, d
     c[2, :, 0:3] = d
-    by_ground = data.sigma_ground * image_H_ground[:, :, :2]
-    (aa, ab, ad), (_, bb, bd), (_, _, dd) = (by_ground @ by_ground.swapaxes(1, 2)).transpose(1, 2, 0)
+    x, y = (sigma_ground * image_H_ground[:, :, :2]).transpose(2, 0, 1)
+    (aa, ab, ad), (_, bb, bd), (_, _, dd) = (x[:, :, None] * x[:, None] + y[:, :, None] * y[:, None]).transpose(1, 2, 0)
     c[3, :, 2], c[3, :, 5], c[3, :, 9] = aa, -2 * ad, dd
     c[4, :, 2], c[4, :, 8], c[4, :, 10] = bb, -2 * bd, dd
     c[5, :, 2], c[5, :, 5], c[5, :, 8], c[5, :, 11] = ab, -bd, -ad, dd
-    kind = data.products.dtype
-    ex, ey, w, cuu, cvv, cuv = (c.reshape(-1, 12).astype(kind) @ data.products).reshape(6, len(image_H_ground), -1)
+    ex, ey, w, cuu, cvv, cuv = (c.reshape(-1, 12) @ products).reshape(6, len(image_H_ground), products.shape[1])
     pixel = w * w
-    cvv += kind.type(data.sigma_image**2 + pitch_sigma**2) * pixel
-    pixel *= kind.type(data.sigma_image**2)
+    pixel *= sigma_image**2
     cuu += pixel
-    area = cuu * cvv
-    area -= cuv * cuv
-    cuv *= ex
-    cuv *= ey
-    cuv *= kind.type(2.0)
-    ex *= ex
-    ex *= cvv
-    ex -= cuv
-    ey *= ey
-    ey *= cuu
-    ex += ey
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ex /= area
-    ex[~(w > 0)] = np.inf
+    cvv += pixel
+    # By the errors along u, and across it: a sum of squares, so that rounding makes no error negative.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        shear = cuv / cuu
+        cuv *= shear
+        own = cvv - cuv
+        shear *= ex
+        ey -= shear
+        ex *= ex
+        ex /= cuu
+        ey *= ey
+        ey /= own
+        ex += ey
+    cvv *= MIN_OWN_VARIANCE
+    np.copyto(ex, np.inf, where=~((w > 0) & (own > cvv)))
     return np.asarray(ex)
 
 
 def bounded_losses(
-    data: NormalizedCorrespondences, image_H_ground: Array, pitch_sigma: float = 0.0
+    products: NDArray[np.floating[Any]], sigma_image: float, sigma_ground: float, image_H_ground: Array
 ) -> NDArray[np.floating[Any]]:
     """Compute the mean squared whitened error (K,), each cut at `CHI2_2DOF_99`, of homographies (K, 3, 3)."""
-    squared = squared_errors(data, image_H_ground, pitch_sigma)
-    return np.asarray(np.fmin(squared, squared.dtype.type(CHI2_2DOF_99), out=squared).mean(axis=1))
+    squared = squared_errors(products, sigma_image, sigma_ground, image_H_ground)
+    return np.asarray(np.minimum(squared, CHI2_2DOF_99, out=squared).mean(axis=1))
 
 
 def nearest_poses(image_K: Array, h: Array) -> Array:
@@ -188,179 +193,190 @@ NOISE_PRIOR_ROWS = 20.0
 MAX_NOISE_FACTOR = 4.0
 # E[x^2 | x^2 < 9.21] / 2 for a chi-squared variable with 2 degrees of freedom: 1 - 4.605 * 0.01 / 0.99.
 TRUNCATED_VARIANCE_SHARE = 0.953
-# Refinement ends when the summed squared error falls by less than this.
+# Refinement ends where the summed squared error would fall by less than this.
 MIN_LOSS_DECREASE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Errors of K homographies on N correspondences, linearized, in normalized units."""
+    """Errors of a homography on N correspondences, linearized, in normalized units."""
 
-    error: Array  # (K, 2, N): whitened errors in the image
-    squared: Array  # (K, N): squared norms of `error`; infinite behind the camera
-    slope: Array  # (K, 9, 2, N): derivatives of `error` by the nine elements of the homography
-    projected: Array  # (K, 2, N): ground positions projected into the image
-    ground: Array  # (3, K, N): covariance in the image (uu, uv, vv) of ground noise of standard deviation 1
-    # (3, K, N): cholesky factors of the inverse covariance: scale of u, scale of v, and the shear of v by u
-    whiten: Array
+    data: NormalizedCorrespondences
+    h: Array  # (3, 3): ground to image
+    projected: Array  # (2, N): ground positions projected into the image
+    scale: Array  # (N,): reciprocal depths of the ground positions; 1 behind the camera
+    spread: Array  # (2, 2, N): covariance in the image of ground noise of standard deviation 1
+    weight: Array  # (2, 2, N): inverse covariance of the errors in the image
+    pull: Array  # (2, N): the errors in the image times `weight`
+    squared: Array  # (N,): squared whitened errors; infinite behind the camera
+
+    @cached_property
+    def inliers(self) -> NDArray[np.bool_]:
+        """Whether the squared error of each row (N,) is below the gate."""
+        return self.squared < CHI2_2DOF_99
+
+    @cached_property
+    def loss(self) -> float:
+        """Sum of the squared whitened errors, each cut at `CHI2_2DOF_99`."""
+        return float(np.minimum(self.squared, CHI2_2DOF_99).sum())
+
+    @cached_property
+    def inlier_equations(self) -> tuple[Array, Array]:
+        """Normal equations of the inliers."""
+        return self.normal_equations(self.inliers)
+
+    @property
+    def bounded_weights(self) -> NDArray[np.floating[Any]]:
+        """Weights (N,) of the rows that fade with the squared error, a quarter at the gate (Geman & McClure, 1985)."""
+        return np.asarray((CHI2_2DOF_99 / (CHI2_2DOF_99 + self.squared)) ** 2)
+
+    @property
+    def slope(self) -> Array:
+        """Derivatives (9, 2, N) of `projected` by the elements of the homography."""
+        out, by_depth = np.zeros((3, 3, 2, len(self.scale))), self.data.ground * self.scale
+        out[0, :, 0] = out[1, :, 1] = by_depth
+        out[2] = -by_depth[:, None] * self.projected
+        return out.reshape(9, 2, -1)
+
+    def normal_equations(self, share: NDArray[Any]) -> tuple[Array, Array]:
+        """Sum the normal matrix (9, 9) and the right side (9,) of the homography's elements over the rows, of which `share` (N,) counts.
+
+        A row's normal matrix is the Kronecker product of two symmetric 3x3 matrices, of the image and of the ground, so that
+        one matrix product sums those of all rows.
+        """
+        projected, weight = self.projected, self.weight
+        image, across = np.empty((10, len(share))), weight[0] * projected[0] + weight[1] * projected[1]
+        image[0:4] = weight.reshape(4, -1)
+        np.negative(across, out=image[4:6])
+        image[6] = (across * projected).sum(axis=0)
+        image[7:9] = self.pull
+        image[9] = -(self.pull * projected).sum(axis=0)
+        image *= share * self.scale
+        image[:7] *= self.scale
+        sums = image @ self.data.ground_products.T
+        return sums.take(_IN_SUMS), sums[7:].take([2, 4, 5], axis=1).ravel()
+
+
+# Where the elements of a normal matrix (9, 9) lie in the sums (10, 6), by image row, ground row, image column, ground column.
+_OF_IMAGE = np.array([[0, 1, 4], [2, 3, 5], [4, 5, 6]])[:, None, :, None]
+_OF_GROUND = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])[None, :, None, :]
+_IN_SUMS = (6 * _OF_IMAGE + _OF_GROUND).reshape(9, 9)
+_ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])[:, :, None]
 
 
 def linearize(data: NormalizedCorrespondences, h: Array, warps: Array | None = None) -> Linearization:
-    """Linearize the errors of homographies (K, 3, 3), ground to image.
+    """Linearize the errors of a homography (3, 3), ground to image.
 
     `warps` (N, 3, 3) are homographies of the image applied to each correspondence on top of `h`, as a pitching camera
     has; the derivatives ignore them, since they are near the identity.
     """
-    count = len(h)
-    q = (h.reshape(-1, 3) @ data.ground).reshape(count, 3, -1)
+    q = h @ data.ground
     if warps is not None:
-        q = np.einsum("nij,kjn->kin", warps, q)
-    front = q[:, 2] > 0
-    depth = 1.0 / np.where(front, q[:, 2], 1.0)
-    projected = q[:, :2] * depth[:, None]
-    u, v = projected[:, 0], projected[:, 1]
-    a, b, c = h[:, 0, :2, None] * depth[:, None], h[:, 1, :2, None] * depth[:, None], h[:, 2, :2, None] * depth[:, None]
-    # Derivatives (K, N) of the pixel by the ground position, and the covariance that ground noise has in the image.
-    ux, uy = a[:, 0] - u * c[:, 0], a[:, 1] - u * c[:, 1]
-    vx, vy = b[:, 0] - v * c[:, 0], b[:, 1] - v * c[:, 1]
-    ground = np.empty((3, count, len(data.tick)))
-    ground[0], ground[1], ground[2] = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
-    cuu, cuv = data.sigma_ground**2 * ground[:2]
-    cuu += data.sigma_image**2
-    shear = cuv / cuu
+        q = np.einsum("nij,jn->in", warps, q)
+    front = q[2] > 0
+    scale = 1.0 / np.where(front, q[2], 1.0)
+    projected = q[:2] * scale
+    # Derivatives (2, N) of the pixel by the ground position's x and y, and the covariance that ground noise has in the image.
+    by_x, by_y = ((h[:2, :2, None] - projected[:, None] * h[2, :2, None]) * scale).swapaxes(0, 1)
+    spread = by_x[:, None] * by_x + by_y[:, None] * by_y
+    pixel, place = data.sigma_image**2, data.sigma_ground**2
+    covariance = place * spread
+    covariance[0, 0] += pixel
+    covariance[1, 1] += pixel
     # The determinant as a sum of squares has no cancellation, even where a hypothesis folds the ground to a line.
-    area = data.sigma_image**2 * (cuu + data.sigma_ground**2 * ground[2])
-    area += data.sigma_ground**4 * (ux * vy - uy * vx) ** 2
-    whiten = np.empty_like(ground)
-    np.sqrt(area, out=area)
-    np.sqrt(cuu, out=cuu)
-    wu = np.divide(1.0, cuu, out=whiten[0])
-    wv = np.divide(cuu, area, out=whiten[1])
-    whiten[2] = shear
+    area = (place * (by_x[0] * by_y[1] - by_x[1] * by_y[0])) ** 2
+    area += pixel * (covariance[0, 0] + covariance[1, 1] - pixel)
+    weight = covariance[::-1, ::-1] * _ADJUGATE_SIGNS
+    weight /= area
     error = projected - data.image
-    error[:, 1] -= shear * error[:, 0]
-    error[:, 0] *= wu
-    error[:, 1] *= wv
-    squared = error[:, 0] * error[:, 0] + error[:, 1] * error[:, 1]
+    pull = weight[0] * error[0] + weight[1] * error[1]
+    squared = (pull * error).sum(axis=0)
     squared[~front] = np.inf
-    scaled = data.ground * depth[:, None]
-    slope = np.empty((count, 9, 2, data.image.shape[1]))
-    np.multiply(scaled, wu[:, None], out=slope[:, 0:3, 0])
-    slope[:, 3:6, 0] = 0.0
-    np.multiply(slope[:, 0:3, 0], -u[:, None], out=slope[:, 6:9, 0])
-    np.multiply(scaled, wv[:, None], out=slope[:, 3:6, 1])
-    np.multiply(slope[:, 3:6, 1], -shear[:, None], out=slope[:, 0:3, 1])
-    np.multiply(slope[:, 3:6, 1], (shear * u - v)[:, None], out=slope[:, 6:9, 1])
-    return Linearization(error, squared, slope, projected, ground, whiten)
-
-
-def refine_many(data: NormalizedCorrespondences, h: Array, gates: tuple[float, ...]) -> Array:
-    """Take one Gauss-Newton step of all homographies (K, 3, 3) for each of `gates` on the squared error; none where undetermined."""
-    for gate in gates:
-        h = _homography_steps(linearize(data, h), h, gate)
-    return h
+    return Linearization(data, h, projected, scale, spread, weight, pull, squared)
 
 
 _DAMPING = 1e-14 * np.eye(9)
 
 
-def _homography_steps(linear: Linearization, h: Array, gate: float) -> Array:
-    """Take a Gauss-Newton step of each homography (K, 3, 3), over rows whose squared error is below `gate`; none where undetermined."""
-    use, count = linear.squared < gate, len(h)
-    slope = (linear.slope * use[:, None, None]).reshape(count, 9, -1)
-    normal, right = slope @ slope.swapaxes(1, 2), slope @ linear.error.reshape(count, -1, 1)
-    # The scale of a homography is free: steps are taken across it, never along it.
-    along = h.reshape(count, 9, 1) / np.linalg.norm(h, axis=(1, 2))[:, None, None]
-    size = np.trace(normal, axis1=1, axis2=2)[:, None, None] / 9
-    enough = use.sum(axis=1) >= 4
-    normal = np.where(enough[:, None, None], normal + size * (along @ along.swapaxes(1, 2) + _DAMPING), np.eye(9))
+def newton_step(
+    linear: Linearization, image_K: Array | None = None, share: NDArray[Any] | None = None
+) -> tuple[Array, float]:
+    """Take a Gauss-Newton step over the inliers, or over the rows of which `share` (N,) counts; none where they do not determine it.
+
+    Returns the homography (3, 3), and by how much the sum of the squared errors should fall. With intrinsics `image_K` (3, 3) it
+    is a step of that camera's pose.
+    """
+    h, rows = linear.h, linear.inliers if share is None else share
+    if np.count_nonzero(rows) < 4:
+        return h, 0.0
+    normal, right = linear.inlier_equations if share is None else linear.normal_equations(rows)
+    if image_K is None:
+        # The scale of a homography is free: steps are taken across it, never along it.
+        along, basis = h.reshape(9, 1) / math.sqrt(np.vdot(h, h)), None
+        normal = normal + normal.trace() / 9 * (along @ along.T + _DAMPING)
+    else:
+        basis = pose_tangent(image_K, h)
+        basis = basis / np.sqrt(np.maximum((basis * (normal @ basis)).sum(axis=0), 1e-300))
+        normal, right = basis.T @ normal @ basis + _DAMPING[:6, :6], basis.T @ right
     try:
-        step = -np.linalg.solve(normal, right)
+        step = np.linalg.solve(normal, right)
     except np.linalg.LinAlgError:
-        return h
-    moved = h.reshape(count, 9, 1) + np.where(
-        enough[:, None, None] & np.isfinite(step).all(axis=1, keepdims=True), step, 0.0
-    )
-    return np.asarray(moved / np.sqrt((moved * moved).sum(axis=1, keepdims=True))).reshape(count, 3, 3)
+        return h, 0.0
+    moved, decrease = h - (step if basis is None else basis @ step).reshape(3, 3), float(step @ right)
+    if not math.isfinite(decrease):
+        return h, 0.0
+    if image_K is None:
+        return np.asarray(moved / math.sqrt(np.vdot(moved, moved))), decrease
+    return np.asarray(nearest_poses(image_K, moved[None])[0], dtype=np.float64), decrease
 
 
-def refine(
-    data: NormalizedCorrespondences, h: Array, rounds: int, image_K: Array | None = None
-) -> tuple[Array, Linearization]:
-    """Minimize the bounded loss from `h` (3, 3); with intrinsics `image_K` (3, 3) over the poses of that camera."""
-    linear = linearize(data, h[None])
-    loss = float(np.minimum(linear.squared, CHI2_2DOF_99).sum())
+def refine(linear: Linearization, rounds: int, image_K: Array | None = None) -> Linearization:
+    """Minimize the bounded loss; with intrinsics `image_K` (3, 3) over the poses of that camera."""
     for _ in range(rounds):
-        proposed = newton_step(linear, h, image_K)
-        proposed_linear = linearize(data, proposed[None])
-        proposed_loss = float(np.minimum(proposed_linear.squared, CHI2_2DOF_99).sum())
-        if proposed_loss >= loss:
-            break
-        decrease, h, linear, loss = loss - proposed_loss, proposed, proposed_linear, proposed_loss
+        h, decrease = newton_step(linear, image_K)
         if decrease < MIN_LOSS_DECREASE:
             break
-    return h, linear
-
-
-def newton_step(
-    linear: Linearization, h: Array, image_K: Array | None = None, gate: float = CHI2_2DOF_99, k: int = 0
-) -> Array:
-    """Take a Gauss-Newton step from `h` (3, 3), the `k`-th linearized; returns `h` if the step is undetermined."""
-    if image_K is None:
-        return np.asarray(_homography_steps(linear, h[None], gate)[0])
-    use, basis = linear.squared[k] < gate, pose_tangent(image_K, h)
-    slope = (linear.slope[k] * use).reshape(9, -1)
-    normal, right = basis.T @ (slope @ slope.T) @ basis, basis.T @ (slope @ linear.error[k].ravel())
-    size = np.sqrt(np.maximum(np.diagonal(normal), 1e-300))
-    try:
-        along = np.linalg.solve(normal / size[:, None] / size + 1e-14 * np.eye(len(size)), right / size) / size
-    except np.linalg.LinAlgError:
-        return h
-    moved = h - (basis @ along).reshape(3, 3)
-    if np.count_nonzero(use) < 4 or not np.isfinite(moved).all():
-        return h
-    return np.asarray(nearest_poses(image_K, moved[None])[0], dtype=np.float64)
+        proposed = linearize(linear.data, h)
+        if proposed.loss >= linear.loss:
+            break
+        linear = proposed
+    return linear
 
 
 def scale_free_basis(h: Array) -> Array:
     """Build the orthonormal directions (9, 8) perpendicular to a homography (3, 3), whose scale is free."""
     # The reflection that takes the homography to an axis takes the other axes to its orthogonal complement (Householder).
     v = h.ravel() / np.linalg.norm(h)
-    largest = int(np.argmax(np.abs(v)))
-    v[largest] += np.sign(v[largest])
-    across = [k for k in range(9) if k != largest]
-    out = v[:, None] * (-v[across] / abs(v[largest]))
-    out[across, range(8)] += 1.0
-    return np.asarray(out)
+    largest = int(np.abs(v).argmax())
+    v[largest] += math.copysign(1.0, v[largest])
+    across = np.arange(9) != largest
+    return np.asarray(np.eye(9)[:, across] - v[:, None] * (v[across] / abs(v[largest])))
 
 
-def noise_factors(data: NormalizedCorrespondences, linear: Linearization, parameters: float = 8) -> tuple[float, float]:
+def noise_factors(linear: Linearization, parameters: float = 8) -> tuple[float, float]:
     """Estimate from the inliers by which factors the noise of pixels and of ground positions exceeds the assumed one.
 
     `parameters` is the number of fitted parameters, subtracted from the degrees of freedom.
 
     Variance components by one step of Fisher scoring of the normal likelihood, with the assumed noise as prior.
     """
-    use = linear.squared[0] < CHI2_2DOF_99
-    count = int(use.sum())
+    use, pixel, place = linear.inliers, linear.data.sigma_image**2, linear.data.sigma_ground**2
+    count = int(np.count_nonzero(use))
     if 2 * count <= parameters:
         return 1.0, 1.0
-    wu, wv, shear = (a[0, use] for a in linear.whiten)
-    error = linear.error[0][:, use]
-    # Inverse covariance, and the errors multiplied by it.
-    icc = wv * wv
-    iuv, iuu = -shear * icc, wu * wu + shear * shear * icc
-    zv = wv * error[1]
-    zu = wu * error[0] - shear * zv
-    guu, guv, gvv = linear.ground[:, 0, use] * data.sigma_ground**2
-    pixel = data.sigma_image**2
-    # Inverse covariance times the covariance of the ground noise: a 2x2 matrix for each correspondence.
-    auu, auv, avu, avv = iuu * guu + iuv * guv, iuu * guv + iuv * gvv, iuv * guu + icc * guv, iuv * guv + icc * gvv
-    score = np.array([pixel * (zu @ zu + zv @ zv), (zu * zu) @ guu + 2 * (zu * zv) @ guv + (zv * zv) @ gvv])
-    cross = float(pixel * (auu @ iuu + (auv + avu) @ iuv + avv @ icc))
-    of_pixels, of_ground = pixel**2 * (iuu @ iuu + 2 * iuv @ iuv + icc @ icc), auu @ auu + 2 * auv @ avu + avv @ avv
-    fisher = np.array([[of_pixels, cross], [cross, of_ground]])
-    score *= 2 * count / (2 * count - parameters) / TRUNCATED_VARIANCE_SHARE
-    variances = np.linalg.solve(fisher + NOISE_PRIOR_ROWS * np.eye(2), score + NOISE_PRIOR_ROWS)
-    factors = np.sqrt(np.clip(variances, MAX_NOISE_FACTOR**-2, MAX_NOISE_FACTOR**2))
-    return float(factors[0]), float(factors[1])
+    weight, pull, spread = linear.weight * use, linear.pull * use, place * linear.spread
+    # Products (2, 2, N) and (2, N) of `weight` with the covariance of the ground noise, and of that with `pull`.
+    of_ground = weight[:, :1] * spread[0] + weight[:, 1:] * spread[1]
+    spread_pull = spread[0] * pull[0] + spread[1] * pull[1]
+    # Two normal equations, each with the prior.
+    share = 2 * count / (2 * count - parameters) / TRUNCATED_VARIANCE_SHARE
+    of_pixel = share * pixel * float(np.vdot(pull, pull)) + NOISE_PRIOR_ROWS
+    of_place = share * float(np.vdot(pull, spread_pull)) + NOISE_PRIOR_ROWS
+    a = pixel**2 * float(np.vdot(weight, weight)) + NOISE_PRIOR_ROWS
+    b = pixel * float(np.vdot(weight, of_ground))
+    c = float(np.vdot(of_ground, of_ground.swapaxes(0, 1))) + NOISE_PRIOR_ROWS
+    determinant = a * c - b * b
+    variances = (c * of_pixel - b * of_place) / determinant, (a * of_place - b * of_pixel) / determinant
+    least, most = MAX_NOISE_FACTOR**-2, MAX_NOISE_FACTOR**2
+    image, ground = (math.sqrt(min(max(v, least), most)) for v in variances)
+    return image, ground

@@ -76,14 +76,18 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     noisy = data
     for k in range(ROUNDS):
         if k < 2:  # again in the second round, with the homography and the standard deviation fitted in the first
-            linear = linearize(data, h[None])
-            (wu, wv, shear), (eu, ev) = linear.whiten[:, 0], linear.projected[0] - data.image
+            linear = linearize(data, h)
+            along_v = linear.pull[1] / linear.weight[1, 1]
             # In ticks with very many correspondences an even selection votes.
             count = data.count[data.tick]
             slots = np.minimum(count, MAX_VOTERS)
             column = (np.arange(len(count)) - data.start[data.tick]) * slots // count
             table = np.full((3, len(data.start), int(slots.max())), np.nan)
-            table[:, data.tick, column] = np.stack([-(ev - shear * eu), wv, (eu * wu) ** 2])
+            table[:, data.tick, column] = [
+                -along_v,
+                np.sqrt(linear.weight[1, 1]),
+                linear.squared - along_v * linear.pull[1],
+            ]
             asked, weight, squared_u = table
             some = asked[:, :: max(asked.shape[1] // MAX_CANDIDATES, 1)]
             candidates = np.concatenate([np.zeros((len(asked), 1)), some], axis=1)
@@ -94,10 +98,10 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
             loss[np.isnan(candidates)] = np.inf
             shift = candidates[np.arange(len(asked)), np.argmin(loss, axis=1)]
             angles = replace(angles, value=np.column_stack([shift, angles.value[:, 1]]))
-        linear = linearize(noisy, h[None], angles.warps()[noisy.tick])
-        h, angles, information = _step(noisy, h, linear, angles, image_K)
+        linear = linearize(noisy, h, angles.warps()[noisy.tick])
+        h, angles, information = _step(linear, angles, image_K)
         if k >= 1:
-            noisy = noisy.scale_noise(*noise_factors(noisy, linear, 8 + 2 * len(angles.value)))
+            noisy = noisy.scale_noise(*noise_factors(linear, 8 + 2 * len(angles.value)))
         variance = 1.0 / (information + 1.0 / angles.sigma**2)
         if k == ROUNDS - 2:
             # Whether they differ from zero over the ticks by more than noise explains, as they would be without the prior, which
@@ -114,40 +118,35 @@ def fit_pitch_roll(data: NormalizedCorrespondences, h: Array, image_K: Array | N
     warps = angles.warps()
     of_rows, parameters = warps[noisy.tick], float((angles.significant * information * variance).sum())
     tick_sigmas = (np.sqrt(variance) * angles.significant)[:, :, None, None] * angles.generators
-    return RobustFit(h, noisy, linearize(noisy, h[None], of_rows), of_rows, parameters), warps, tick_sigmas
+    return RobustFit(noisy, linearize(noisy, h, of_rows), of_rows, parameters), warps, tick_sigmas
 
 
-def _step(
-    data: NormalizedCorrespondences, h: Array, linear: Linearization, angles: _Angles, image_K: Array | None
-) -> tuple[Array, _Angles, Array]:
+def _step(linear: Linearization, angles: _Angles, image_K: Array | None) -> tuple[Array, _Angles, Array]:
     """Take one Gauss-Newton step: homography (3, 3), angles, and the information (T, 2) of each tick on them."""
-    use = linear.squared[0] < CHI2_2DOF_99
-    by_h = linear.slope[0] * use
-    error = linear.error[0] * use
-    # Derivatives (2, 2, N) of the whitened errors by the two angles.
-    (u, v), (wu, wv, shear) = linear.projected[0], linear.whiten[:, 0]
+    use, h = linear.inliers, linear.h
+    # Derivatives (2, 2, N) of the projected positions by the two angles, and these times the inverse covariance of the errors.
+    (u, v), (wu, wv) = linear.projected, linear.weight * use
     by_angle = np.empty((2, 2, len(u)))
     for k, g in enumerate(angles.generators):
         dw = g[2, 0] * u + g[2, 1] * v + g[2, 2]
-        du = g[0, 0] * u + g[0, 1] * v + g[0, 2] - u * dw
-        dv = g[1, 0] * u + g[1, 1] * v + g[1, 2] - v * dw
-        by_angle[k] = du * wu, (dv - shear * du) * wv
-    by_angle = by_angle * use * angles.significant[:, None, None]
+        by_angle[k] = g[0, 0] * u + g[0, 1] * v + g[0, 2] - u * dw, g[1, 0] * u + g[1, 1] * v + g[1, 2] - v * dw
+    by_angle *= angles.significant[:, None, None]
+    weighted = by_angle[:, :1] * wu + by_angle[:, 1:] * wv
     basis = scale_free_basis(h) if image_K is None else pose_tangent(image_K, h)
-    by_h = (basis.T @ by_h.reshape(9, -1)).reshape(-1, *by_h.shape[1:])
+    by_h = (basis.T @ linear.slope.reshape(9, -1)).reshape(-1, 2, len(u))
+    normal, right = linear.inlier_equations
 
     def by_tick(a: Array, b: Array) -> Array:
         """Sum the products (T, n, m) of two sets of rows (n, 2, N), (m, 2, N) over each tick."""
         products = a[:, None, 0] * b[:, 0] + a[:, None, 1] * b[:, 1]
-        return np.asarray(np.add.reduceat(products, data.start, axis=-1).transpose(2, 0, 1))
+        return np.asarray(np.add.reduceat(products, linear.data.start, axis=-1).transpose(2, 0, 1))
 
-    own = by_tick(by_angle, by_angle) + np.diag(1.0 / angles.sigma**2)
-    shared = by_tick(by_h, by_angle)
-    pull = by_tick(by_angle, error[None])[:, :, 0] + angles.value / angles.sigma**2
+    own = by_tick(by_angle, weighted) + np.diag(1.0 / angles.sigma**2)
+    shared = by_tick(by_h, weighted)
+    pull = by_tick(by_angle, (linear.pull * use)[None])[:, :, 0] + angles.value / angles.sigma**2
     gain = shared @ np.linalg.inv(own)
-    flat = by_h.reshape(len(by_h), -1)
-    normal = flat @ flat.T - (gain @ shared.swapaxes(1, 2)).sum(axis=0)
-    right = flat @ error.ravel() - (gain @ pull[:, :, None]).sum(axis=0)[:, 0]
+    normal = basis.T @ normal @ basis - (gain @ shared.swapaxes(1, 2)).sum(axis=0)
+    right = basis.T @ right - (gain @ pull[:, :, None]).sum(axis=0)[:, 0]
     try:
         step = -np.linalg.solve(normal, right)
     except np.linalg.LinAlgError:
