@@ -48,11 +48,20 @@ MIN_SCORE, MAX_ERROR_SCORE = 0.02, 0.98
 MIN_SIDE_SIGMA_M, MAX_YAW_SIGMA_RAD = 0.03, np.pi / np.sqrt(12)
 
 
-def yaw_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
+def yaw_terms(points: NDArray[np.int64], range_m: Array, score: Array) -> Array:
     """Return 1, log(1 + points), distance in units of 10 m, and the log-odds of the score (M, 4) of boxes."""
-    range_m = np.hypot(*(boxes.center_m[:, :2] - sensor_m[:2]).T)
-    sure = log_odds_of(np.clip(boxes.score, MIN_SCORE, MAX_ERROR_SCORE))
-    return np.column_stack([np.ones(len(boxes)), np.log1p(boxes.points), range_m / 10.0, sure])
+    sure = log_odds_of(np.clip(score, MIN_SCORE, MAX_ERROR_SCORE))
+    return np.column_stack([np.ones(len(points)), np.log1p(points), range_m / 10.0, sure])
+
+
+def yaw_sigma(group: Sequence[str] | NDArray[np.str_], terms: Array) -> Array:
+    """Return the standard deviations (M,), rad, of the yaws of boxes up to half turns, by their groups (M,) and `yaw_terms` (M, 4)."""
+    weights = np.array([YAW_WEIGHTS.get(str(g), np.zeros(4)) for g in group]).reshape(-1, 4)
+    return np.asarray(np.minimum(np.exp((weights * terms).sum(axis=-1)), MAX_YAW_SIGMA_RAD))
+
+
+def _terms_of(boxes: Boxes3D, sensor_m: Array) -> Array:
+    return yaw_terms(boxes.points, np.hypot(*(boxes.center_m[:, :2] - sensor_m[:2]).T), boxes.score)
 
 
 def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
@@ -67,7 +76,7 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
     for end, sign in enumerate((-1.0, 1.0)):
         beyond = sign * sensor - half
         facing[..., end] = beyond / np.hypot(beyond, sensor[:, ::-1])
-    shared = np.broadcast_to(yaw_terms(boxes, sensor_m)[:, None, None], (len(boxes), 2, 2, 4))
+    shared = np.broadcast_to(_terms_of(boxes, sensor_m)[:, None, None], (len(boxes), 2, 2, 4))
     extent = np.broadcast_to(np.log(2 * half)[..., None], facing.shape)
     seen = [extent, np.maximum(facing, 0.0), np.maximum(-facing, 0.0)]
     return np.concatenate([shared, np.stack(seen, axis=-1)], axis=-1)
@@ -143,10 +152,9 @@ class SeenBoxes:
         """Estimate the errors of boxes (M,) that were seen from a sensor at (3,), m, map frame."""
         group = [GROUP_OF[str(c)] for c in boxes.category]
         of_sides = np.array([SIDE_WEIGHTS.get(g, SIDE_WEIGHTS["vehicle"]) for g in group]).reshape(-1, 1, 1, 7)
-        of_yaw = np.array([YAW_WEIGHTS.get(g, np.zeros(4)) for g in group]).reshape(-1, 4)
         side = np.exp((of_sides * side_terms(boxes, sensor_m)).sum(axis=-1))
-        yaw = np.exp((of_yaw * yaw_terms(boxes, sensor_m)).sum(axis=-1))
-        return cls(boxes, np.maximum(side, MIN_SIDE_SIGMA_M), np.minimum(yaw, MAX_YAW_SIGMA_RAD), sensor_m)
+        yaw = yaw_sigma(group, _terms_of(boxes, sensor_m))
+        return cls(boxes, np.maximum(side, MIN_SIDE_SIGMA_M), yaw, sensor_m)
 
     def take(self, index: NDArray[Any]) -> SeenBoxes:
         """Take the boxes at `index`, integers or a mask."""
