@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, Measurements, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import corner_correction, oriented_covariance, real_ends, rotate
@@ -89,6 +89,9 @@ MAX_LENGTH_SHARE = 0.25
 # Some bodies return few rays, and not from their ends: in random scenes two lengths were a meter too short with some 100 points, and
 # those with 150 and more mostly right. Not varied one by one.
 MIN_WHOLE_POINTS = 150
+# Of a body that returns no light, wheels, trim and what is behind windows are seen, and none of the ends. Its flank has a gap of more than
+# half its length then, others of a wheel or a door; at heights of wheels, below windows, as shares of that of the body.
+MAX_GAP_SHARE, FLANK_SHARES = 0.25, (0.25, 0.5)
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
 
@@ -116,6 +119,7 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
         & real[:, 0].all(axis=1)
         & (rows.points >= MIN_WHOLE_POINTS)
         & (np.abs(length / boxes.size_m[mine, 0] - 1) <= MAX_LENGTH_SHARE)
+        & (_largest_gaps(rows) <= MAX_GAP_SHARE * length)
     )
     # Along its length to the middle of what is observed.
     axis = np.column_stack([np.cos(rows.yaw_rad), np.sin(rows.yaw_rad)])
@@ -123,6 +127,18 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     center[mine, :2] += np.where(is_whole, toward, 0.0)[:, None] * axis
     size[mine, 0] = np.where(is_whole, length, size[mine, 0])
     return replace(boxes, center_m=center, size_m=size, yaw_rad=yaw)
+
+
+def _largest_gaps(rows: Measurements) -> Array:
+    """Return the largest distance (M,) along the length, m, between points of flanks, below windows, and between these and the ends."""
+    out = np.zeros(len(rows))
+    for k in range(len(rows)):
+        points = rows.points_of(k)
+        share = (points[:, 2] - rows.bottom_m[k]) / (rows.top_m[k] - rows.bottom_m[k])
+        flank = points[(share >= FLANK_SHARES[0]) & (share <= FLANK_SHARES[1]), :2] - rows.sensor_m[k, :2]
+        along = np.append(rotate(flank, -float(rows.yaw_rad[k]))[:, 0], [rows.low_m[k, 0], rows.high_m[k, 0]])
+        out[k] = np.diff(np.sort(along)).max()
+    return out
 
 
 # Boxes of one class with such an IoU are one object (Chen, "Vehicle-Road Cooperation", gives no value; half of what is
