@@ -89,8 +89,8 @@ MAX_LENGTH_SHARE = 0.25
 # Some bodies return few rays, and not from their ends: in random scenes two lengths were a meter too short with some 100 points, and
 # those with 150 and more mostly right. Not varied one by one.
 MIN_WHOLE_POINTS = 150
-# Of a body that returns no light, wheels, trim and what is behind windows are seen, and none of the ends. Its flank has a gap of more than
-# half its length then, others of a wheel or a door; at heights of wheels, below windows, as shares of that of the body.
+# Of a body that returns no light, wheels, sills and what is behind windows are seen, and none of the ends. Between its wheels its flank has a
+# gap of half its length, others of a wheel at most; above sills and below windows, as shares of the height.
 MAX_GAP_SHARE, FLANK_SHARES = 0.25, (0.25, 0.5)
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
@@ -130,14 +130,18 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
 
 
 def _largest_gaps(rows: Measurements) -> Array:
-    """Return the largest distance (M,) along the length, m, between points of flanks, below windows, and between these and the ends."""
+    """Return the largest distance (M,) along the length, m, between points of flanks, below windows, and between these and the ends.
+
+    0 where rays miss the flank at these heights.
+    """
     out = np.zeros(len(rows))
     for k in range(len(rows)):
         points = rows.points_of(k)
         share = (points[:, 2] - rows.bottom_m[k]) / (rows.top_m[k] - rows.bottom_m[k])
         flank = points[(share >= FLANK_SHARES[0]) & (share <= FLANK_SHARES[1]), :2] - rows.sensor_m[k, :2]
-        along = np.append(rotate(flank, -float(rows.yaw_rad[k]))[:, 0], [rows.low_m[k, 0], rows.high_m[k, 0]])
-        out[k] = np.diff(np.sort(along)).max()
+        if len(flank):
+            along = np.append(rotate(flank, -float(rows.yaw_rad[k]))[:, 0], [rows.low_m[k, 0], rows.high_m[k, 0]])
+            out[k] = np.diff(np.sort(along)).max()
     return out
 
 
