@@ -127,10 +127,12 @@ def test_traffic_alone_shows_the_pose_in_the_plane_and_the_delay(delay_s: float)
 
 def test_what_all_boxes_of_a_track_have_in_common_turns_no_pole_and_what_stands_tells_no_time() -> None:
     t_s = np.arange(0.0, 4.0, 0.2)
-    car, waits = drive((-20, 3), (10, 0), t_s), drive((-9, 12), (0, 0), t_s)
+    car = drive((-20, 3), (10, 0), t_s)
 
-    def found(seen: ObjectTrack, road: ObjectTrack) -> tuple[Array, Array]:
-        out = estimate_error(Sight(None, still(np.zeros((0, 3))), None, None, CommonObjects.of([seen], [road])))
+    def found(seen: ObjectTrack, *road: ObjectTrack) -> tuple[Array, Array]:
+        out = estimate_error(
+            Sight(None, still(np.zeros((0, 3))), None, None, CommonObjects.of([seen, *road[1:]], road))
+        )
         return out.values, np.sqrt(np.diag(out.covariance))
 
     # All boxes lie 0.1 m to one side.
@@ -143,10 +145,12 @@ def test_what_all_boxes_of_a_track_have_in_common_turns_no_pole_and_what_stands_
     values, sigma = found(car, turned)
     assert values[5] == pytest.approx(0.02, abs=0.002)
     assert sigma[5] < np.radians(0.3)
-    # Boxes of what waits jump, which is no velocity.
-    jumping = replace(waits, velocity_mps=np.tile([0.4, 0.0], (len(t_s), 1)))
-    late = replace(jumping, box=jumping.box + np.array([0.08, *[0.0] * 10]))
-    assert found(jumping, late)[1][6] == pytest.approx(0.3, abs=0.01)
+    # Boxes of what waits jump this way and that, which is no velocity.
+    jumping, other = (
+        replace(drive((-9, y), (0, 0), t_s), velocity_mps=np.tile([v, 0.0], (len(t_s), 1)))
+        for y, v in ((12, 0.8), (-9, -0.8))
+    )
+    assert found(jumping, jumping, other)[1][6] == pytest.approx(0.3, abs=0.01)
 
 
 def test_a_side_that_both_ends_see_places_a_box_whose_length_one_of_them_guesses() -> None:
