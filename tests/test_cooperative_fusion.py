@@ -278,6 +278,11 @@ def test_a_flank_that_is_seen_from_end_to_end_says_how_long_a_vehicle_is(yaw, se
     length, x = length_of(np.concatenate([seen_by, wall]))
     assert length == pytest.approx(4.5, abs=0.1)
     assert x == pytest.approx(0.0, abs=0.12)
+    # The points of wheels, of a body that gives none, are not its length.
+    flank = seen_by[(seen_by[:, 2] == 0.3) & (seen_by[:, 1] * towards[1] > 0.85)] + [0.0, 0.0, 0.2]
+    wheels = flank[np.abs(np.abs(flank[:, 0]) - 1.5) < 0.35]
+    assert length_of(np.concatenate([seen_by, flank, wall]))[0] == pytest.approx(4.5, abs=0.1)
+    assert length_of(np.concatenate([seen_by, wheels, wall]))[0] == pytest.approx(5.2)
     # With nothing behind it, it may go on; nor is it believed that a bus of 12 m ends there.
     assert length_of(seen_by)[0] == pytest.approx(5.2)
     assert length_of(np.concatenate([seen_by, wall]), "bus", 12.0)[0] == pytest.approx(12.0)

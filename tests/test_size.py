@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from worlds import apart, measured_row, rows_at, scan, standing
 
+from log2sim.agents.candidate import Timeline
 from log2sim.agents.hypotheses import explain_track
+from log2sim.agents.moving import moving_candidate
 from log2sim.agents.size import ends_of, moving_geometry, static_geometry
 from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, OtherView, Track
 from log2sim.geometry import rotation_from_rpy
@@ -321,3 +323,19 @@ def test_ends_of_many_measurements_are_those_of_each_alone_from_two_viewpoints_t
     assert together.real[[0, 2, 4], 0].tolist() == [[2, 2]] * 3
     np.testing.assert_array_equal(together.real[[1, 3]], one.real[[1, 3]])
     np.testing.assert_allclose((together.high - together.low)[[0, 2, 4], 0], CAR[0], atol=0.1)
+
+
+def test_a_slow_truck_is_laid_along_its_sides_not_along_a_way_that_errors_bend():
+    truck, count = (10.5, 2.4, 3.5), 20
+    track = measured([(9.0 + 0.2 * k, 6.0, 0.0) for k in range(count)], truck, "truck")
+    m, aside = track.measurements, 0.4 * np.sin(np.linspace(-1.5, 1.5, count))
+    boxes = {
+        "box_center_m": np.column_stack([9.0 + 0.2 * np.arange(count), 6.0 + aside, np.full(count, 1.75)]),
+        "box_size_m": np.tile(truck, (count, 1)),
+        "box_yaw_rad": np.zeros(count),
+    }
+    rows = replace(m, **boxes, center_m=np.column_stack([boxes["box_center_m"][:, :2], m.center_m[:, 2]]))
+    timeline = Timeline(T0_NS + np.arange(count) * STEP_NS, T0_NS)
+    w = moving_candidate(replace(track, measurements=rows), [None] * count, timeline, smooth=True).agent.waypoints
+    assert np.abs(w.y_m - 6.0).max() < 0.15
+    assert apart(w.yaw_rad, 0.0, np.pi).max() < np.deg2rad(4)

@@ -32,6 +32,7 @@ from log2sim.datatypes.categories import MAX_CURVATURE_1PM as ROAD_CURVATURE_1PM
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, wrap_angle
 from log2sim.perception.boxes import align_to
+from log2sim.perception.cooperative import yaw_sigma, yaw_terms
 from log2sim.tracking.forward import CENTER_SIGMA_M
 from log2sim.tracking.tracker import VELOCITY_WINDOW_S, track, velocities
 
@@ -223,7 +224,7 @@ def moving_candidate(
     for _ in range(PRELIMINARY_SMOOTHINGS):
         rough = smooth_track(t, xy, covariance=covariance + noise, at_s=t, motion=motion)
         headings = _headings(rough, group)
-        geometry = moving_geometry(track, headings, rough.velocity_mps)
+        geometry = moving_geometry(track, _body_axes(m, headings, rough.sigma_yaw_rad, group), rough.velocity_mps)
         xy, covariance = geometry.xy_m, geometry.covariance
     # The box is looked for before, after and in the gaps of its track.
     tick = track.tick.tolist()
@@ -299,6 +300,21 @@ def _headings(path: SmoothedTrack, group: str) -> Array:
         return path.yaw_rad
     offset = REAR_AXLE_SHARE[group] * TYPICAL_SIZE_M["car" if group == "vehicle" else "cyclist"][0]
     return wrap_angle(path.yaw_rad - np.arcsin(np.clip(offset * path.curvature_1pm, -0.5, 0.5)))
+
+
+def _body_axes(m: Measurements, heading_rad: Array, sigma_rad: Array, group: str) -> Array:
+    """Average the headings (n,) of a path, which have standard deviations (n,), with the axes that the sides of the body show.
+
+    A slow path is short beside the errors of its places. Laid along its direction, the ends of a long body are off sideways, which
+    bends the path further.
+    """
+    if group not in REAR_AXLE_SHARE:
+        return heading_rad
+    range_m = np.hypot(*(m.center_m - m.sensor_m)[:, :2].T)
+    sigma = yaw_sigma(np.full(len(m.t_ns), group), yaw_terms(m.points, range_m, m.score))
+    off = wrap_angle(2 * (m.yaw_rad - heading_rad)) / 2
+    shown = np.isfinite(m.box_yaw_rad) & (np.cos(off) >= MIN_AXIS_COS)
+    return heading_rad + np.where(shown, off * sigma_rad**2 / (sigma_rad**2 + sigma**2), 0.0)
 
 
 def _first_heading(track: Track) -> tuple[float | None, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import erf
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from log2sim.localization.roadside_fit import (
     detect_boxes,
     detectors_of,
     ground_below,
+    independent_parts,
     link_boxes,
     match_ground,
     match_objects,
@@ -217,13 +219,13 @@ def estimate_error(sight: Sight) -> Estimate:
 def covariance_of_poses(track: PoseTrack, view: VehicleView) -> Array:
     """Compute how far the errors of the ego's poses move a unit: the covariance (7, 7) of what it seems to lack.
 
-    The poses err for seconds, so that the mean over the ego's way errs by the root of `PARTS` less. What is turned where the ego is, at
+    The poses err for seconds, so that the mean over the ego's way errs less the longer it takes. What is turned where the ego is, at
     the middle of its sweeps, moves the site by its distance from there too.
     """
     sigma_m, sigma_rad = track.sigmas_at(view.t_ns).mean(axis=0)
     site_T_ego = adjoint_of(transform(np.eye(3), view.sensor_m.mean(axis=0)))
-    out = np.zeros((7, 7))
-    out[POSE, POSE] = site_T_ego @ np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3) @ site_T_ego.T / PARTS
+    out, count = np.zeros((7, 7)), independent_parts(float(np.ptp(view.t_ns)) / NS_PER_S)
+    out[POSE, POSE] = site_T_ego @ np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3) @ site_T_ego.T / count
     return out
 
 
@@ -277,6 +279,8 @@ def _refine(sight: Sight, start: Array, *, with_objects: bool) -> tuple[Array, A
 # What is certain is corrected if it matters: as much as agents are misplaced anyway, near the unit and 20 to 40 m away; stamps
 # by as much at city speeds.
 MIN_SHIFT_M, MIN_TURN_RAD, MIN_DELAY_S = 0.1, np.radians(0.3), 0.02
+# What is left of a delay is within that with this probability where nothing is said.
+MIN_CERTAINTY = 0.9
 # Chance explains as much in one of 100 checks of six normal variables, or of the three in the plane (chi-square), and in one of
 # 300 of one. The sigmas of poses are bounds by what points have in common: on streets with houses, estimates are within a third.
 MAX_CHANCE_CHI2, MAX_CHANCE_PLANE_CHI2, MIN_SIGMAS = 16.8, 11.3, 3.0
@@ -353,8 +357,10 @@ class Findings:
 
     @property
     def clock_verified(self) -> bool:
-        """Whether the clock is known to what matters."""
-        return self._sees_movers and bool(self.sigma[DELAY] < MIN_DELAY_S)
+        """Whether the clock is known to what matters, with what was found and is not corrected, nearly as surely as a pose is."""
+        left_s, sigma_s = self.found.values[DELAY] - self.applied[DELAY], self.sigma[DELAY] * np.sqrt(2.0)
+        likely = (erf((MIN_DELAY_S - left_s) / sigma_s) + erf((MIN_DELAY_S + left_s) / sigma_s)) / 2
+        return self._sees_movers and likely > MIN_CERTAINTY
 
     @property
     def _fits(self) -> bool:

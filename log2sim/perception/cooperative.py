@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, end_of, seen_from
+from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, Measurements, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import corner_correction, oriented_covariance, real_ends, rotate
@@ -48,11 +48,20 @@ MIN_SCORE, MAX_ERROR_SCORE = 0.02, 0.98
 MIN_SIDE_SIGMA_M, MAX_YAW_SIGMA_RAD = 0.03, np.pi / np.sqrt(12)
 
 
-def yaw_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
+def yaw_terms(points: NDArray[np.int64], range_m: Array, score: Array) -> Array:
     """Return 1, log(1 + points), distance in units of 10 m, and the log-odds of the score (M, 4) of boxes."""
-    range_m = np.hypot(*(boxes.center_m[:, :2] - sensor_m[:2]).T)
-    sure = log_odds_of(np.clip(boxes.score, MIN_SCORE, MAX_ERROR_SCORE))
-    return np.column_stack([np.ones(len(boxes)), np.log1p(boxes.points), range_m / 10.0, sure])
+    sure = log_odds_of(np.clip(score, MIN_SCORE, MAX_ERROR_SCORE))
+    return np.column_stack([np.ones(len(points)), np.log1p(points), range_m / 10.0, sure])
+
+
+def yaw_sigma(group: Sequence[str] | NDArray[np.str_], terms: Array) -> Array:
+    """Return the standard deviations (M,), rad, of the yaws of boxes up to half turns, by their groups (M,) and `yaw_terms` (M, 4)."""
+    weights = np.array([YAW_WEIGHTS.get(str(g), np.zeros(4)) for g in group]).reshape(-1, 4)
+    return np.asarray(np.minimum(np.exp((weights * terms).sum(axis=-1)), MAX_YAW_SIGMA_RAD))
+
+
+def _terms_of(boxes: Boxes3D, sensor_m: Array) -> Array:
+    return yaw_terms(boxes.points, np.hypot(*(boxes.center_m[:, :2] - sensor_m[:2]).T), boxes.score)
 
 
 def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
@@ -67,7 +76,7 @@ def side_terms(boxes: Boxes3D, sensor_m: Array) -> Array:
     for end, sign in enumerate((-1.0, 1.0)):
         beyond = sign * sensor - half
         facing[..., end] = beyond / np.hypot(beyond, sensor[:, ::-1])
-    shared = np.broadcast_to(yaw_terms(boxes, sensor_m)[:, None, None], (len(boxes), 2, 2, 4))
+    shared = np.broadcast_to(_terms_of(boxes, sensor_m)[:, None, None], (len(boxes), 2, 2, 4))
     extent = np.broadcast_to(np.log(2 * half)[..., None], facing.shape)
     seen = [extent, np.maximum(facing, 0.0), np.maximum(-facing, 0.0)]
     return np.concatenate([shared, np.stack(seen, axis=-1)], axis=-1)
@@ -80,6 +89,9 @@ MAX_LENGTH_SHARE = 0.25
 # Some bodies return few rays, and not from their ends: in random scenes two lengths were a meter too short with some 100 points, and
 # those with 150 and more mostly right. Not varied one by one.
 MIN_WHOLE_POINTS = 150
+# Of a body that returns no light, wheels, sills and what is behind windows are seen, and none of the ends. Between its wheels its flank has a
+# gap of half its length, others of a wheel at most; above sills and below windows, as shares of the height.
+MAX_GAP_SHARE, FLANK_SHARES = 0.25, (0.25, 0.5)
 # Between the sweeps of two ends, road users in towns move so far.
 MOVED_M = 0.3
 
@@ -107,6 +119,7 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
         & real[:, 0].all(axis=1)
         & (rows.points >= MIN_WHOLE_POINTS)
         & (np.abs(length / boxes.size_m[mine, 0] - 1) <= MAX_LENGTH_SHARE)
+        & (_largest_gaps(rows) <= MAX_GAP_SHARE * length)
     )
     # Along its length to the middle of what is observed.
     axis = np.column_stack([np.cos(rows.yaw_rad), np.sin(rows.yaw_rad)])
@@ -114,6 +127,22 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     center[mine, :2] += np.where(is_whole, toward, 0.0)[:, None] * axis
     size[mine, 0] = np.where(is_whole, length, size[mine, 0])
     return replace(boxes, center_m=center, size_m=size, yaw_rad=yaw)
+
+
+def _largest_gaps(rows: Measurements) -> Array:
+    """Return the largest distance (M,) along the length, m, between points of flanks, below windows, and between these and the ends.
+
+    0 where rays miss the flank at these heights.
+    """
+    out = np.zeros(len(rows))
+    for k in range(len(rows)):
+        points = rows.points_of(k)
+        share = (points[:, 2] - rows.bottom_m[k]) / (rows.top_m[k] - rows.bottom_m[k])
+        flank = points[(share >= FLANK_SHARES[0]) & (share <= FLANK_SHARES[1]), :2] - rows.sensor_m[k, :2]
+        if len(flank):
+            along = np.append(rotate(flank, -float(rows.yaw_rad[k]))[:, 0], [rows.low_m[k, 0], rows.high_m[k, 0]])
+            out[k] = np.diff(np.sort(along)).max()
+    return out
 
 
 # Boxes of one class with such an IoU are one object (Chen, "Vehicle-Road Cooperation", gives no value; half of what is
@@ -143,10 +172,9 @@ class SeenBoxes:
         """Estimate the errors of boxes (M,) that were seen from a sensor at (3,), m, map frame."""
         group = [GROUP_OF[str(c)] for c in boxes.category]
         of_sides = np.array([SIDE_WEIGHTS.get(g, SIDE_WEIGHTS["vehicle"]) for g in group]).reshape(-1, 1, 1, 7)
-        of_yaw = np.array([YAW_WEIGHTS.get(g, np.zeros(4)) for g in group]).reshape(-1, 4)
         side = np.exp((of_sides * side_terms(boxes, sensor_m)).sum(axis=-1))
-        yaw = np.exp((of_yaw * yaw_terms(boxes, sensor_m)).sum(axis=-1))
-        return cls(boxes, np.maximum(side, MIN_SIDE_SIGMA_M), np.minimum(yaw, MAX_YAW_SIGMA_RAD), sensor_m)
+        yaw = yaw_sigma(group, _terms_of(boxes, sensor_m))
+        return cls(boxes, np.maximum(side, MIN_SIDE_SIGMA_M), yaw, sensor_m)
 
     def take(self, index: NDArray[Any]) -> SeenBoxes:
         """Take the boxes at `index`, integers or a mask."""

@@ -36,7 +36,8 @@ def errors_of(boxes: Boxes3D, truth: Boxes3D, sensor: Array) -> list[Row]:
     """List the errors of the sides and yaws of the boxes that match the truth."""
     if not len(boxes) or not len(truth):
         return []
-    of_yaw, of_sides = yaw_terms(boxes, sensor), side_terms(boxes, sensor)
+    of_sides = side_terms(boxes, sensor)
+    of_yaw = yaw_terms(boxes.points, np.hypot(*(boxes.center_m[:, :2] - sensor[:2]).T), boxes.score)
     out: list[Row] = []
     found, true = rectangles(boxes), rectangles(truth)
     for k in range(len(boxes)):
