@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from log2sim.errors import ConfigError, Log2SimError, MissingExtra
+from log2sim.files.inputs import follows_links
 from log2sim.files.version import __version__
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class Sent:
     """Something that all tasks of a run need, pickled with the functions in it, which name no module; for `map_on_workers`."""
 
     content: bytes
+    follow_links: bool  # whether links of logs may leave the log's folders
     version: str = __version__
 
     @classmethod
@@ -112,7 +114,7 @@ class Sent:
         """Pickle something."""
         import cloudpickle
 
-        return cls(cloudpickle.dumps(value))
+        return cls(cloudpickle.dumps(value), follows_links())
 
     def received(self) -> Any:
         """Return it; it is read once in each process. `ConfigError` where log2sim is of another version, or files are missing."""

@@ -33,6 +33,7 @@ from log2sim.datatypes import (
 from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.cluster import Sent, count_workers, map_on_workers
+from log2sim.files.inputs import following_links
 from log2sim.files.packing import digest_of
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock, usable_threads
@@ -502,7 +503,7 @@ _WORKING = Lock()  # threads of one worker, which share detectors and clouds
 
 def observe_on_worker(run: Sent, task: Task) -> tuple[Part, StageClock, tuple[int, int, str | None]]:
     """Observe some ticks of a first pass that was sent to this process, and is made here once."""
-    with _WORKING:
+    with _WORKING, following_links(run.follow_links):
         first_pass: FirstPass = run.received()
         return first_pass.observe(task)
 
