@@ -214,9 +214,9 @@ class TrackConfig(Section):
         True, "Whether static agents exist for the whole scenario, but where the log shows their place free."
     )
     quarantine_confidence: float = setting(
-        0.25,
-        "Agents of a lower confidence stay in the file, but are left out of replays and exports. Of agents at 0.25 three of four are "
-        "wrong. Without a LiDAR most are placed wrong, which is no reason to lose them: half of it counts.",
+        0.33,
+        "Agents of a lower confidence stay in the file, but are left out of replays and exports. Of agents at 0.33 two of three are "
+        "wrong. Without a LiDAR most are placed wrong, which is no reason to lose them: a third of it counts.",
         ge=0.0,
         le=1.0,
     )

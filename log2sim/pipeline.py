@@ -150,7 +150,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         ]
         if limits.static_for_all:
             agents = extend_static(agents, ego, obstacles, timeline)
-        least = limits.quarantine_confidence / (1 if log.lidars else 2)
+        least = limits.quarantine_confidence / (1 if log.lidars else 3)
         agents = [replace(a, quarantined=a.confidence < least) for a in agents]
         # Without an ego the agents' waypoints alone hold the ticks, so all of them stay.
         agents = estimate.simplify(agents) if ego is not None else agents

@@ -138,10 +138,13 @@ def log_folder(tiny_folder: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def tiny_scenario(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scenario file reconstructed from `tiny_folder`."""
+    from plain_settings import ALL_KEPT
+
     from log2sim import Config, open_log, reconstruct
 
     path = tmp_path_factory.mktemp("scenario") / "scenario.json"
-    reconstruct(open_log(tiny_folder), Config.load(detect={"name": "labels"})).scenario.save(path)
+    config = Config.load(detect={"name": "labels"}, **ALL_KEPT)
+    reconstruct(open_log(tiny_folder), config).scenario.save(path)
     return path
 
 

@@ -6,3 +6,5 @@ from typing import Any
 
 AGENTS_ONLY = ("--set", "map.lanes=false", "--set", "appearance.colors=false", "--set", "appearance.signals=false")
 AGENTS_ALONE: dict[str, Any] = {"map": {"lanes": False}, "appearance": {"colors": False, "signals": False}}
+# In a second of sparse points a car may be too unsure to be replayed.
+ALL_KEPT: dict[str, Any] = {"track": {"quarantine_confidence": 0.0}}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import names, run
+from plain_settings import ALL_KEPT
 from worlds import tiny_log, waypoints
 
 from log2sim.config import Config
@@ -38,7 +39,7 @@ from log2sim.perception.sync import schedule_of
 from log2sim.plan import select_sensors
 
 FirstPass = tuple[BenchContext, Observations, dict[str, float]]
-LABELS = Config.load(detect={"name": "labels"})
+LABELS = Config.load(detect={"name": "labels"}, **ALL_KEPT)
 
 
 def silent(what: str, done: int, total: int) -> None:

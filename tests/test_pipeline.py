@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plain_settings import AGENTS_ALONE
+from plain_settings import AGENTS_ALONE, ALL_KEPT
 from worlds import PARKED, tiny_log
 
 from log2sim import Config, Scenario, reconstruct
@@ -18,7 +18,7 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import check, write_json
 from log2sim.report import Result
 
-LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE)
+LABELS = Config.load(detect={"name": "labels"}, **AGENTS_ALONE, **ALL_KEPT)
 
 
 def run(log: Log, **changes: Any) -> Result:
