@@ -29,15 +29,15 @@ CONNECT_TIMEOUT_S = 20
 AHEAD = 4
 
 
-def import_dask() -> tuple[Any, Any]:
-    """Return `distributed` and `dask`; raise `MissingExtra` where one of the packages that a batch needs is missing."""
+def import_dask(what: str = "log2sim batch") -> tuple[Any, Any]:
+    """Return `distributed` and `dask`; raise `MissingExtra`, which says what needs them, where a package of the extra is missing."""
     try:
         import cryptography  # noqa: F401  (for the certificates of a local cluster)
         import dask
         import distributed
         import pyarrow  # noqa: F401  (for the tables of a batch)
     except ImportError:
-        raise MissingExtra("log2sim batch", "cluster") from None
+        raise MissingExtra(what, "cluster") from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     return distributed, dask
 
@@ -50,7 +50,7 @@ def client_of(address: str) -> Iterator[Client]:
     """
     if not address.startswith(PROTOCOLS):
         raise ConfigError(f"--scheduler {address}: expected {' or '.join(PROTOCOLS)}HOST:PORT")
-    distributed, _ = import_dask()
+    distributed, _ = import_dask("--scheduler")
     try:
         client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:

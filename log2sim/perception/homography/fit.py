@@ -386,13 +386,5 @@ def validated_fit(robust: RobustFit, image_K: Array | None = None) -> Homography
     if covariance is not None:
         to_px = by_elements(m_N_ground, data.image_N_px) / size
         covariance = to_px @ covariance @ to_px.T
-    return HomographyFit(
-        True,
-        "",
-        ground_H_image / size,
-        inliers,
-        error_m,
-        condition,
-        sigma_m=float(sigma / scale),
-        covariance=covariance,
-    )
+    h, sigma_m = ground_H_image / size, float(sigma / scale)
+    return HomographyFit(True, "", h, inliers, error_m, condition, sigma_m=sigma_m, covariance=covariance)
