@@ -213,11 +213,11 @@ def extend_static(
         ticks, there = [], []
         for k in np.flatnonzero(away_m <= reach_m + np.hypot(*(high - low).T)).tolist():
             if k not in tables:
-                life = _ticks_of(moving[k], t_s)
-                tables[k] = life, AgentTable.of([moving[k]], t_s[life])
-            life, table = tables[k]
+                alive = _ticks_of(moving[k], t_s)
+                tables[k] = alive, AgentTable.of([moving[k]], t_s[alive])
+            alive, table = tables[k]
             at = np.flatnonzero(np.hypot(*(table.xy_m[0] - place[:2]).T) <= reach_m[k])
-            ticks.append(life[at])
+            ticks.append(alive[at])
             there.append(table.rectangles(0, at))
         if ticks:  # at which another is in its place
             others = np.concatenate(there)

@@ -354,9 +354,8 @@ def _estimate_size(ends: Ends, category: str, known: Array | None) -> tuple[Arra
         # The longer of the sides that were observed, with half the gaps beside them, is no less than a body's.
         most = [np.quantile(seen[whole[:, a], a], SIZE_QUANTILE) for a in range(2) if whole[:, a].any()]
         is_likely = is_likely and bool(max(most) >= body_m)
-    if (
-        category == "pedestrian"
-    ):  # short enough that a hand, a sway or an error of poses makes the points reach much farther
+    if category == "pedestrian":
+        # So short that a hand, a sway or an error of the poses makes the points reach much farther.
         least = least - np.sqrt(np.median(variance, axis=0))
     return np.clip(np.maximum(size, least), smallest, largest), is_likely
 

@@ -106,15 +106,15 @@ class Workers:
         return [a for a in self.client.scheduler_info(n_workers=-1)["workers"] if a != address]
 
 
-def connect(jobs: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:
-    """Return so many worker processes on this machine, one for each core by default, or the workers of a scheduler."""
-    return local_workers(jobs or usable_threads()) if scheduler is None else _workers_of(scheduler)
-
-
 @contextmanager
-def _workers_of(address: str) -> Iterator[Workers]:
-    with client_of(address) as client:
-        yield Workers(client, are_ours=False)
+def connect(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Workers]:
+    """Use so many worker processes on this machine, one for each core by default, or the workers of a scheduler."""
+    if scheduler is None:
+        with local_workers(jobs or usable_threads()) as workers:
+            yield workers
+    else:
+        with client_of(scheduler) as client:
+            yield Workers(client, are_ours=False)
 
 
 @contextmanager

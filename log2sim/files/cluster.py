@@ -24,8 +24,7 @@ Out = TypeVar("Out")
 
 PROTOCOLS = ("tcp://", "tls://")
 CONNECT_TIMEOUT_S = 20
-# Tasks that the scheduler knows at once, for each worker: one runs and the next ones wait there, so that none is idle while the
-# result that is next in turn takes longer.
+# Tasks submitted at once for each worker: one runs and the others wait there, so that no worker is idle while an earlier result is late.
 AHEAD = 4
 
 
@@ -83,11 +82,11 @@ def map_on_workers(
     """
     from distributed import CancelledError, KilledWorker
 
-    most, kept = AHEAD * count_workers(client), [client.scatter(value, broadcast=True, hash=False) for value in shared]
+    most, sent = AHEAD * count_workers(client), [client.scatter(value, broadcast=True, hash=False) for value in shared]
     running = deque[Any]()
     try:
         for task in tasks:
-            running.append(client.submit(work, *kept, task, pure=False))
+            running.append(client.submit(work, *sent, task, pure=False))
             if len(running) == most:
                 yield running.popleft().result()
         while running:

@@ -692,15 +692,15 @@ def _evidence_of_track(jacobian: Array, off: Array, sigma: Array, share: Array, 
     precision = share @ sigma**-2.0
     scatter = share @ (off - share @ off) ** 2
     for axis in np.flatnonzero(precision):
-        # What few boxes scatter by is hardly known: as if there were one more, with the error of a box.
+        # The scatter of few boxes is uncertain: as if there were one more box, with the error of a box.
         own = scatter[axis] + 1 / (precision[axis] * len(off)) + DRIFT[axis] ** 2
         weight = share * independent_parts(duration_s) / own
         of_common = weight @ jacobian[:, axis]
-        known = 1 / (weight.sum() + precision[axis] / COMMON_SHARE**2)
-        information += (jacobian[:, axis] * weight[:, None]).T @ jacobian[:, axis] - known * np.outer(
+        variance = 1 / (weight.sum() + precision[axis] / COMMON_SHARE**2)
+        information += (jacobian[:, axis] * weight[:, None]).T @ jacobian[:, axis] - variance * np.outer(
             of_common, of_common
         )
-        gradient += (weight * off[:, axis]) @ jacobian[:, axis] - known * (weight @ off[:, axis]) * of_common
+        gradient += (weight * off[:, axis]) @ jacobian[:, axis] - variance * (weight @ off[:, axis]) * of_common
     return Evidence(information, gradient)
 
 

@@ -408,8 +408,8 @@ class RecordWatch:
 
     def copied(self) -> RecordWatch:
         """Return a watch that goes on from here by itself."""
-        other, known = RecordWatch(self._log), {id(self._log): self._log}
-        other.cameras, other.lidars = deepcopy(self.cameras, known), deepcopy(self.lidars, known)
+        other, shared = RecordWatch(self._log), {id(self._log): self._log}
+        other.cameras, other.lidars = deepcopy(self.cameras, shared), deepcopy(self.lidars, shared)
         return other
 
     def attach(self, log: Log) -> None:

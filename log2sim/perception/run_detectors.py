@@ -94,6 +94,10 @@ class StageCache:
                 self._store.put(name, pack([name, records, self._content(records), made]))
         return made
 
+    def add(self, stages: Iterable[str]) -> None:
+        """Add stages that were known in another process of this run."""
+        self.found = [*dict.fromkeys([*self.found, *stages])]
+
     def figures(self, first_pass: FirstPassCache | None) -> dict[str, Any] | None:
         """Return what the report says: stages that were known, and ticks of the first pass; None where nothing is kept."""
         if self._store is None:

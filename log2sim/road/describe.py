@@ -66,8 +66,9 @@ def describe(
     with clock.stage("appearance"), in_background(look, jobs if plan.keeps(Stage.COLORS) else 1) as appearance:
         found = list[MapFeatures]()
         shared = min(jobs, len(parts)) if len(parts) > 1 else 1
-        told = (clock, progress) if shared == 1 else (StageClock(), lambda stage, done, total: None)
-        draw = partial(_draw, drawn, scenario, settings, records, earlier, *told)
+        # Other processes have clocks of their own, and show no progress.
+        reported = (clock, progress) if shared == 1 else (StageClock(), lambda stage, done, total: None)
+        draw = partial(_draw, drawn, scenario, settings, records, earlier, *reported)
         with nullcontext() if shared == 1 else clock.stage("pictures", progress):
             for made, known, failed in map_in_processes(draw, parts, shared):
                 found.append(made)
@@ -75,7 +76,7 @@ def describe(
                     progress("pictures", len(found), len(parts))
                 records.add({}, failed)
                 if earlier is not None:
-                    earlier.found = [*dict.fromkeys([*earlier.found, *known])]
+                    earlier.add(known)
         if parts:
             features = join_parts(parts, found).moved(lambda points_m: place_as_given(points_m, drawn, log))
         if features is not None:
@@ -83,8 +84,8 @@ def describe(
                 lanes, notes = infer_lanes(features.markings, features.borders, scenario)
                 features = replace(features, lanes=lanes, notes=(*features.notes, *notes))
         (colors, uncolored, signals, seen_lights), known = appearance()
-        if earlier is not None:  # which the process in the background did not tell
-            earlier.found = [*dict.fromkeys([*earlier.found, *known])]
+        if earlier is not None:
+            earlier.add(known)
     agents = tuple(replace(agent, color=colors.get(agent.id, agent.color)) for agent in scenario.agents)
     described = replace(scenario, map_features=features, agents=agents, signals=signals)
     colored = sum(agent.color is not None for agent in described.others)

@@ -29,9 +29,9 @@ from log2sim.plan import IMAGE_DETECTOR
 
 # Points this high above the bottom of a labeled box are its object's and no ground.
 BODY_M = 0.3
-# Of an object with fewer points no cluster is asked for. A cluster is its own with this overlap of their points.
+# Objects with fewer points do not count. A cluster is that of an object with at least this overlap (IoU) of their points.
 MIN_POINTS, MIN_OVERLAP = 20, 0.5
-# Of cells of the one and of neighbors of the other; the least points of a core point are DBSCAN's own.
+# Edge of log2sim's cells and radius of DBSCAN; least points of DBSCAN's core points.
 APART_M, CORE_POINTS = 0.4, 5
 NEAREST_LABEL_NS = 60_000_000
 PICTURES = 12
@@ -58,7 +58,7 @@ def bodies(log: Log, cloud: Cloud) -> list[Array]:
     return out
 
 
-def found(clusters: Array, objects: list[Array], rows: Array) -> tuple[int, int]:
+def count_clustered(clusters: Array, objects: list[Array], rows: Array) -> tuple[int, int]:
     """Count the objects with a cluster of their own, by labels (n,) of points `rows` (n,), and all that have enough points."""
     good = total = 0
     for mask in (of[rows] for of in objects):
@@ -95,10 +95,10 @@ def of_sweeps(path: Path) -> tuple[list[list[Any]], list[list[Any]]]:
         ground.setdefault("Patchwork++", []).append((ms, _mean(theirs[body]), _mean(theirs)))
         rows = cloud.obstacles
         (ours, _, _), ms = timed(_cluster, cloud.xyz[rows, :2], APART_M)
-        clusters.setdefault("log2sim, connected cells", []).append((ms, *found(ours, objects, rows)))
+        clusters.setdefault("log2sim, connected cells", []).append((ms, *count_clustered(ours, objects, rows)))
         points = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.xyz[rows].astype(np.float64)))
         labels, ms = timed(points.cluster_dbscan, APART_M, CORE_POINTS)
-        clusters.setdefault("Open3D, DBSCAN", []).append((ms, *found(np.array(labels), objects, rows)))
+        clusters.setdefault("Open3D, DBSCAN", []).append((ms, *count_clustered(np.array(labels), objects, rows)))
     about_ground = [
         [log.name, name, f"{np.median([r[0] for r in of]):.1f}", *(_share([r[k] for r in of]) for k in (1, 2))]
         for name, of in ground.items()

@@ -130,11 +130,11 @@ def ransac(
         hypotheses = solve_samples(data, np.concatenate(rows, axis=1), solved)
         losses = bounded_losses(scored, *sigmas, hypotheses)
         if losses.min(initial=np.inf) < best_score:
-            best_score, found = losses.min(), []
+            best_score, optimized = losses.min(), []
             for h in hypotheses[losses.argsort()[:OPTIMIZED_HYPOTHESES]]:
                 linear = linearize(part, h)
-                found.append(linearize(data, newton_step(linear, share=linear.bounded_weights)[0]))
-            linear = min(found, key=lambda of: of.loss)
+                optimized.append(linearize(data, newton_step(linear, share=linear.bounded_weights)[0]))
+            linear = min(optimized, key=lambda of: of.loss)
             if image_K is not None:
                 h = nearest_poses(image_K, linear.h[None])[0]
                 for gate in POSE_GATES:
