@@ -28,8 +28,9 @@ from log2sim.datatypes import COLOR_NAMES
 from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.road.colors import LAB_SCALE, METADATA_KEY, SIDE_PX, ColorNetwork, open_color_network
 
-WORLDS, STEPS, BATCH, RATE = 20_000, 4_500, 64, 3e-3
+WORLDS, STEPS, BATCH, RATE = 80_000, 20_000, 64, 3e-3
 PER_FILE, SHAPES_PER_FILE = 2_000, 150
+NETWORKS = 3
 TRACKS, VIEWS = 600, 4  # to calibrate with, and as many to report
 LAB_WEIGHT = 0.5
 PARTS = {"train": 0, "tune": 1, "report": 2}  # parts of the seed: other shapes, paints and lights in each
@@ -69,13 +70,31 @@ class Names(nn.Module):
         return self.head(torch.relu(self.mixed(pooled))).flatten(1)
 
 
+def developed(x: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Change tones, black level, saturation and white balance of pictures (B, 48, 48, 3): cameras process theirs in ways that no renderer knows."""
+    one = (len(x), 1, 1, 1)
+    gray = x.mean(axis=-1, keepdims=True)
+    x = np.clip(gray + np.exp(rng.normal(0, 0.2, one)) * (x - gray), 0, 1) ** np.exp(rng.normal(0, 0.2, one))
+    lift = rng.uniform(0, 0.1, one)
+    return np.clip(lift + (1 - lift) * x * np.exp(rng.normal(0, 0.05, (len(x), 1, 1, 3))), 0, 1).astype(np.float32)
+
+
+class Mean(nn.Module):
+    """Mean of networks that began with other weights: on pictures unlike those of training they err apart (Lakshminarayanan et al., NeurIPS 2017)."""
+
+    def __init__(self, networks: list[nn.Module]) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList(networks)
+
+    def forward(self, picture: Tensor) -> Tensor:
+        return torch.stack([network(picture) for network in self.networks]).mean(dim=0)
+
+
 def fit(paths: list[Path], out: Path, steps: int, seed: int) -> nn.Module:
-    """Fit the network to the pictures of some files, or go on from its checkpoint."""
+    """Fit networks to the pictures of some files, or go on from their checkpoints, and return their mean."""
     files = [np.load(path) for path in paths]
     pictures = np.concatenate([f["picture"].reshape(-1, SIDE_PX, SIDE_PX, 3) for f in files])
     name, lab = np.concatenate([f["name"] for f in files]), np.concatenate([f["lab"] for f in files])
-    torch.manual_seed(seed)
-    network = Names().to(memory_format=torch.channels_last)
 
     def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         rows = rng.integers(0, len(pictures), BATCH)
@@ -83,8 +102,8 @@ def fit(paths: list[Path], out: Path, steps: int, seed: int) -> nn.Module:
         flip = rng.random(BATCH) < 0.5
         x[flip] = x[flip, :, ::-1]
         shift = rng.integers(-3, 4, 2)
-        x = np.roll(x, shift, axis=(1, 2)) * np.exp(rng.normal(0, 0.03, (BATCH, 1, 1, 3))).astype(np.float32)
-        out = network(torch.from_numpy(np.ascontiguousarray(np.clip(x, 0, 1).transpose(0, 3, 1, 2), np.float32)))
+        x = developed(np.roll(x, shift, axis=(1, 2)), rng)
+        out = network(torch.from_numpy(np.ascontiguousarray(x.transpose(0, 3, 1, 2))))
         truth = torch.from_numpy(name[rows])
         named = nn.functional.cross_entropy(out[:, : len(COLOR_NAMES)], truth)
         away = nn.functional.smooth_l1_loss(
@@ -93,9 +112,15 @@ def fit(paths: list[Path], out: Path, steps: int, seed: int) -> nn.Module:
         right = (out[:, : len(COLOR_NAMES)].argmax(dim=1) == truth).float().mean()
         return named + LAB_WEIGHT * away, {"names": named.item(), "lab": away.item(), "right": right.item()}
 
-    mean = fitting.fit(network, step_loss, FitPlan(steps, seed, RATE, out / "colors.pt", 100))
-    network.load_state_dict(mean)
-    return network.eval()
+    networks = list[nn.Module]()
+    for k in range(NETWORKS):
+        torch.manual_seed(seed + k)
+        network = Names().to(memory_format=torch.channels_last)
+        network.load_state_dict(
+            fitting.fit(network, step_loss, FitPlan(steps, seed + k, RATE, out / f"colors-{k}.pt", 100))
+        )
+        networks.append(network)
+    return Mean(networks).eval()
 
 
 def calibrate(network: ColorNetwork, path: Path) -> tuple[float, float]:
@@ -151,7 +176,7 @@ def main(out: Path, worlds: int = WORLDS, steps: int = STEPS, seed: int = 1) -> 
     info["scale"], info["power"] = calibrate(open_color_network(path), tune)
     describe(path, info, METADATA_KEY)
     card = {
-        "seed": seed, "worlds": worlds, "steps": steps, "batch": BATCH, "rate": RATE, "torch": torch.__version__,
+        "seed": seed, "worlds": worlds, "networks": NETWORKS, "steps": steps, "batch": BATCH, "rate": RATE, "torch": torch.__version__,
         "cpu_s": round(time.process_time() - begun), "calibration": info, "simulated": report(open_color_network(path), test),
     }  # fmt: skip
     (out / "colors.json").write_text(json.dumps(card, indent=1) + "\n")

@@ -29,15 +29,22 @@ SHAPES = ("car", "car", "car", "car", "car", "car", "car", "truck", "bus")
 # browns and taupes of vehicles have a chroma from 7 (brown and beige in Axalta's reports), where the names of colors say black or gray.
 PAINTS = {
     "black": ((1, 22), (0, 5), (0, 360)), "white": ((86, 97), (0, 12), (0, 360)), "gray": ((25, 60), (0, 6), (0, 360)),
-    "silver": ((60, 80), (0, 6), (0, 360)), "red": ((14, 62), (25, 85), (-40, 45)), "blue": ((8, 68), (13, 70), (190, 318)),
+    "silver": ((60, 80), (0, 6), (0, 360)), "red": ((14, 85), (15, 85), (-45, 45)), "blue": ((8, 68), (13, 70), (190, 318)),
     "green": ((10, 90), (12, 95), (100, 190)), "yellow": ((55, 92), (42, 95), (74, 111)), "brown": ((7, 70), (7, 34), (18, 95)),
     "orange": ((42, 75), (45, 95), (45, 74)),
 }  # fmt: skip
 METALLIC = {"silver": 0.95, "gray": 0.7, "white": 0.25, "black": 0.5, "yellow": 0.2, "orange": 0.3}  # share; else 0.6
-LIGHTS = ("sun", "sun", "overcast", "shade", "dusk", "night", "studio")
-# Errors of automatic white balance, about 5 degrees of angular error (Barnard et al. 2002), of exposure half a photographic stop, as
-# standard deviations of the logarithm.
-WHITE_BALANCE_SIGMA, EXPOSURE_SIGMA = 0.08, 0.35
+LIGHTS = ("sun", "sun", "overcast", "shade", "shade", "dusk", "night", "studio")
+# Standard deviations of the logarithm: of white balance beside what follows from the light, about 4 degrees of angular error (gray world 6,
+# learned ones 2, Barron and Tsai 2017), of exposure a photographic stop: it is for the sky as much as for the street, so that it is half a stop low
+# in the mean.
+WHITE_BALANCE_SIGMA, EXPOSURE_SIGMA, EXPOSURE_MEAN = 0.06, 0.7, -0.35
+SUN_K = 5_500  # color temperature of daylight presets
+VEILING_GLARE = 0.02  # mean, of the light of all directions
+# Flakes lie nearly flat and send light back around the mirror direction, as exp(-(angle / 29 degrees)^2). With a lobe of 6.5, in relation to the
+# paint at 45 degrees, a silver has an L* of 131, 112, 68, 47 and 47 at 15, 25, 45, 75 and 110 degrees and a flop index (DuPont) of 10; that of solid
+# paints is 0, that of the strongest metallics about 15. Flakes send back at most 0.9 of the light in all.
+FLAKE_LOBE_RAD, FLAKE_LOBES, MAX_FLAKE_ALBEDO = np.radians(29.0), (1.0, 7.0), 0.9
 ROWS, COLUMNS = 48, 96  # of the light from all directions
 
 
@@ -164,7 +171,7 @@ class World:
 
     name: str
     lab: NDArray[np.float64]  # (3,): of the paint
-    metallic: float  # share of the light that flakes send back in a wide lobe
+    flakes: float  # what they send into the mirror direction, in relation to the paint at 45 degrees from it
     dirt: float
     light: str
     sky: Values  # (ROWS, COLUMNS, 3): light from all directions, from the nadir up
@@ -257,15 +264,18 @@ def draw_world(rng: np.random.Generator, name: str | None = None, light: str | N
     illuminant = (sky[above].mean(axis=0) + 0.5 * sunny + lamp) / max(
         float((sky[above].mean(axis=0) + 0.5 * sunny + lamp).mean()), 1e-4
     )
-    # Cameras correct the color of the light, that of lamps and of a low sun in part.
-    strength = rng.uniform(0.5, 1.0) if light in ("night", "dusk") else 1.0
+    # Cameras correct the color of the light whole, in part or, fixed to that of the sun, not at all: streets in the shade are bluish then.
+    strength = rng.uniform()
+    white = illuminant**-strength * tint(SUN_K) ** (strength - 1)
     lab = draw_paint(name, rng)
+    greatest = MAX_FLAKE_ALBEDO / (FLAKE_LOBE_RAD**2 * float(linear_of_lab(lab[None]).max()))
+    flakes = min(rng.uniform(*FLAKE_LOBES), greatest) if rng.random() < METALLIC.get(name, 0.6) else 0.0
     return World(
-        name, lab, rng.uniform(0.2, 0.7) if rng.random() < METALLIC.get(name, 0.6) else 0.0,
+        name, lab, flakes,
         rng.uniform(0.1, 0.5) if rng.random() < 0.2 else 0.0, light, sky, sun.astype(np.float32), toward.astype(np.float32),
         lamp.astype(np.float32) * max(up_light, 0.2), road, float(rng.random() < 0.2) * rng.uniform(0.3, 1), backdrop,
-        (illuminant**-strength * np.exp(rng.normal(0, WHITE_BALANCE_SIGMA, 3))).astype(np.float32), rng.normal(0, EXPOSURE_SIGMA), rng.uniform(0, 1),
-        rng.uniform(0.05, 0.5) if rng.random() < 0.12 else 0.0, rng.uniform(0, 0.6), rng.uniform(0.8, 1.3), bool(rng.random() < 0.5),
+        (white * np.exp(rng.normal(0, WHITE_BALANCE_SIGMA, 3))).astype(np.float32), rng.normal(EXPOSURE_MEAN, EXPOSURE_SIGMA), rng.uniform(0, 1),
+        rng.uniform(0.05, 0.5) if rng.random() < 0.12 else 0.0, rng.uniform(-0.3, 0.6), rng.uniform(0.8, 1.3), bool(rng.random() < 0.5),
     )  # fmt: skip
 
 
@@ -321,15 +331,14 @@ def draw_view(world: World, shape: Shape, rng: np.random.Generator) -> NDArray[n
         dirty = world.dirt * np.clip(1.2 - 1.3 * shape.height, 0, 1) * np.exp(_noise(rng, body.shape, 9, 0.5))
         albedo += np.clip(dirty, 0, 0.8)[..., None] * (np.array([0.11, 0.15, 0.18], np.float32) - albedo)
     color = albedo * (lit + direct)
-    if world.metallic:
-        soft = cv2.GaussianBlur(sky, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE)
-        half = world.toward_sun - view
-        half /= np.linalg.norm(half, axis=-1, keepdims=True)
-        glint = np.clip((n * half).sum(-1), 0, 1) ** 12 * 1.5
-        flakes = _look_up(soft, mirrored) + glint[..., None] * world.sun
-        # Flakes send more back towards the viewer than at flat angles.
-        share = world.metallic * (body * (0.5 + 0.9 * facing))[..., None]
-        color += share * (base * flakes - 0.8 * color)
+    if world.flakes:
+        soft = cv2.GaussianBlur(
+            sky, (0, 0), FLAKE_LOBE_RAD / np.sqrt(2) / np.pi * ROWS, borderType=cv2.BORDER_REPLICATE
+        )
+        glint = np.exp(2 / FLAKE_LOBE_RAD**2 * ((mirrored * world.toward_sun).sum(-1) - 1)) * in_sun
+        lobe = FLAKE_LOBE_RAD**2 * facing[..., None] * _look_up(soft, mirrored) + glint[..., None] * world.sun
+        at_45 = np.exp(-((np.radians(45) / FLAKE_LOBE_RAD) ** 2))
+        color += world.flakes * body[..., None] * (base * lobe - at_45 * color)
     coat = 0.045 + 0.955 * (1 - facing) ** 5
     shine = np.where(shape.gloss > 0.05, coat * np.where(shape.gloss > 0.25, 1.3, 1.0), 0.0) * (
         1 - 0.8 * min(2 * world.dirt, 1)
@@ -383,6 +392,8 @@ def _taken(picture: Values, mean_light: Values, world: World, rng: np.random.Gen
         )
     horizon = world.sky[ROWS // 2 : ROWS // 2 + 3].mean(axis=(0, 1))
     picture = picture + world.haze * (horizon - picture)
+    # Light that a lens and a windshield scatter over the whole picture, of good lenses one to three percent (ISO 9358): it tints what is black.
+    picture = picture + rng.exponential(VEILING_GLARE) * mean_light
     picture = picture * world.white
     seen = float(np.exp(np.log(np.maximum(picture.mean(axis=-1), 1e-4)).mean()))
     whole = max(float((mean_light * world.white).mean()) * 0.5, 1e-3)
