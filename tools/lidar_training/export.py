@@ -14,7 +14,7 @@ from fits.logistic import logistic_regression
 from torch import Tensor, nn
 
 from lidar_training.clouds import Example
-from lidar_training.network import GROUPS, IN_CHANNELS, BevNetwork
+from lidar_training.network import GROUPS, IN_CHANNELS, BevNetwork, Widths, widths_of
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
@@ -47,8 +47,9 @@ def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
     Weights are stored in 16 bits, half the bytes, and everything is computed in 32: activations of 8 bits are a sixth faster
     and lose up to a third of the vehicles where a LiDAR has few lines.
     """
-    network = BevNetwork()
-    network.load_state_dict(torch.load(checkpoint, weights_only=True)["mean"])
+    state = torch.load(checkpoint, weights_only=True)["mean"]
+    network = BevNetwork(widths_of({name.removesuffix(".0.weight"): value for name, value in state.items()}))
+    network.load_state_dict(state)
     axes, generator = {0: "batch", 2: "x", 3: "y"}, torch.Generator().manual_seed(0)
     checked = {"grid": torch.rand((1, IN_CHANNELS, 192, 256), generator=generator)}
     export_checked(network.eval(), path, checked, ("maps",), {"grid": axes, "maps": axes}, halved=True)
@@ -114,7 +115,7 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
             # "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0", "maps" of the head.
             name = node.output[0].split("/")[-2].rsplit(".", 1)[0] if "/" in node.output[0] else "head"
             folded[name] = [torch.from_numpy(values[k].copy()) for k in node.input[1:]]
-    network = BevNetwork().eval()
+    network = BevNetwork(widths_of({name: kernel for name, (kernel, _) in folded.items()})).eval()
     network.head.weight.data, network.head.bias.data = folded["head"]
     layers = {
         m: name for name, m in network.named_modules() if isinstance(m, nn.Sequential) and isinstance(m[0], nn.Conv2d)
@@ -135,6 +136,19 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
     for hook in hooks:
         hook.remove()
     return network
+
+
+def widened(network: BevNetwork, widths: Widths) -> BevNetwork:
+    """Make a network of greater widths that computes the same: what it had hears nothing of the new channels at first (Chen et al., ICLR 2016)."""
+    wide = BevNetwork(widths).eval()
+    state = wide.state_dict()
+    for name, value in network.state_dict().items():
+        old = tuple(slice(size) for size in value.shape)
+        if value.ndim == 4:
+            state[name][old[0]] = 0
+        state[name][old] = value
+    wide.load_state_dict(state)
+    return wide
 
 
 def blend(path: Path, other: Path, share: float) -> None:

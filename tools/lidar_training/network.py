@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,12 +29,19 @@ def conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequ
     )
 
 
+Widths = tuple[int, int, int, int]  # channels at strides of 2, 4, 8 and 16
+
+
+def widths_of(kernels: Mapping[str, Tensor]) -> Widths:
+    """Return the widths of a network by the kernels (outputs, inputs, k, k) of its layers, by name."""
+    a, b, c, d = (len(kernels[f"{name}.0"]) for name in ("stem", "down4", "down8", "down16"))
+    return a, b, c, d
+
+
 class BevNetwork(nn.Module):
     """Anchor-free detector on bird's-eye-view grids, after CenterPoint (Yin et al., CVPR 2021) and PIXOR (Yang et al., CVPR 2018)."""
 
-    def __init__(
-        self, widths: tuple[int, int, int, int] = (16, 32, 48, 64), depths: tuple[int, int, int] = (1, 2, 2)
-    ) -> None:
+    def __init__(self, widths: Widths = (16, 32, 48, 64), depths: tuple[int, int, int] = (1, 2, 2)) -> None:
         super().__init__()
         a, b, c, d = widths
         self.stem = nn.Sequential(conv(IN_CHANNELS, a, kernel=6, stride=2), conv(a, a))
