@@ -139,7 +139,7 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
 
 
 def widened(network: BevNetwork, widths: Widths) -> BevNetwork:
-    """Make a network of greater widths that computes the same: what it had hears nothing of the new channels at first (Chen et al., ICLR 2016)."""
+    """Make a wider network that computes the same: the channels that were there do not use the new ones at first (Chen et al., ICLR 2016)."""
     wide = BevNetwork(widths).eval()
     state = wide.state_dict()
     for name, value in network.state_dict().items():
