@@ -70,7 +70,7 @@ class Names(nn.Module):
         return self.head(torch.relu(self.mixed(pooled))).flatten(1)
 
 
-def developed(x: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
+def jittered(x: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
     """Change tones, black level, saturation and white balance of pictures (B, 48, 48, 3): cameras process theirs in ways that no renderer knows."""
     one = (len(x), 1, 1, 1)
     gray = x.mean(axis=-1, keepdims=True)
@@ -102,7 +102,7 @@ def fit(paths: list[Path], out: Path, steps: int, seed: int) -> nn.Module:
         flip = rng.random(BATCH) < 0.5
         x[flip] = x[flip, :, ::-1]
         shift = rng.integers(-3, 4, 2)
-        x = developed(np.roll(x, shift, axis=(1, 2)), rng)
+        x = jittered(np.roll(x, shift, axis=(1, 2)), rng)
         out = network(torch.from_numpy(np.ascontiguousarray(x.transpose(0, 3, 1, 2))))
         truth = torch.from_numpy(name[rows])
         named = nn.functional.cross_entropy(out[:, : len(COLOR_NAMES)], truth)

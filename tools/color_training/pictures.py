@@ -185,7 +185,7 @@ class World:
     exposure: float  # logarithm
     metering: float  # share of the picture in what exposure is measured by
     haze: float
-    contrast: float
+    contrast: float  # of the tone curve; below zero shadows are lifted
     saturation: float
     shoulder: bool
 
