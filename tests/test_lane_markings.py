@@ -11,6 +11,7 @@ from painted_ground import ASPHALT, GRASS, WHITE, Painter, dashes_of, line_of, o
 from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, Camera, ground_homography
+from log2sim.road.lane_course import RoadShape, find_lane_lines
 from log2sim.road.lane_picture import find_markings_in_picture
 from log2sim.road.markings import find_markings
 from log2sim.road.paint import log_odds_of_line, no_pieces
@@ -242,12 +243,21 @@ def test_dashed_lines_end_at_a_junction_and_not_at_their_own_gaps(dash_m: float,
 OFFSETS = (-5.25, -1.75, 1.75, 5.25)
 
 
-def picture() -> tuple[np.ndarray, Camera]:
-    """Photograph a straight road from 1.5 m above it, 3 deg downwards."""
-    painter = Painter((0.0, 70.0, -12.0, 12.0))
+def straight(offset_m: float) -> Array:
+    return line_of(lambda x: offset_m + 0 * x, 0, 70)
+
+
+def picture(*, base=ASPHALT, beyond=(), last: dict | None = None) -> tuple[np.ndarray, Camera]:
+    """Photograph a straight road from 1.5 m above it, 3 deg downwards.
+
+    `beyond`: offset, width and color of what else runs along it, below the lines. `last`: how the leftmost line is painted.
+    """
+    painter = Painter((0.0, 70.0, -12.0, 12.0), base=base)
+    for offset, width, color in beyond:
+        painter.lay(painter.cover([outline_of(straight(offset), width)]), color)
     for k, offset in enumerate(OFFSETS):
-        line = line_of(lambda x, o=offset: o + 0 * x, 0, 70)
-        painter.lines([line] if k in (0, 3) else dashes_of(line, 3, 6))
+        pieces = [straight(offset)] if k in (0, 3) else dashes_of(straight(offset), 3, 6)
+        painter.lines(pieces, **(last if last and k == 3 else {}))
     ground = painter.ground(lidar=False)
     pitch = np.deg2rad(3.0)
     pose = np.eye(4)
@@ -274,3 +284,43 @@ def test_a_known_camera_measures_lines_where_they_are() -> None:
     image, camera = picture()
     found = find_markings_in_picture(image, camera)
     assert np.allclose([line.offset_m for line in found.lane_lines], sorted(OFFSETS, reverse=True), atol=0.1)
+
+
+CONCRETE, YELLOW, STEEL, SEAM = (150, 152, 154), (90, 112, 125), (190, 190, 190), (125, 126, 126)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        # Darker than the concrete on its right, and beyond it a dark shoulder.
+        {"base": CONCRETE, "beyond": [(8.7, 6.7, ASPHALT)], "last": {"color": YELLOW}},
+        {"last": {"worn": 0.85}},
+        {"last": {"color": SEAM}},
+    ],
+    ids=["yellow between concrete and asphalt", "worn", "faint"],
+)
+def test_lines_that_hardly_stand_out_anywhere_are_found_along_the_course(options) -> None:
+    image, camera = picture(**options)
+    found = find_markings_in_picture(image, camera)
+    assert [line.offset_m for line in found.lane_lines] == pytest.approx(sorted(OFFSETS, reverse=True), abs=0.1)
+
+
+def test_rails_beside_the_road_and_seams_within_lanes_are_no_lane_lines() -> None:
+    beyond = [
+        (3.5, 0.12, SEAM),
+        (8.9, 6.4, GRASS),
+        (8.0, 0.15, STEEL),
+        (11.0, 0.15, STEEL),
+        (-8.9, 6.4, GRASS),
+        (-9.0, 0.15, STEEL),
+    ]
+    image, camera = picture(beyond=beyond)
+    found = find_markings_in_picture(image, camera)
+    assert [line.offset_m for line in found.lane_lines] == pytest.approx(sorted(OFFSETS, reverse=True), abs=0.1)
+
+
+def test_a_road_without_markings_has_no_lane_lines() -> None:
+    painter = Painter((0.0, 70.0, -12.0, 12.0))
+    shape, camera = RoadShape(0.0, 0.0), picture()[1]
+    ground = painter.ground(lidar=False)
+    assert find_lane_lines(ground, ground, camera, shape, [], 100.0) == []

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, Camera, apply, inverse, project, weighted_quantile
 from log2sim.road.ground_map import GroundMap, Raster
+from log2sim.road.lane_course import LaneLine, find_lane_lines, find_shape
 from log2sim.road.markings import list_markings
 from log2sim.road.pictures import Image, View, sample_at, warp_onto
 from log2sim.road.ridges import log_color
@@ -138,130 +139,6 @@ def keep_road(ground: GroundMap, camera_x_m: float, camera_y_m: float) -> Ground
     return replace(ground, alpha=np.where(wider > 0, ground.alpha, 0).astype(np.uint8))
 
 
-TOLERANCE_M, TOLERANCE_PER_M = 0.12, 0.01  # of a line's course: its own error, and that of a ground that is not flat
-SAME_LINE_M = 0.6  # double lines are one lane line
-MAX_SLOPE = 0.35  # of lines that run along the road where the camera is
-STEP_M = 0.5
-BEND_SIGMA_PER_M = 0.01  # half the curvature of a radius of 50 m; a line counts as one observation, however long it is
-MIN_WEIGHT = 0.8
-
-
-@dataclass(frozen=True, eq=False)
-class RoadShape:
-    """y = offset + slope x + bend x**2 of all lane lines, each with its own offset."""
-
-    slope: float  # `slope`, `bend`: bend in 1/m
-    bend: float
-
-    def course(self, x: Array) -> Array:
-        """Return y (N,) of the line through the origin."""
-        return np.asarray(self.slope * x + self.bend * x**2)
-
-
-@dataclass(frozen=True, eq=False)
-class LaneLine:
-    """Markings that are one line beside a lane, and its course from end to end of what can be seen."""
-
-    offset_m: float  # to the left of the camera
-    markings: tuple[Marking, ...]
-    points_m: Array  # (N, 3): beyond the markings by the course of the others
-
-
-def find_shape(markings: list[Marking], weights: Array) -> tuple[RoadShape, list[int]] | None:
-    """Find the course that most lane lines follow, by weight, and the indices of those that do.
-
-    `markings`: lane lines. `weights`: (N,): what each counts.
-    """
-    points = [_even(marking.points_m) for marking in markings]
-    best: tuple[float, RoadShape, list[int]] | None = None
-    for seed in range(len(markings)):
-        shape = _fit([points[seed]], weights[[seed]])
-        for _ in range(2):
-            member = [k for k in range(len(markings)) if _follows(points[k], shape)]
-            if not member:
-                break
-            shape = _fit([points[k] for k in member], weights[member])
-        member = [k for k in range(len(markings)) if _follows(points[k], shape)]
-        # Lines at several offsets tell more than one alone, which upright things give, too.
-        offsets = _groups([_offset(points[k], shape) for k in member])
-        score = sum(min(float(weights[[member[i] for i in group]].sum()), 1.0) for group in offsets)
-        if abs(shape.slope) <= MAX_SLOPE and member and (best is None or score > best[0]):
-            best = (score, shape, member)
-    return None if best is None or best[0] < MIN_WEIGHT else (best[1], best[2])
-
-
-def join_lines(markings: list[Marking], shape: RoadShape, near_m: float, far_m: float) -> list[LaneLine]:
-    """Join markings at one offset to lane lines, and continue these by the course of all."""
-    points = [_even(marking.points_m) for marking in markings]
-    offsets = [_offset(p, shape) for p in points]
-    lines = []
-    for group in _groups(offsets):
-        order = sorted(group, key=lambda k: points[k][:, 0].min())
-        own = np.concatenate([points[k] for k in order])
-        own = own[np.argsort(own[:, 0], kind="stable")]
-        # To both ends it goes on beside the course where it was seen last: by the median of 5 m, as single points would shift
-        # all that lies beyond.
-        x = np.arange(min(near_m, own[0, 0]), max(far_m, own[-1, 0]) + STEP_M, STEP_M)
-        beside, some = own[:, 1] - shape.course(own[:, 0]), 1 + int(5 / STEP_M)
-        first, last = float(np.median(beside[:some])), float(np.median(beside[-some:]))
-        y = shape.course(x) + np.interp(x, own[:, 0], beside, left=first, right=last)
-        course = np.column_stack([x, y, np.full(len(x), float(np.median(own[:, 2])))])
-        lines.append(LaneLine(float(np.mean([offsets[k] for k in group])), tuple(markings[k] for k in order), course))
-    return sorted(lines, key=lambda line: -line.offset_m)
-
-
-def _even(points: Array) -> Array:
-    """Points at equal steps along x."""
-    order = np.argsort(points[:, 0], kind="stable")
-    low, high = points[order[0], 0], points[order[-1], 0]
-    x = np.linspace(low, high, max(int((high - low) / STEP_M), 2))
-    return np.column_stack([x, *(np.interp(x, points[order, 0], points[order, k]) for k in (1, 2))])
-
-
-def _offset(points: Array, shape: RoadShape) -> float:
-    return float(np.median(points[:, 1] - shape.course(points[:, 0])))
-
-
-def _follows(points: Array, shape: RoadShape) -> bool:
-    beside = points[:, 1] - shape.course(points[:, 0])
-    span = float(np.ptp(points[:, 0]))
-    spread = float(np.abs(beside - np.median(beside)).max())
-    turn = abs(float(np.polyfit(points[:, 0], beside, 1)[0])) if span > 0 else np.inf
-    reach = float(points[:, 0].max())
-    return spread <= TOLERANCE_M + TOLERANCE_PER_M * reach and turn <= 0.02 + 2 * TOLERANCE_M / max(span, 1.0)
-
-
-def _groups(offsets: list[float]) -> list[list[int]]:
-    """Group indices of offsets that are near their neighbors."""
-    order = np.argsort(offsets, kind="stable")
-    groups: list[list[int]] = []
-    for k in order.tolist():
-        if groups and offsets[k] - offsets[groups[-1][-1]] <= SAME_LINE_M:
-            groups[-1].append(k)
-        else:
-            groups.append([k])
-    return groups
-
-
-def _fit(lines: list[Array], weights: Array) -> RoadShape:
-    """Fit one course to lines, each with its own offset; bends need length to be seen, or are slight."""
-    rows, right = [], []
-    for k, (points, weight) in enumerate(zip(lines, weights)):
-        x, y = points[:, 0], points[:, 1]
-        # Pixels shrink with distance, and errors grow.
-        w = np.sqrt(weight / len(x)) / (TOLERANCE_M + TOLERANCE_PER_M * x)
-        block = np.zeros((len(x), 2 + len(lines)))
-        block[:, 0], block[:, 1], block[:, 2 + k] = w * x, w * x**2, w
-        rows.append(block)
-        right.append(w * y)
-    prior = np.zeros((1, 2 + len(lines)))
-    prior[0, 1] = 1 / BEND_SIGMA_PER_M
-    rows.append(prior)
-    right.append(np.zeros(1))
-    solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    return RoadShape(float(solution[0]), float(solution[1]))
-
-
 CELL_M = 0.05
 HALF_WIDTH_M, REACH_M = 18.0, 90.0
 COARSEST_M = 3.0  # a dash is 3 m long; what is coarser along the road shows no line's begin, but where it runs
@@ -272,7 +149,7 @@ ROUNDS = 2
 MIN_LINE_M, MIN_APART_M = 8.0, 2.0
 # Rows that a line spans, as a share of the picture's height: less is too little to tell its course; more counts no more.
 SHORT_LINE, LONG_LINE = 0.015, 0.1
-NEAR_M, FAR_M = 2.0, 150.0  # to where lane lines are continued
+FAR_M = 150.0  # to where lane lines are continued
 # Of lines that do not count alone, but where others run beside them; dashes are 1 m and more.
 MIN_CONFIDENCE, MIN_DASH_M = 0.15, 1.0
 UPRIGHT_SLOPE, UPRIGHT_OFFSET_M = 0.06, 0.7
@@ -333,7 +210,8 @@ def find_markings_in_picture(
 
 def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     """Find markings by a camera's pose, and leave out lines that do not follow the course of the road."""
-    ground = _lay_out(image_bgr, camera)
+    whole = _lay_out(image_bgr, camera)
+    ground = keep_road(whole, *camera.mount_T_cam[:2, 3].tolist())
     markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M, symbols=False)
     notes = ("markings by a camera only: light streaks are harder to tell from paint",)
     found = PictureMarkings(markings, (), (), camera, ground, notes)
@@ -352,9 +230,9 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     others = tuple(m for m in markings if not m.is_lane_line)
     if shape is None:
         return replace(found, markings=others, notes=(*notes, "no lane lines seen: none run beside each other"))
-    kept, own_m = [lines[k] for k in shape[1]], camera.mount_T_cam[0, 3]
-    joined = join_lines(kept, shape[0], own_m + NEAR_M, own_m + FAR_M)
-    return replace(found, markings=(*kept, *others), lane_lines=tuple(joined))
+    kept = [lines[k] for k in shape[1]]
+    lane_lines = find_lane_lines(whole, ground, camera, shape[0], kept, FAR_M)
+    return replace(found, markings=(*kept, *others), lane_lines=tuple(lane_lines))
 
 
 def _seen_rows(found: PictureMarkings) -> float:
@@ -380,8 +258,7 @@ def _lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
     if warp is not None:
         color.reshape(-1, 3)[warp.cell] = sample_at(image_bgr, warp.u, warp.v, warp.scale)
         alpha.reshape(-1)[warp.cell] = np.rint(255 * warp.opacity)
-    ground = GroundMap(color, alpha, unknown, unknown, raster.resolution_m, raster.extent_m)
-    return keep_road(ground, float(x), float(y))
+    return GroundMap(color, alpha, unknown, unknown, raster.resolution_m, raster.extent_m)
 
 
 def _camera_towards(image_bgr: Image, point: tuple[float, float], height_m: float) -> Camera:

@@ -1,10 +1,11 @@
-"""Markings found in single pictures of TuSimple and OpenLane, without a network, against their annotations.
+"""Lane lines found in single pictures, without a network, against their annotations.
 
     python tools/bench.py lane_pictures FOLDER
 
-FOLDER holds `tusimple/image` with `tusimple/gt_binary_image`, and `openlane/lane3d/annotations` with
-`openlane/lane2d/images`; either may be missing. TuSimple's cameras are not known and are estimated from each picture;
-OpenLane's are. A pixel is right within 20 px of the other side's line, in pictures as they are annotated. The lateral error
+FOLDER holds `tusimple/image` with `tusimple/gt_binary_image`, `openlane/lane3d/annotations` with `openlane/lane2d/images`, and
+folders of `log2sim synth --scene` in `simulated`; any may be missing. The cameras are not known and are estimated from each
+picture, but OpenLane's are. Of a simulated log five pictures are taken, and the lines along the ego's way within 11 m and 80 m,
+whether or not vehicles hide them. A pixel is right within 20 px of the other side's line, in pictures as they are annotated. The lateral error
 of OpenLane's lines is that at the same distance ahead, where both have the line and the annotation is visible.
 """
 
@@ -19,13 +20,17 @@ import cv2
 import numpy as np
 from kitti.boxes import EGO_R_CAM
 
-from log2sim.geometry import Camera, apply
+from log2sim import open_log
+from log2sim.datatypes import Scenario
+from log2sim.geometry import Camera, apply, inverse, project
 from log2sim.road.lane_picture import PictureMarkings, find_markings_in_picture
 
 WITHIN_PX = 20
 DRAWN_PX = 5
 CURBS = (20, 21)  # left and right, of OpenLane's categories
 MATCH_M = 1.5
+SHOWN, WIDTH_PX = 5, 1280
+AHEAD_M, BESIDE_M, ALONG = 80.0, 11.0, 0.85
 SPANS_M = ((0.0, 40.0), (40.0, 80.0))
 # Name, picture (H, W, 3), mask (H, W) of the true lines, camera where it is known, annotations.
 Picture = tuple[str, np.ndarray, np.ndarray, Camera | None, dict]
@@ -71,6 +76,36 @@ def openlane(folder: Path) -> Iterator[Picture]:
         yield path.stem, image, true, openlane_camera(document, image.shape), document
 
 
+def simulated(folder: Path) -> Iterator[Picture]:
+    """Pictures of the first camera of simulated logs, with the mask of their lines 1280 pixels wide."""
+    for path in sorted(folder.glob("*/truth.json")):
+        log, features = open_log(path.parent), Scenario.load(path).map_features
+        name, camera = next(iter(log.cameras.items()))
+        lines = [resampled(m.points_m) for m in features.markings if m.is_lane_line] if features else []
+        own, stamps = camera.mount_T_cam[:3, 3], log.streams[name].t_ns
+        for k in np.linspace(0, len(stamps) - 1, SHOWN).astype(int).tolist():
+            ego_T_map = inverse(log.ego.at(stamps[k])[0][0])
+            masks = []
+            for line in lines:
+                points = apply(ego_T_map, line)
+                along = np.gradient(points[:, :2], axis=0)
+                chosen = np.abs(along[:, 0]) > ALONG * np.linalg.norm(along, axis=1)
+                chosen &= (points[:, 0] > own[0] + 2) & (points[:, 0] < AHEAD_M) & (np.abs(points[:, 1]) < BESIDE_M)
+                uv = project(camera, apply(inverse(camera.mount_T_cam), points))[0]
+                masks.append(np.where(chosen[:, None], uv, np.nan) * WIDTH_PX / camera.width_px)
+            image = log.streams[name].read(k)
+            true = draw_lines((round(image.shape[0] * WIDTH_PX / camera.width_px), WIDTH_PX), masks)
+            if true.any():
+                yield f"{path.parent.name} {k}", image, true, None, {}
+
+
+def resampled(points_m: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of a line at steps of half a meter."""
+    s = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
+    at = np.arange(0, s[-1], 0.5) if s[-1] > 1 else s
+    return np.column_stack([np.interp(at, s, column) for column in points_m.T])
+
+
 def openlane_camera(document: dict, shape: tuple[int, ...]) -> Camera:
     """Make the camera of an annotation, whose extrinsic is the pose of the frame x forward, y left, z up; it looks along z."""
     pose = np.array(document["extrinsic"], np.float64)
@@ -103,17 +138,19 @@ def lateral_errors(document: dict, camera: Camera, found: PictureMarkings) -> li
 
 
 def main(folder: Path) -> None:
-    """Print the scores of each picture, and the mean of each data set."""
-    for data_set in (tusimple, openlane):
+    """Print the scores of each picture, and the means of each data set."""
+    for data_set in (tusimple, openlane, simulated):
         name, scores = data_set.__name__, []
         for stem, image, true, camera, document in data_set(folder / name):
             begin = time.perf_counter()
             found = find_markings_in_picture(image, camera)
             more = [f"{len(found.lane_lines)} lines, {time.perf_counter() - begin:.1f} s"]
-            drawn = draw_lines(image.shape, [found.project(line.points_m) for line in found.lane_lines])
+            scale = true.shape[1] / image.shape[1]
+            drawn = draw_lines(true.shape, [found.project(line.points_m) * scale for line in found.lane_lines])
             precision, recall, f1 = score_masks(drawn, true)
             more += lateral_errors(document, camera, found) if camera is not None else []
             print(f"{name} {stem}: precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f}; {'; '.join(more)}")
-            scores.append(f1)
+            scores.append((precision, recall, f1))
         if scores:
-            print(f"{name}: mean F1 {np.mean(scores):.3f} of {len(scores)} pictures")
+            p, r, f = np.mean(scores, axis=0)
+            print(f"{name}: means of {len(scores)} pictures: precision {p:.3f}, recall {r:.3f}, F1 {f:.3f}")
