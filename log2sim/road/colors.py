@@ -28,7 +28,7 @@ Image = NDArray[np.uint8]
 
 FILE = Path(__file__).with_name("weights") / "colors.onnx"
 METADATA_KEY = "log2sim.colors"
-MAX_BYTES = 1024**2
+MAX_BYTES = 4 * 1024**2
 SIDE_PX = 48  # of the picture that the network sees
 # Sides of what it sees relative to those of the vehicle's box: the road and what is beside tell the light.
 CONTEXT = 1.3
