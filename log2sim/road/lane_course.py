@@ -129,7 +129,8 @@ HALF_PAINT, ROAD_FROM, ROAD_TO = (0.05, 0.5), (0.15, 1.2), (0.4, 3.0)
 # noise of their logarithms.
 MIN_NOISE = (0.03, 0.01)
 FROM_SIGMAS, TO_SIGMAS = 1.0, 4.0  # a contrast counts nothing up to the one, and not more than the other
-MIN_SAMPLES, FULL_SAMPLES = 40, 60
+MIN_SAMPLES, FULL_SAMPLES, MOST_SAMPLES = 40, 60, 1000
+MIN_HEIGHT_M = 0.5
 # Texture stands out everywhere around; a line by more than so many times as much.
 AROUND_M, TIMES_AROUND = 3.0, 4.0
 MIN_RESPONSE = 0.1  # sigmas in the mean of all samples: a few dashes in a hundred samples
@@ -156,10 +157,11 @@ class _Straightened:
     is_road: Array  # (N, M): whether it looks like the road in front of the camera; NaN where nothing was seen
 
 
-def straighten(ground: GroundMap, road: GroundMap, camera: Camera, shape: RoadShape) -> _Straightened:
+def _straighten(ground: GroundMap, road: GroundMap, camera: Camera, shape: RoadShape) -> _Straightened:
     """Sample the ground beside the course of its lines; `road` is the same map without what is no road."""
     focal_px, (x0, _, height_m) = camera.K[0, 0], camera.mount_T_cam[:3, 3]
-    step = ROW_SHARE * camera.height_px / (focal_px * height_m)
+    # Cameras with a very long focal length have no more samples than that.
+    step = max(ROW_SHARE * camera.height_px / (focal_px * max(height_m, MIN_HEIGHT_M)), 1 / NEAREST_M / MOST_SAMPLES)
     ahead = 1 / np.arange(1 / FARTHEST_M, 1 / NEAREST_M, step)
     across = np.arange(-SIDE_M, SIDE_M + ACROSS_M / 2, ACROSS_M)
     x = np.broadcast_to((ahead + x0)[:, None], (len(ahead), len(across)))
@@ -180,7 +182,7 @@ def find_lane_lines(
     Worn paint, dashes far away and yellow lines on concrete stand out little at any one place; all along the course they add
     up. Of the places where something does, those are taken that together are likeliest: lanes lie between them.
     """
-    flat = straighten(ground, road, camera, shape)
+    flat = _straighten(ground, road, camera, shape)
     lines = _candidates(flat, camera, shape, far_m)
     own_x = camera.mount_T_cam[0, 3]
     offsets = [_offset(_even(marking.points_m), shape) for marking in markings]
