@@ -312,7 +312,7 @@ def test_rails_beside_the_road_and_seams_within_lanes_are_no_lane_lines() -> Non
         (8.0, 0.15, STEEL),
         (11.0, 0.15, STEEL),
         (-8.9, 6.4, GRASS),
-        (-9.0, 0.15, STEEL),
+        (-7.4, 0.15, STEEL),
     ]
     image, camera = picture(beyond=beyond)
     found = find_markings_in_picture(image, camera)
