@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Marking, RoadBorder
-from log2sim.geometry import Array, Camera, apply, inverse, project, weighted_quantile
+from log2sim.geometry import Array, Camera, apply, inverse, project
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.lane_course import LaneLine, find_lane_lines, find_shape
 from log2sim.road.markings import list_markings
@@ -145,15 +145,11 @@ COARSEST_M = 3.0  # a dash is 3 m long; what is coarser along the road shows no 
 # Behind the windshield of cars cameras are 1.2 m to 1.6 m above the road; widths scale with it.
 CAMERA_HEIGHT_M = 1.5
 HORIZONTAL_FIELD_RAD = np.deg2rad(60)  # dashboard cameras: 50 to 70 deg; lengths along the road scale with its tangent
-ROUNDS = 2
-MIN_LINE_M, MIN_APART_M = 8.0, 2.0
 # Rows that a line spans, as a share of the picture's height: less is too little to tell its course; more counts no more.
 SHORT_LINE, LONG_LINE = 0.015, 0.1
 FAR_M = 150.0  # to where lane lines are continued
 # Of lines that do not count alone, but where others run beside them; dashes are 1 m and more.
 MIN_CONFIDENCE, MIN_DASH_M = 0.15, 1.0
-UPRIGHT_SLOPE, UPRIGHT_OFFSET_M = 0.06, 0.7
-MAX_PITCH_STEP_RAD = np.deg2rad(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +179,6 @@ def find_markings_in_picture(
     above the road, where there is no camera.
 
     Returns PictureMarkings: without markings where no lines meet.
-
-    Where the direction is estimated, markings are found again after the horizon is corrected so that lane lines stay at one
-    distance from each other.
     """
     if camera is not None:
         return _find(image_bgr, camera)
@@ -195,14 +188,6 @@ def find_markings_in_picture(
         note = "no markings seen: no lines meet, so the horizon of the road is unknown"
         return PictureMarkings((), (), (), nowhere, _lay_out(image_bgr, nowhere), (note,))
     found = _find(image_bgr, _camera_towards(image_bgr, point, height_m))
-    for _ in range(ROUNDS):
-        corrected = _make_parallel(found, image_bgr, height_m)
-        if corrected is None:
-            break
-        again = _find(image_bgr, corrected)
-        if _seen_rows(again) < _seen_rows(found):
-            break
-        found = again
     field = f"{np.rad2deg(HORIZONTAL_FIELD_RAD):.0f} deg"
     assumed = f"camera: {height_m:g} m above the road and a field of view of {field} are assumed"
     return replace(found, notes=(*found.notes, assumed))
@@ -218,12 +203,8 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     lines, shares = [], []
     for m in markings:
         if m.is_lane_line:
-            x, y = (m.points_m[:, :2] - camera.mount_T_cam[:2, 3]).T
-            slope, offset = np.polyfit(x, y, 1)
             share = _visible(found, m) * m.confidence / (LONG_LINE * camera.height_px)
-            # Upright things that are laid out flat point to below the camera, but not along the road.
-            upright = abs(slope) > UPRIGHT_SLOPE and abs(offset) < UPRIGHT_OFFSET_M
-            if not upright and share >= SHORT_LINE / LONG_LINE:
+            if share >= SHORT_LINE / LONG_LINE:
                 lines.append(m)
                 shares.append(share)
     shape = find_shape(lines, np.array(shares))
@@ -233,11 +214,6 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     kept = [lines[k] for k in shape[1]]
     lane_lines = find_lane_lines(whole, ground, camera, shape[0], kept, FAR_M)
     return replace(found, markings=(*kept, *others), lane_lines=tuple(lane_lines))
-
-
-def _seen_rows(found: PictureMarkings) -> float:
-    """Sum the rows of the picture that lane lines span, by confidence."""
-    return sum(_visible(found, m) * m.confidence for line in found.lane_lines for m in line.markings)
 
 
 def _visible(found: PictureMarkings, marking: Marking) -> float:
@@ -274,35 +250,3 @@ def _camera_towards(image_bgr: Image, point: tuple[float, float], height_m: floa
     pose[:3, :3] = np.stack([forward, np.cross(up, forward), up])
     pose[2, 3] = height_m
     return Camera("picture", width, height, K, "ego", pose)
-
-
-def _make_parallel(found: PictureMarkings, image_bgr: Image, height_m: float) -> Camera | None:
-    """Correct the horizon so that lane lines keep their distances; None where there are no two, or nothing changes.
-
-    A row that is wrong by d pixels adds d / (f h) to 1 / x, with focal length f and height h, and leaves y / x as it is:
-    the line y = a + b x becomes y = a + (b + a d / (f h)) x. So b grows by a line with a.
-    """
-    camera = found.camera
-    rows = []  # offset and slope of lines where they pass the camera, and their weights
-    for x, y in (m.points_m[:, :2].T for m in found.markings if m.is_lane_line):
-        span = float(np.ptp(x))
-        if span >= max(MIN_LINE_M, 3 * np.ptp(y)):
-            # A bend at least as long as the line reaches beyond it would be uncertain.
-            fit = np.polyfit(x, y, 2 if span > 25 and x.min() < 15 else 1)
-            rows.append((float(fit[-1]), float(fit[-2]), span))
-    if len(rows) < 2:
-        return None
-    a, b, w = np.array(rows).T
-    if np.ptp(a) < MIN_APART_M:
-        return None
-    # The line through most of them: weighted medians of pairs (Theil and Sen).
-    i, j = np.triu_indices(len(a), 1)
-    apart = np.abs(a[i] - a[j]) >= MIN_APART_M
-    i, j = i[apart], j[apart]
-    rate = weighted_quantile((b[i] - b[j]) / (a[i] - a[j]), w[i] * w[j] * np.abs(a[i] - a[j]), 0.5)
-    level = weighted_quantile(b - rate * a, w, 0.5)
-    focal = camera.K[0, 0]
-    forward = camera.K @ np.linalg.inv(camera.mount_T_cam[:3, :3]) @ np.array([1.0, level, 0.0])
-    limit = MAX_PITCH_STEP_RAD * focal
-    u, v = forward[:2] / forward[2]
-    return _camera_towards(image_bgr, (float(u), float(v - np.clip(rate * focal * height_m, -limit, limit))), height_m)
