@@ -10,7 +10,7 @@ import pytest
 from painted_ground import ASPHALT, GRASS, WHITE, Painter, dashes_of, line_of, outline_of
 from scipy.spatial import cKDTree
 
-from log2sim.geometry import Array, Camera, ground_homography
+from log2sim.geometry import Array, Camera, apply, ground_homography, inverse, project
 from log2sim.road.lane_course import RoadShape, find_lane_lines
 from log2sim.road.lane_picture import find_markings_in_picture
 from log2sim.road.markings import find_markings
@@ -286,6 +286,18 @@ def test_a_known_camera_measures_lines_where_they_are() -> None:
     assert np.allclose([line.offset_m for line in found.lane_lines], sorted(OFFSETS, reverse=True), atol=0.1)
 
 
+def test_an_unknown_camera_is_estimated_from_where_lines_meet() -> None:
+    image, camera = picture()
+    found = find_markings_in_picture(image)
+    for line, offset in zip(found.lane_lines, sorted(OFFSETS, reverse=True), strict=True):
+        truth = np.column_stack([straight(offset), np.zeros(281)])[32:]
+        u, v = project(camera, apply(inverse(camera.mount_T_cam), truth))[0].T
+        own = found.project(line.points_m)
+        own = own[np.isfinite(own).all(axis=1)]
+        seen = (u > 0) & (u < 1280)
+        assert np.abs(np.interp(v[seen], own[::-1, 1], own[::-1, 0]) - u[seen]).max() < 15
+
+
 CONCRETE, YELLOW, STEEL, SEAM = (150, 152, 154), (90, 112, 125), (190, 190, 190), (125, 126, 126)
 
 
@@ -306,14 +318,9 @@ def test_lines_that_hardly_stand_out_anywhere_are_found_along_the_course(options
 
 
 def test_rails_beside_the_road_and_seams_within_lanes_are_no_lane_lines() -> None:
-    beyond = [
-        (3.5, 0.12, SEAM),
-        (8.9, 6.4, GRASS),
-        (8.0, 0.15, STEEL),
-        (11.0, 0.15, STEEL),
-        (-8.9, 6.4, GRASS),
-        (-7.4, 0.15, STEEL),
-    ]
+    beyond = [(3.5, 0.12, SEAM)]
+    for side in (-1, 1):
+        beyond += [(8.9 * side, 6.4, GRASS), (7.4 * side, 0.15, STEEL)]
     image, camera = picture(beyond=beyond)
     found = find_markings_in_picture(image, camera)
     assert [line.offset_m for line in found.lane_lines] == pytest.approx(sorted(OFFSETS, reverse=True), abs=0.1)
