@@ -294,8 +294,8 @@ def test_an_unknown_camera_is_estimated_from_where_lines_meet() -> None:
         u, v = project(camera, apply(inverse(camera.mount_T_cam), truth))[0].T
         own = found.project(line.points_m)
         own = own[np.isfinite(own).all(axis=1)]
-        seen = (u > 0) & (u < 1280)
-        assert np.abs(np.interp(v[seen], own[::-1, 1], own[::-1, 0]) - u[seen]).max() < 15
+        visible = (u > 0) & (u < 1280)
+        assert np.abs(np.interp(v[visible], own[::-1, 1], own[::-1, 0]) - u[visible]).max() < 15
 
 
 CONCRETE, YELLOW, STEEL, SEAM = (150, 152, 154), (90, 112, 125), (190, 190, 190), (125, 126, 126)
@@ -311,13 +311,13 @@ CONCRETE, YELLOW, STEEL, SEAM = (150, 152, 154), (90, 112, 125), (190, 190, 190)
     ],
     ids=["yellow between concrete and asphalt", "worn", "faint"],
 )
-def test_lines_that_hardly_stand_out_anywhere_are_found_along_the_course(options) -> None:
+def test_lines_of_little_contrast_are_detected_along_the_course(options) -> None:
     image, camera = picture(**options)
     found = find_markings_in_picture(image, camera)
     assert [line.offset_m for line in found.lane_lines] == pytest.approx(sorted(OFFSETS, reverse=True), abs=0.1)
 
 
-def test_rails_beside_the_road_and_seams_within_lanes_are_no_lane_lines() -> None:
+def test_rails_off_the_road_and_seams_within_lanes_are_no_lane_lines() -> None:
     beyond = [(3.5, 0.12, SEAM)]
     for side in (-1, 1):
         beyond += [(8.9 * side, 6.4, GRASS), (7.4 * side, 0.15, STEEL)]

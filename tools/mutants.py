@@ -60,7 +60,7 @@ MUTANTS = (
     ("shifts to the side", "edit/edits.py", "y_m=w.y_m + offset * np.cos(yaw)", "y_m=w.y_m - offset * np.cos(yaw)", "edit"),
     ("hypotheses are not counted", "agents/hypotheses.py", "- np.log(count))", ")", "hypotheses"),
     ("yellow lines by brightness alone", "road/lane_course.py", "for values in (flat.paint, flat.yellow)", "for values in (flat.paint, flat.paint)", "lane_markings"),
-    ("lanes beside the road", "road/lane_course.py", "and _is_road(flat, line.offset_m, left.offset_m)", "", "lane_markings"),
+    ("lanes off the road", "road/lane_course.py", "and _is_road(flat, line.offset_m, left.offset_m)", "", "lane_markings"),
     ("lit lamps", "road/signals.py", "log[k] += 0.0 if", "log[k] += 0.0 if True or", "traffic_lights"),
     ("points beyond a gap of time", "evaluation/metrics/comparison.py", "<= MAX_TRUTH_GAP_S) & table", "<= 2 * MAX_TRUTH_GAP_S) & table", "metrics_evaluate"),
     ("boxes between labels", "evaluation/detection/truth.py", "stamps[partner] - stamps[nearest]", "stamps[partner] + stamps[nearest]", "detection_files"),

@@ -8,12 +8,16 @@
     python tools/train_lidar.py vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
     python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
 
-The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close beside the sensor's car, end-on and at
+The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close to the sensor's car, end-on and at
 walls, and are means with what they went on from:
 
     python tools/train_lidar.py vehicle B --scenes 6000 --steps 15000 --seed 3 --start A.onnx --blend A.onnx --share 0.5
     python tools/train_lidar.py vehicle C --scenes 6000 --steps 12000 --seed 4 --start B/vehicle.onnx --blend A.onnx --share 0.25
     python tools/train_lidar.py vehicle D --scenes 2500 --steps 5000 --seed 5 --start C/vehicle.onnx --blend C/vehicle.onnx --share 0.25
+
+and then, as a wider network (`WIDTHS`; 16, 32, 48 and 64 channels until then) that computed the same at first:
+
+    python tools/train_lidar.py vehicle E --scenes 8000 --steps 30000 --seed 31 --start D/vehicle.onnx --examples 500
 
 Those of `roadside` went on likewise, not averaged: 3,000 scenes and 9,000 steps (seed 3), 3,000 and 6,000 (seed 4), 5,000 and 10,000 (seed 13);
 then 16,000 and 30,000 (seed 23) of a wider network, which computed the same at first.
@@ -76,8 +80,7 @@ WARM_UP_STEPS = 100
 START_BATCHES, START_RATE = 4, 1.5e-3
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
 CELLS = {"vehicle": 256, "roadside": 192}
-# Wider where strides are long and cells few: a vehicle's sweep takes a fifth longer with 80 and 112 than with 48 and 64. The grid of the roadside sensor is
-# small besides.
+# Wider at long strides, where cells are few: a vehicle's sweep takes a fifth longer with 80 and 112 channels than with 48 and 64.
 WIDTHS: dict[str, Widths] = {"vehicle": (16, 32, 80, 112), "roadside": (16, 48, 80, 112)}
 CELL_M = {"vehicle": 0.25, "roadside": 0.1875}
 # Largest distance of a grid's middle from the sensor along an axis: with half a grid, as far as the network is to look.

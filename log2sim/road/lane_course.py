@@ -38,9 +38,9 @@ class LaneLine:
     """A line beside a lane, along the course of the road."""
 
     offset_m: float  # to the left of the camera
-    log_odds: float  # that it is there, as far as lines were compared with each other
-    markings: tuple[Marking, ...]  # what was seen of it piece by piece; may be none
-    points_m: Array  # (N, 3): from the camera on, beyond what was seen by the course of all
+    log_odds: float  # that it is a lane line; not calibrated
+    markings: tuple[Marking, ...]  # those of its pieces that were detected one by one; may be none
+    points_m: Array  # (N, 3): from the camera on, continued along the course
 
 
 def find_shape(markings: list[Marking], weights: Array) -> tuple[RoadShape, list[int]] | None:
@@ -121,29 +121,29 @@ def _fit(lines: list[Array], weights: Array) -> RoadShape:
 # Across the course, m.
 ACROSS_M, SIDE_M = 0.05, 14.0
 NEAREST_M, FARTHEST_M = 3.0, 70.0  # from the camera, where lines are looked for
-# Of the height of the picture, from one sample along the course to the next: what is near counts by its pixels.
+# Of the height of the picture: from one sample along the course to the next, so that near paint counts by its pixels.
 ROW_SHARE = 1 / 300
-# Paint and, on either side, the road beside it: m, and far away at least so many pixels.
+# Half the width of paint; from where and to where on either side of it contrast is measured: m, and at least so many pixels.
 HALF_PAINT, ROAD_FROM, ROAD_TO = (0.05, 0.5), (0.15, 1.2), (0.4, 3.0)
-# Brightness with yellowness, and yellowness alone: a yellow line between concrete and asphalt is not brighter than both. Least
-# noise of their logarithms.
+# Least noise of logarithms: of brightness plus yellowness, and of yellowness alone, as a yellow line between concrete and
+# asphalt is not brighter than both.
 MIN_NOISE = (0.03, 0.01)
-FROM_SIGMAS, TO_SIGMAS = 1.0, 4.0  # a contrast counts nothing up to the one, and not more than the other
-MIN_SAMPLES, FULL_SAMPLES, MOST_SAMPLES = 40, 60, 1000
-MIN_HEIGHT_M = 0.5
-# Texture stands out everywhere around; a line by more than so many times as much.
+FROM_SIGMAS, TO_SIGMAS = 1.0, 4.0  # contrast below the first counts nothing, above the second no more
+# An offset needs so many visible samples; with fewer than the second it counts less; the last bounds memory.
+MIN_SAMPLES, FULL_SAMPLES, MAX_SAMPLES = 40, 60, 1000
+MIN_HEIGHT_M = 0.5  # of the camera
+# Texture has as much contrast at all offsets around; a line has more than so many times their median.
 AROUND_M, TIMES_AROUND = 3.0, 4.0
-MIN_RESPONSE = 0.1  # sigmas in the mean of all samples: a few dashes in a hundred samples
-MIN_YELLOW = 0.06  # logarithm: yellow paint has two thirds more, worn and blurred
-# Log-odds that are added where pieces of paint were found, too, and those of a line that only they show.
+MIN_RESPONSE = 0.1  # sigmas, mean of all samples: full contrast in one of thirty
+MIN_YELLOW = 0.06  # logarithm; fresh paint has 0.5 and more, worn, blurred and far away a tenth of it
+# Log-odds that are added where pieces of paint were detected, too, and those of a line that has nothing else.
 ALSO_IN_PIECES, ONLY_IN_PIECES = 1.0, 0.7
 # Lanes are 2.5 to 3.75 m wide, where lengths are known to a fifth.
 LANE_M = (2.0, 4.6)
-NO_NEIGHBOR = -0.5  # log-odds of a line with a lane's width of road to no other
-# Between lines of one road there is road: in this share of the samples it fills most of the way from one to the other.
-MIN_ROAD, MOST = 0.3, 0.8
-ROAD_WITHIN_M = 40.0
-DRIFT_SIGMA_M, OFF_M = 0.2, 0.15  # of a line from the course at 30 m; distance at which a sample counts half
+NO_NEIGHBOR = -0.5  # log-odds of a line that is farther than that from the next one
+# Lines of one road have road between them: within this distance, in this share of the samples, over most of the width.
+ROAD_WITHIN_M, MIN_ROAD, MOST = 40.0, 0.3, 0.8
+DRIFT_SIGMA_M, OFF_M = 0.2, 0.15  # of a line from the course at 30 m; residual at which a sample counts half
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,23 +152,22 @@ class _Straightened:
 
     ahead_m: Array
     across_m: Array
-    paint: Array  # (N, M): see `Samples`; NaN where nothing was seen
+    paint: Array  # (N, M): see `Samples`; NaN where the ground is not visible
     yellow: Array
-    is_road: Array  # (N, M): whether it looks like the road in front of the camera; NaN where nothing was seen
+    is_road: Array  # (N, M): whether it has the color of the road in front of the camera; NaN where not visible
 
 
 def _straighten(ground: GroundMap, road: GroundMap, camera: Camera, shape: RoadShape) -> _Straightened:
-    """Sample the ground beside the course of its lines; `road` is the same map without what is no road."""
+    """Sample the ground on both sides of the course of its lines; `road` is the same map without what is no road."""
     focal_px, (x0, _, height_m) = camera.K[0, 0], camera.mount_T_cam[:3, 3]
-    # Cameras with a very long focal length have no more samples than that.
-    step = max(ROW_SHARE * camera.height_px / (focal_px * max(height_m, MIN_HEIGHT_M)), 1 / NEAREST_M / MOST_SAMPLES)
+    step = max(ROW_SHARE * camera.height_px / (focal_px * max(height_m, MIN_HEIGHT_M)), 1 / NEAREST_M / MAX_SAMPLES)
     ahead = 1 / np.arange(1 / FARTHEST_M, 1 / NEAREST_M, step)
     across = np.arange(-SIDE_M, SIDE_M + ACROSS_M / 2, ACROSS_M)
     x = np.broadcast_to((ahead + x0)[:, None], (len(ahead), len(across)))
     y = shape.course(ahead + x0)[:, None] + across
-    seen = sample(ground, x, y)
-    is_road = np.where(np.isnan(seen.bright), np.nan, np.isfinite(sample(road, x, y).bright))
-    return _Straightened(ahead, across, seen.paint.astype(float), seen.yellow.astype(float), is_road)
+    whole = sample(ground, x, y)
+    is_road = np.where(np.isnan(whole.bright), np.nan, np.isfinite(sample(road, x, y).bright))
+    return _Straightened(ahead, across, whole.paint.astype(float), whole.yellow.astype(float), is_road)
 
 
 def find_lane_lines(
@@ -179,12 +178,11 @@ def find_lane_lines(
     `ground`, `road`: the ground and what of it is road. `markings`: pieces of lines that follow the course. `far_m`: to where
     lines are continued, from the camera.
 
-    Worn paint, dashes far away and yellow lines on concrete stand out little at any one place; all along the course they add
-    up. Of the places where something does, those are taken that together are likeliest: lanes lie between them.
+    Worn paint, distant dashes and yellow lines on concrete have little contrast at any one place, but the sum along the course is
+    significant. Of the offsets where it is, those are chosen that are most likely together: lanes of road lie between them.
     """
     flat = _straighten(ground, road, camera, shape)
     lines = _candidates(flat, camera, shape, far_m)
-    own_x = camera.mount_T_cam[0, 3]
     offsets = [_offset(_even(marking.points_m), shape) for marking in markings]
     for group in _groups(offsets):
         offset, members = float(np.mean([offsets[k] for k in group])), tuple(markings[k] for k in group)
@@ -193,30 +191,35 @@ def find_lane_lines(
             k = min(same, key=lambda k: abs(lines[k].offset_m - offset))
             lines[k] = replace(lines[k], log_odds=lines[k].log_odds + ALSO_IN_PIECES, markings=members)
         else:
-            x = np.arange(own_x, own_x + far_m, STEP_M)
-            course = np.column_stack([x, shape.course(x) + offset, np.zeros(len(x))])
-            lines.append(LaneLine(offset, ONLY_IN_PIECES, members, course))
+            lines.append(LaneLine(offset, ONLY_IN_PIECES, members, _along(shape, camera, far_m, offset)))
     return _side_by_side(sorted(lines, key=lambda line: -line.offset_m), flat)
 
 
+def _along(shape: RoadShape, camera: Camera, far_m: float, offset_m: float, drift: float = 0.0) -> Array:
+    """Return the points (N, 3) of a line at an offset from the course, which changes by `drift` m per meter."""
+    x = np.arange(0, far_m, STEP_M)
+    own_x = camera.mount_T_cam[0, 3]
+    y = shape.course(x + own_x) + offset_m + drift * np.minimum(x, FARTHEST_M)
+    return np.column_stack([x + own_x, y, np.zeros(len(x))])
+
+
 def _candidates(flat: _Straightened, camera: Camera, shape: RoadShape, far_m: float) -> list[LaneLine]:
-    """Places across the course along which something stands out."""
+    """List lines at the offsets along which contrast adds up, strongest first."""
     pixel_m = flat.ahead_m / camera.K[0, 0]
     contrasts = [_contrast(values, pixel_m) for values in (flat.paint, flat.yellow)]
     response, mean = [], []
     for contrast, least in zip(contrasts, MIN_NOISE):
         known = np.isfinite(contrast)
-        # Of each row, as noise grows far away; lines are a small part of it.
+        # Of each row, as noise grows with distance; lines are a small part of a row.
         noise = np.array([np.median(np.abs(c[k])) / 0.6745 if k.any() else np.inf for c, k in zip(contrast, known)])
         sigmas = np.nan_to_num(contrast / np.maximum(noise, least)[:, None])
         response.append(np.clip(sigmas - FROM_SIGMAS, 0, TO_SIGMAS - FROM_SIGMAS))
         count = known.sum(axis=0)
         along = np.where(count >= MIN_SAMPLES, response[-1].sum(axis=0) / np.maximum(count, FULL_SAMPLES), 0)
         mean.append(along - TIMES_AROUND * median_filter(along, round(AROUND_M / ACROSS_M) | 1, mode="nearest"))
-    own_x, reach = camera.mount_T_cam[0, 3], round(SAME_LINE_M / ACROSS_M)
+    reach = round(SAME_LINE_M / ACROSS_M)
     best, kind = np.max(mean, axis=0), np.argmax(mean, axis=0)
-    found = []
-    x = np.arange(own_x, own_x + far_m, STEP_M)
+    lines = []
     while best.max() >= MIN_RESPONSE:
         middle = int(best.argmax())
         value, k = best[middle], kind[middle]
@@ -230,14 +233,13 @@ def _candidates(flat: _Straightened, camera: Camera, shape: RoadShape, far_m: fl
         total = strength.sum(axis=1)
         shift, drift = _drift(flat.ahead_m[rows], strength @ off / total, total)
         offset = float(flat.across_m[middle] + shift)
-        y = shape.course(x) + offset + drift * np.minimum(x - own_x, FARTHEST_M)
-        course = np.column_stack([x, y, np.zeros(len(x))])
-        found.append(LaneLine(offset, float(np.log(value / MIN_RESPONSE)), (), course))
-    return found
+        points = _along(shape, camera, far_m, offset, drift)
+        lines.append(LaneLine(offset, float(np.log(value / MIN_RESPONSE)), (), points))
+    return lines
 
 
 def _contrast(values: Array, pixel_m: Array) -> Array:
-    """Contrast (N, M) of each place to the brighter of both sides; NaN where too little was seen."""
+    """Compute the contrast (N, M) of each place to the brighter of both sides; NaN where too little is visible."""
     known = np.isfinite(values)
     pad = np.zeros((len(values), 1))
     total = np.hstack([pad, np.cumsum(np.where(known, values, 0), axis=1, dtype=np.float64)])
@@ -249,17 +251,17 @@ def _contrast(values: Array, pixel_m: Array) -> Array:
 
     def mean(first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
         low, high = (np.clip(place + v, 0, values.shape[1]) for v in (first, last + 1))
-        seen = count[row, high] - count[row, low]
-        enough = (seen > 0) & (2 * seen >= high - low)
+        number = count[row, high] - count[row, low]
+        enough = (number > 0) & (2 * number >= high - low)
         among = total[row, high] - total[row, low]
-        return np.asarray(np.divide(among, seen, out=np.full(values.shape, np.nan), where=enough))
+        return np.asarray(np.divide(among, number, out=np.full(values.shape, np.nan), where=enough))
 
     paint, begin, end = (cells(*length) for length in (HALF_PAINT, ROAD_FROM, ROAD_TO))
     return np.asarray(mean(-paint, paint) - np.maximum(mean(-end, -begin), mean(begin, end)))
 
 
 def _drift(ahead_m: Array, off_m: Array, weight: Array) -> tuple[float, float]:
-    """Fit the offset at the camera and the change per meter of what was seen at (N,) m, robustly."""
+    """Fit the offset at the camera and its change per meter to offsets (N,) at distances (N,), m, robustly."""
     rows = np.column_stack([np.ones(len(ahead_m)), ahead_m])
     solution = np.zeros(2)
     prior = np.diag([1.0, (30 / DRIFT_SIGMA_M) ** 2])
@@ -270,8 +272,8 @@ def _drift(ahead_m: Array, off_m: Array, weight: Array) -> tuple[float, float]:
 
 
 def _side_by_side(lines: list[LaneLine], flat: _Straightened) -> list[LaneLine]:
-    """Choose the lines, of those sorted from left to right, that are likeliest together."""
-    best: list[tuple[float, list[LaneLine]]] = []  # of those that end with each line
+    """Choose lines, of those sorted from left to right, that are most likely together."""
+    best: list[tuple[float, list[LaneLine]]] = []  # log-odds and lines of the best choice that ends with each line
     for k, line in enumerate(lines):
         choices = [(line.log_odds, [line])]
         for (odds, before), left in zip(best, lines[:k]):
@@ -286,6 +288,6 @@ def _is_road(flat: _Straightened, right_m: float, left_m: float) -> bool:
     """Whether there is road between two offsets from the course."""
     between = (flat.across_m > right_m + SAME_LINE_M / 2) & (flat.across_m < left_m - SAME_LINE_M / 2)
     part = flat.is_road[flat.ahead_m < ROAD_WITHIN_M][:, between]
-    seen = np.isfinite(part).sum(axis=1)
-    enough = seen > 0.5 * np.count_nonzero(between)
-    return bool(enough.any() and np.mean(np.nansum(part, axis=1)[enough] > MOST * seen[enough]) >= MIN_ROAD)
+    visible = np.isfinite(part).sum(axis=1)
+    enough = visible > 0.5 * np.count_nonzero(between)
+    return bool(enough.any() and np.mean(np.nansum(part, axis=1)[enough] > MOST * visible[enough]) >= MIN_ROAD)

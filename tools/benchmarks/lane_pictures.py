@@ -29,8 +29,9 @@ WITHIN_PX = 20
 DRAWN_PX = 5
 CURBS = (20, 21)  # left and right, of OpenLane's categories
 MATCH_M = 1.5
-SHOWN, WIDTH_PX = 5, 1280
-AHEAD_M, BESIDE_M, ALONG = 80.0, 11.0, 0.85
+# Of simulated logs: pictures of each, width of their masks, and lines that count: cosine to the ego's way.
+PICTURES, WIDTH_PX = 5, 1280
+AHEAD_M, ACROSS_M, MIN_COSINE = 80.0, 11.0, 0.85
 SPANS_M = ((0.0, 40.0), (40.0, 80.0))
 # Name, picture (H, W, 3), mask (H, W) of the true lines, camera where it is known, annotations.
 Picture = tuple[str, np.ndarray, np.ndarray, Camera | None, dict]
@@ -83,14 +84,14 @@ def simulated(folder: Path) -> Iterator[Picture]:
         name, camera = next(iter(log.cameras.items()))
         lines = [resampled(m.points_m) for m in features.markings if m.is_lane_line] if features else []
         own, stamps = camera.mount_T_cam[:3, 3], log.streams[name].t_ns
-        for k in np.linspace(0, len(stamps) - 1, SHOWN).astype(int).tolist():
+        for k in np.linspace(0, len(stamps) - 1, PICTURES).astype(int).tolist():
             ego_T_map = inverse(log.ego.at(stamps[k])[0][0])
             masks = []
             for line in lines:
                 points = apply(ego_T_map, line)
                 along = np.gradient(points[:, :2], axis=0)
-                chosen = np.abs(along[:, 0]) > ALONG * np.linalg.norm(along, axis=1)
-                chosen &= (points[:, 0] > own[0] + 2) & (points[:, 0] < AHEAD_M) & (np.abs(points[:, 1]) < BESIDE_M)
+                chosen = np.abs(along[:, 0]) > MIN_COSINE * np.linalg.norm(along, axis=1)
+                chosen &= (points[:, 0] > own[0] + 2) & (points[:, 0] < AHEAD_M) & (np.abs(points[:, 1]) < ACROSS_M)
                 uv = project(camera, apply(inverse(camera.mount_T_cam), points))[0]
                 masks.append(np.where(chosen[:, None], uv, np.nan) * WIDTH_PX / camera.width_px)
             image = log.streams[name].read(k)
