@@ -98,3 +98,30 @@ def write_network(
         entry.key, entry.value = key, metadata if isinstance(metadata, str) else json.dumps(metadata)
     save(model, path)
     return path
+
+
+def write_refinement(
+    path: Path, corrections: Array | Sequence[float], *, inputs: tuple[str, str] = ("points", "box"), points: int = 64,
+    metadata: dict[str, Any] | None = INFO,
+) -> Path:  # fmt: skip
+    """Write a second stage that makes the same corrections to each box."""
+    from onnx import TensorProto, helper, numpy_helper, save
+
+    stored = [
+        numpy_helper.from_array(np.zeros((15, len(corrections)), np.float32), "weight"),
+        numpy_helper.from_array(np.asarray(corrections, np.float32), "bias"),
+    ]
+    nodes = [
+        helper.make_node("MatMul", [inputs[1], "weight"], ["none"]),
+        helper.make_node("Add", ["none", "bias"], ["corrections"]),
+    ]
+    shapes = [["boxes", points, 7], ["boxes", 15]]
+    given = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in zip(inputs, shapes, strict=True)]
+    result = [helper.make_tensor_value_info("corrections", TensorProto.FLOAT, ["boxes", len(corrections)])]
+    graph = helper.make_graph(nodes, "by hand", given, result, stored)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    if metadata is not None:
+        entry = model.metadata_props.add()
+        entry.key, entry.value = "log2sim.boxes", json.dumps(metadata)
+    save(model, path)
+    return path

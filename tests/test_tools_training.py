@@ -12,7 +12,7 @@ from lidar_training.clouds import CATEGORIES, Sample, write_shard
 from worlds import cloud_at
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
-from log2sim.geometry import Camera, project_boxes, rotation_from_rpy, transform
+from log2sim.geometry import Camera, project_boxes, rotation_from_rpy, transform, wrap_angle
 from log2sim.perception.detect3d.network import load_network
 
 pytestmark = pytest.mark.slow
@@ -41,6 +41,89 @@ def test_a_toy_learns_to_find_riders(tmp_path: Path, monkeypatch: pytest.MonkeyP
     card = json.loads((tmp_path / "roadside.json").read_text())
     assert card["simulated"]["two_wheeler"]["average_precision"] > 0.08
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_300_000
+
+
+def test_targets_of_the_second_stage_make_boxes_the_true_ones() -> None:
+    from lidar_training.refinement import targets_of
+    from test_box_refinement import boxes_at
+
+    from log2sim.perception.detect3d.refinement import corrected
+
+    rng = np.random.default_rng(3)
+    low, high = [-20, -20, 0.5, 0.5, 0.5, 0.5, -3.1], [20, 20, 2, 8, 3, 3, 3.1]
+    truth = rng.uniform(low, high, (50, 7))
+    off = rng.uniform(-1, 1, (50, 7)) * [1, 1, 0.5, 0, 0, 0, 0.7]
+    found = truth + off
+    found[:, 3:6] *= rng.uniform(0.6, 1.6, (50, 3))
+    found[::2, 6] += np.pi
+    boxes = boxes_at(found.tolist())
+    target = targets_of(boxes, truth)
+    again = corrected(boxes, np.column_stack([np.ones(50), target[:, :8], 4 * target[:, 8] - 2, np.zeros(50)]))
+    np.testing.assert_allclose(np.column_stack([again.center_m, again.size_m]), truth[:, :6], atol=1e-9)
+    np.testing.assert_allclose(wrap_angle(again.yaw_rad - truth[:, 6]), 0, atol=1e-9)
+
+
+def test_reshaped_objects_fill_their_boxes_as_before_and_what_is_around_keeps_its_distance() -> None:
+    from lidar_training.refinement import reshaped
+
+    rng = np.random.default_rng(4)
+    truth = rng.uniform([-1, -1, 0.5, 0.5, 0.5, 1.0, -3], [1, 1, 1, 8, 3, 3, 3], (40, 7))
+    # Corners of the boxes, points inside, and points half a meter outside a side.
+    u = np.concatenate([np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3), rng.uniform(-1, 1, (30, 3))])
+
+    def at(box: Any, u: Any, beyond_m: float = 0.0) -> Any:
+        x, y, z = ((u * box[:, None, 3:6]) / 2 + np.array([beyond_m, 0, 0])).transpose(2, 0, 1)
+        c, s = np.cos(box[:, 6:]), np.sin(box[:, 6:])
+        return np.stack([x * c - y * s, x * s + y * c, z], axis=2) + box[:, None, :3]
+
+    side = np.array([[1.0, 0.3, 0.0]])
+    xyz = np.concatenate([at(truth, u), at(truth, side, 0.5)], axis=1).astype(np.float32)
+    flat, after = xyz.reshape(-1, 3), truth.copy()
+    center = reshaped(flat, np.repeat(np.arange(40), len(u) + 1), after, truth[:, :3].copy(), rng)
+    factor = after[:, 3:6] / truth[:, 3:6]
+    assert 0.02 < np.log(factor).std() < 0.12
+    np.testing.assert_allclose(center, after[:, :3], atol=1e-6)
+    c, s = np.cos(after[:, 6, None]), np.sin(after[:, 6, None])
+    dx, dy, dz = (flat.reshape(xyz.shape) - after[:, None, :3]).transpose(2, 0, 1)
+    local = np.stack([dx * c + dy * s, dy * c - dx * s, dz], axis=2)
+    new = local / (after[:, None, 3:6] / 2)
+    # Corners move inward by a quarter at most, never in height.
+    assert (np.abs(new[:, :8]) < 1 + 1e-4).all()
+    assert (new[:, :8] * u[:8] > 0.7).all()
+    np.testing.assert_allclose(new[:, :8, 2], np.broadcast_to(u[:8, 2], (40, 8)), atol=1e-4)
+    assert np.abs(new[:, 8:-1]).max() < 1 + 1e-4
+    assert np.abs(new[:, 8:-1, :2] - u[8:, :2]).max() > 0.05
+    # As far from the side, which is rounder now.
+    np.testing.assert_allclose(local[:, -1, 0] - after[:, 3] / 2, 0.5, atol=0.12)
+
+
+def test_a_toy_of_the_second_stage_comes_closer_to_people_than_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a quarter of a minute, from a few scenes, on others."""
+    from lidar_training import refinement
+    from lidar_training.clouds import draw_example
+
+    from log2sim.config import LidarConfig
+    from log2sim.perception.detect3d.detectors import WEIGHTS, open_network
+
+    first = tmp_path / "first.onnx"
+    first.write_bytes((WEIGHTS / "roadside.onnx").read_bytes())
+    monkeypatch.setattr(refinement, "PER_SHARD", 20)
+    refinement.generate("roadside", first, tmp_path, 20, 5)
+    weights = refinement.train("roadside", tmp_path, 20, 150, 5, None)
+    refinement.finish("roadside", first, tmp_path, weights, {"seed": 5}, 4)
+    card = json.loads((tmp_path / "roadside.boxes.json").read_text())
+    assert card["simulated"]["scenes"] == 4
+    away: list[list[float]] = [[], []]
+    for example in [draw_example("roadside", (6, k)) for k in range(6)]:
+        people = example.truth.box[(example.truth.category == "pedestrian") & (example.truth.points >= 20), :2]
+        for k, path in enumerate((first, tmp_path / "roadside.onnx")):
+            found = open_network(path, LidarConfig(), name="x").detect(example.cloud)
+            near = np.hypot(*(found.center_m[:, None, :2] - people).T).T.min(axis=0, initial=9.0)
+            away[k] += near[near < 0.5].tolist()
+    assert len(away[1]) > 10
+    assert np.median(away[1]) < 0.8 * np.median(away[0])
 
 
 def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any) -> None:

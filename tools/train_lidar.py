@@ -6,6 +6,7 @@
     python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
     python tools/train_lidar.py vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
     python tools/train_lidar.py vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
+    python tools/train_lidar.py refinement vehicle DIR        # the second stage, which looks at the points of boxes, of the shipped first one
     python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
 
 The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close to the sensor's car, end-on and at
@@ -70,6 +71,7 @@ from log2sim.perception.detect3d.detectors import open_network
 from log2sim.synth.traffic import Mount
 
 PAPERS = ("zou2021", "two_stream")
+MODULES = (*PAPERS, "refinement")
 PER_SHARD = 100
 # Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.
 HELD_OUT_SHARE = 0.2
@@ -166,12 +168,7 @@ class Pool:
     def prepare(self, step: int) -> None:
         """Load what a step may use."""
         while len(self._shards) < min(len(self._paths), self._first + step // STEPS_PER_SHARD):
-            path = self._paths[len(self._shards)]
-            while not path.exists():
-                if self._generator is not None and self._generator.poll():
-                    raise LogError(f"{path} is missing: the process that generates scenes has failed")
-                time.sleep(2)
-            self._shards.append(Shard(path))
+            self._shards.append(Shard(fitting.wait_for(self._paths[len(self._shards)], self._generator)))
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Draw a sample: from each kind of shards as often where there are both."""
@@ -311,7 +308,7 @@ def main(
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] and sys.argv[1] in PAPERS:
+    if sys.argv[1:2] and sys.argv[1] in MODULES:
         module = importlib.import_module(f"lidar_training.{sys.argv[1]}")
         run(module.main, module.__doc__, sys.argv[2:], sys.argv[1])
     run(main, __doc__)

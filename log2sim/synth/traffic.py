@@ -352,6 +352,13 @@ def _roadside(out: _Layout, road: Road) -> None:
                 xy, direction = road.at(s + rng.normal(0, 0.5), side * d)
                 if not out.on_road(xy):
                     out.add_small(kind, xy, direction)
+        if rng.random() < 0.25:
+            # Bollards keep cars off the sidewalk.
+            start, step, d = rng.uniform(-30, 25), rng.uniform(0.9, 2.5), half + rng.uniform(0.2, 3)
+            for k in range(rng.integers(3, 15)):
+                xy, direction = road.at(start + k * step, side * d)
+                if not out.on_road(xy):
+                    out.add_small("bollard", xy, direction)
     for _ in range(rng.poisson(rng.choice([16, 26, 45]))):
         kind = out.one_of(shares)
         d = rng.choice([-1, 1]) * (half + abs(rng.normal(0, 6)) + 0.3)

@@ -336,16 +336,30 @@ def grass(rng: Rng) -> Parts:
     return (ellipsoid((r, r * rng.uniform(0.5, 1), h), (0, 0, 0), LEAVES),)
 
 
+def bollard(rng: Rng) -> Parts:
+    """Draw a bollard, some with a head or foot that is wider."""
+    radius, height = rng.uniform(0.04, 0.18), rng.uniform(0.4, 1.3)
+    parts = [column(radius, (0, height), METAL)]
+    if rng.random() < 0.4:
+        z = rng.choice([0.0, height - 0.25])
+        parts.append(column(radius * rng.uniform(1.2, 2.0), (z, z + rng.uniform(0.08, 0.25)), METAL))
+    return tuple(parts)
+
+
 def pole(rng: Rng) -> Parts:
     """Draw a post: a bollard, a lamp or a sign with its plate, at heights of people and above."""
     kind = rng.random()
     if kind < 0.25:
-        return (column(rng.uniform(0.05, 0.18), (0, rng.uniform(0.5, 1.3)), METAL),)
+        return bollard(rng)
     height, radius = rng.uniform(1.6, 8.0), rng.uniform(0.03, 0.16)
     parts = [column(radius, (0, height), METAL)]
     if kind < 0.6:
-        plate, z = rng.uniform(0.25, 0.6), rng.uniform(1.2, max(1.3, min(height, 3.0)))
-        parts.append(box((-0.03, -plate / 2, z), (0.03, plate / 2, z + plate), METAL))
+        # A plate; low ones stand on islands.
+        plate, z = rng.uniform(0.25, 0.6), rng.uniform(0.5, max(1.3, min(height, 3.0)))
+        if rng.random() < 0.5:
+            parts.append(box((-0.03, -plate / 2, z), (0.03, plate / 2, z + plate), METAL))
+        else:
+            parts.append(ellipsoid((0.03, plate / 2, plate / 2), (0, 0, z + plate / 2), METAL))
     elif kind < 0.8:
         parts.append(box((-0.2, -0.2, 0), (0.2, 0.2, rng.uniform(0.5, 1.4)), METAL))
     if height > 5 and rng.random() < 0.5:
@@ -586,7 +600,7 @@ SMALL: dict[str, tuple[float, float, Callable[[Rng], Parts]]] = {
     "bench": (0.04, 1.0, bench), "shelter": (0.015, 2.5, shelter), "cone": (0.04, 0.5, cone), "hydrant": (0.02, 0.2, hydrant),
     "planter": (0.04, 0.5, planter), "railing": (0.03, 1.0, railing), "corner": (0.03, 1.0, corner), "sign board": (0.02, 0.4, sign_board),
     "letterbox": (0.02, 0.3, letterbox), "crates": (0.03, 0.7, crates), "stall": (0.02, 1.8, stall), "clothes rail": (0.01, 0.9, clothes_rail),
-    "parasol": (0.01, 0.3, parasol), "table": (0.02, 0.8, table),
+    "parasol": (0.01, 0.3, parasol), "table": (0.02, 0.8, table), "bollard": (0.02, 0.2, bollard),
 }  # fmt: skip
 """By kind: share, radius in m that is to be free around it, and how to draw it."""
 

@@ -80,7 +80,7 @@ def export_checked(
             opset_version=17, dynamo=False, dynamic_axes=axes,
         )  # fmt: skip
     model = onnx.load(path)
-    for weight in [value for value in model.graph.initializer if halved and len(value.dims) == 4]:
+    for weight in [value for value in model.graph.initializer if halved and len(value.dims) > 1]:
         half = onnx.numpy_helper.to_array(weight).astype(np.float16)
         model.graph.initializer.remove(weight)
         model.graph.initializer.append(onnx.numpy_helper.from_array(half, weight.name + "_half"))

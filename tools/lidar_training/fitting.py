@@ -7,11 +7,14 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from subprocess import Popen
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from log2sim.errors import LogError
 
 MAX_GRADIENT_NORM = 10.0
 CHECKPOINT_S = 60.0
@@ -30,6 +33,15 @@ def draw_once(path: Path, rows: Iterable[Mapping[str, Any]]) -> Path:
     np.savez(temporary, **{key: np.array([row[key] for row in kept]) for key in kept[0]})
     temporary.replace(path)
     print(f"{path.name}: {(time.process_time() - begun) / len(kept) * 1e3:.1f} ms of CPU a row", flush=True)
+    return path
+
+
+def wait_for(path: Path, generator: Popen[bytes] | None) -> Path:
+    """Wait until another process, if there is one, has written a file. Raises `LogError` when it has failed."""
+    while not path.exists():
+        if generator is not None and generator.poll():
+            raise LogError(f"{path} is missing: the process that generates scenes has failed")
+        time.sleep(2)
     return path
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.datatypes import GROUPS, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M
 from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, rectangle_overlap, wrap_angle
-from log2sim.perception.detect3d.network import NetworkInfo
+from log2sim.perception.detect3d.network import NetworkInfo, ScoreInfo
 
 # Road users do not share ground; estimates of neighbors overlap by a little where sizes and headings are off.
 MAX_IOU = 0.2
@@ -99,7 +99,7 @@ class LevelBoxes(Columns):
         """
         return np.stack([np.ones(len(self)), self.heat, self.quality, np.log1p(points), range_m / 10.0])
 
-    def score(self, info: NetworkInfo, terms: Array) -> Array:
+    def score(self, info: ScoreInfo, terms: Array) -> Array:
         """Compute the probability (M,) that each box is right from the first terms of the calibration, (up to 5, M)."""
         weights = np.array([info.calibration[group] for group in info.groups])[self.group, : len(terms)]
         return sigmoid((weights.T * terms).sum(axis=0))

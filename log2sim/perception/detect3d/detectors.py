@@ -31,6 +31,7 @@ from log2sim.perception.detect3d.network import (
     stack_points,
     viewpoints_xy,
 )
+from log2sim.perception.detect3d.refinement import SUFFIX, Refinement, load_refinement
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud
 
 
@@ -86,11 +87,11 @@ MIN_GROUP_RECALL = 0.5
 
 
 def describe_weakness(name: str) -> str:
-    """State what a shipped network finds and turns round in simulated sweeps if it misses most groups of road users, else nothing.
+    """State what a shipped detector finds and turns round in simulated sweeps if it misses most groups of road users, else nothing.
 
-    The figures are those of the JSON file next to its weights.
+    The figures are those of the JSON file next to its second stage.
     """
-    file = WEIGHTS / f"{name.removeprefix('lidar:')}.json"
+    file = WEIGHTS / f"{name.removeprefix('lidar:')}.boxes.json"
     if not name.startswith("lidar:") or name.endswith(".onnx") or not file.is_file():
         return ""
     card = json.loads(file.read_text(encoding="utf-8"))["simulated"]
@@ -115,6 +116,10 @@ class Candidates:
     terms: NDArray[np.float64]  # (5, M): see `LevelBoxes.terms`
 
 
+# What the second stage is asked about: boxes of a lower score are hardly ever of road users.
+MIN_FIRST_SCORE = 0.05
+
+
 @dataclass(frozen=True, eq=False)
 class NetworkDetector:
     """Detector from a network and settings."""
@@ -124,17 +129,20 @@ class NetworkDetector:
     decode: Literal["centers", "votes"]  # "centers" or "votes": see `LidarConfig`
     range_m: float  # largest distance from the sensor along x and along y, m
     min_score: float | None  # or None: lowest score of a box; None for the network's own of each group
+    refinement: Refinement | None = None  # second stage, for boxes at centers
 
     @property
     def cache_key(self) -> str:
         """All that its boxes depend on besides the clouds."""
-        return f"{self.network.digest()} {self.decode} {self.range_m} {self.min_score}"
+        second = f" {self.refinement.digest()}" if self.refinement is not None else ""
+        return f"{self.network.digest()}{second} {self.decode} {self.range_m} {self.min_score}"
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""
         found = self.candidates(cloud, earlier, weak=False)
         boxes, points = found.boxes, found.inside.count
-        score = sigmoid(boxes.heat) if self.decode == "votes" else boxes.score(self.network.info, found.terms)
+        info = self.network.info if self.refinement is None else self.refinement.info
+        score = sigmoid(boxes.heat) if self.decode == "votes" else boxes.score(info, found.terms)
         # What holds no point is nothing that the LiDAR saw.
         good = np.flatnonzero((points > 0) & (score >= self._least(boxes)))
         kept = good[suppress(boxes.rectangles[good], score[good], boxes.group[good])]
@@ -177,10 +185,14 @@ class NetworkDetector:
                     ranges_m(boxes, sensors),
                 )
                 best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
-                boxes = boxes.take(best >= self._least(boxes))
+                least = self._least(boxes)
+                boxes = boxes.take(best >= (least if self.refinement is None else np.minimum(least, MIN_FIRST_SCORE)))
             without = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
             boxes = boxes.take(suppress(boxes.rectangles, without, boxes.group, across=False))
-        inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
+        if self.refinement is not None:
+            boxes, inside = self.refinement.refine(boxes, xyz, sensors)
+        else:
+            inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
         return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensors)))
 
     def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
@@ -200,7 +212,7 @@ def ranges_m(boxes: LevelBoxes, sensors: Array) -> Array:
 
 
 def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDetector:
-    """Make a detector of a network's file.
+    """Make a detector of a network's file, and of that of its second stage where there is one of the same name with `SUFFIX`.
 
     Raises `ConfigError`: a file that is no usable network, or a range that its grid cannot cover.
     """
@@ -211,8 +223,10 @@ def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDete
             f"lidar.range_m {settings.range_m:g}: {path} has cells of {network.info.cell_m:g} m, with which a grid covers "
             f"up to {limit:g} m"
         )
-    range_m = settings.range_m or network.info.range_m
-    return NetworkDetector(name, network, settings.decode, range_m, settings.min_score or None)
+    range_m, second = settings.range_m or network.info.range_m, path.with_suffix(SUFFIX)
+    refines = settings.decode == "centers" and second.is_file()
+    refinement = load_refinement(second, network.info.groups) if refines else None
+    return NetworkDetector(name, network, settings.decode, range_m, settings.min_score or None, refinement)
 
 
 def create_vehicle(log: Log, settings: LidarConfig) -> NetworkDetector:

@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,14 @@ def open_session(path: Path, max_bytes: int, kind: str) -> Any:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
         raise ConfigError(f"{path}: not a {kind} that ONNX Runtime can load: {first_line(error)}") from None
+
+
+def digest_of(path: Path) -> str:
+    """Return what tells a network from others: the content of its file, and the version of what runs it."""
+    import onnxruntime
+
+    content = read_file(path, MAX_FILE_BYTES, ConfigError)
+    return f"{hashlib.sha256(content).hexdigest()} onnxruntime {onnxruntime.__version__}"
 
 
 def first_line(error: Exception) -> str:
@@ -226,37 +234,48 @@ MAX_SIDE_CELLS = 1024
 CALIBRATION_TERMS = 5
 
 
-class NetworkInfo(BaseModel):
-    """What the metadata of a network's file say about it."""
+class ScoreInfo(BaseModel):
+    """What the metadata of a network's file say about the scores of its boxes."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     version: int
-    name: str
-    cell_m: float = Field(ge=0.05, le=2.0)  # side of a cell of the grid, m
-    stride: int = Field(ge=1, le=16)  # cells of the grid along a cell of the maps
-    range_m: float = Field(gt=0.0, le=1000.0)  # largest distance from the sensor along x and along y, m
     groups: tuple[str, ...] = Field(min_length=1)  # of categories, in the order of the channels of heat
-    categories: dict[str, tuple[str, ...]]  # of each group, in the order of the channels of categories
     # For each group the weights of 1, logit of the heat, logit of the quality, log(1 + points) and range in units of 10 m, whose
     # sum is the logit of the score
     calibration: dict[str, tuple[float, ...]]
-    min_score: dict[str, float]  # lowest score of a box of each group
     card: dict[str, Any] = {}  # how the network was trained and how good it is; free
 
     @model_validator(mode="after")
-    def _check(self) -> NetworkInfo:
-        """Check what types and limits do not say."""
+    def _check_scores(self) -> Self:
+        """Check what types do not say."""
         if self.version != VERSION:
             raise ValueError(f"'version' is {self.version}, expected {VERSION}")
         for group in self.groups:
             if group not in GROUPS or self.groups.count(group) > 1:
                 raise ValueError(f"'groups' has '{group}' twice or unknown; expected some of {', '.join(GROUPS)}")
+            if len(self.calibration.get(group, ())) != CALIBRATION_TERMS:
+                raise ValueError(f"'calibration.{group}' is missing or has not {CALIBRATION_TERMS} numbers")
+        return self
+
+
+class NetworkInfo(ScoreInfo):
+    """What the metadata of a network's file say about it."""
+
+    name: str
+    cell_m: float = Field(ge=0.05, le=2.0)  # side of a cell of the grid, m
+    stride: int = Field(ge=1, le=16)  # cells of the grid along a cell of the maps
+    range_m: float = Field(gt=0.0, le=1000.0)  # largest distance from the sensor along x and along y, m
+    categories: dict[str, tuple[str, ...]]  # of each group, in the order of the channels of categories
+    min_score: dict[str, float]  # lowest score of a box of each group
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        """Check what types and limits do not say."""
+        for group in self.groups:
             known, named = GROUPS[group], self.categories.get(group, ())
             if not named or not set(named) <= set(known) or len(set(named)) < len(named):
                 raise ValueError(f"'categories.{group}' is {list(named)}, expected some of {', '.join(known)}")
-            if len(self.calibration.get(group, ())) != CALIBRATION_TERMS:
-                raise ValueError(f"'calibration.{group}' is missing or has not {CALIBRATION_TERMS} numbers")
             if not 0 <= self.min_score.get(group, -1.0) <= 1:
                 raise ValueError(f"'min_score.{group}' is missing or no number from 0 to 1")
         if self.range_m > self.max_range_m:
@@ -315,11 +334,8 @@ class Network:
     session: Any  # onnxruntime.InferenceSession
 
     def digest(self) -> str:
-        """Return what tells it from other networks: the content of its file, and the version of what runs it."""
-        import onnxruntime
-
-        content = read_file(self.path, MAX_FILE_BYTES, ConfigError)
-        return f"{hashlib.sha256(content).hexdigest()} onnxruntime {onnxruntime.__version__}"
+        """Return what tells it from other networks."""
+        return digest_of(self.path)
 
     def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
         """Compute the maps (C, H / stride, W / stride) of a grid (12, H, W); `ConfigError` when it fails or they have another shape."""

@@ -1,0 +1,176 @@
+"""Second stage of a LiDAR detector: a network on the points in and around each box.
+
+Cells of a grid are as wide as a person is deep. The points themselves tell more: whether the box holds a road user of its
+group, where the sides are, and which end is the front. Such networks follow PointNet (Qi et al., CVPR 2017) and PointRCNN
+(Shi et al., CVPR 2019). The size of the box is among the inputs, since points alone do not tell how far they are from its
+sides (Li, Wang and Wang, "LiDAR R-CNN", CVPR 2021).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from log2sim.errors import ConfigError
+from log2sim.files.documents import first_problem
+from log2sim.geometry import Array, wrap_angle
+from log2sim.perception.detect3d.box_points import PointsOfBoxes, points_of_boxes
+from log2sim.perception.detect3d.boxes import LevelBoxes, sigmoid
+from log2sim.perception.detect3d.network import MAX_HEIGHT_M, ScoreInfo, digest_of, first_line, open_session
+from log2sim.perception.lidar.cloud import ON_GROUND_M
+
+SUFFIX = ".boxes.onnx"
+METADATA_KEY = "log2sim.boxes"
+MAX_FILE_BYTES = 64 * 1024**2
+# Points this far outside a box are looked at, too: places of boxes err by less, and the space around tells people from walls.
+MARGIN_M = 0.5
+# Points of a box from which those of the network are drawn.
+MOST_POINTS = 256
+POINT_VALUES, BOX_VALUES, OUTPUTS = 7, 15, 11
+# A box that has to be changed by more than this is of another object.
+MAX_SHIFT_M, MAX_LOG_SIZE = 2.0, 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """Loaded second stage; may be used from several threads."""
+
+    path: Path
+    info: ScoreInfo  # its groups are those of the first stage
+    session: Any  # onnxruntime.InferenceSession
+    points: int  # number of points of a box that the network takes
+
+    def digest(self) -> str:
+        """Return what tells it from other networks."""
+        return digest_of(self.path)
+
+    def refine(self, boxes: LevelBoxes, xyz: NDArray[np.float32], sensors: Array) -> tuple[LevelBoxes, PointsOfBoxes]:
+        """Correct boxes by their points; those without points are left out.
+
+        `xyz`: (N, 3), m: level frame. `sensors`: (V, 2), m: where they were measured from.
+
+        Returns the boxes, whose heat is the logit of holding an object of their group, and their points above the ground.
+        """
+        around = points_around(xyz, boxes)
+        inside = points_within(around, xyz, boxes)
+        some = np.flatnonzero(inside.count > 0)
+        if not len(some):
+            return boxes.take(some), inside.take(some)
+        boxes, around = boxes.take(some), around.take(some)
+        away = sensors - boxes.center_m[:, None, :2]
+        toward = away[np.arange(len(some)), np.hypot(away[..., 0], away[..., 1]).argmin(axis=1)]
+        values = box_inputs(xyz, around.sample(MOST_POINTS), around.count, boxes, toward, self.points)
+        boxes = corrected(boxes, self._run(*values))
+        return boxes, points_within(around, xyz, boxes)
+
+    def _run(self, points: NDArray[np.float32], of_box: NDArray[np.float32]) -> Array:
+        try:
+            (out,) = self.session.run(["corrections"], {"points": points, "box": of_box})
+        except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
+            raise ConfigError(f"{self.path}: the network fails on {len(of_box)} boxes: {first_line(error)}") from None
+        if out.shape != (len(of_box), OUTPUTS):
+            raise ConfigError(f"{self.path}: output 'corrections' is {out.shape}, expected ({len(of_box)}, {OUTPUTS})")
+        return np.nan_to_num(np.asarray(out, np.float64))
+
+
+def points_around(xyz: NDArray[np.float32], boxes: LevelBoxes, margin_m: float = MARGIN_M) -> PointsOfBoxes:
+    """Find the points (N, 3) above the ground in boxes and up to a margin around them, at any height."""
+    center, size = boxes.center_m.copy(), boxes.size_m + 2 * margin_m
+    center[:, 2], size[:, 2] = 0.0, 2 * MAX_HEIGHT_M
+    return points_of_boxes(xyz, center, size, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
+
+
+def points_within(around: PointsOfBoxes, xyz: NDArray[np.float32], boxes: LevelBoxes) -> PointsOfBoxes:
+    """Take those of some points that are in the boxes themselves."""
+    offset = in_box_axes(xyz, around, boxes)
+    inside = np.flatnonzero((np.abs(offset) <= boxes.size_m[around.box] / 2).all(axis=1))
+    return PointsOfBoxes(around.box[inside], around.point[inside], around.boxes)
+
+
+def in_box_axes(xyz: NDArray[np.float32], pairs: PointsOfBoxes, boxes: LevelBoxes) -> Array:
+    """Express points relative to the centers of boxes, along their axes: (K, 3), m."""
+    c, s = np.cos(boxes.yaw_rad)[pairs.box], np.sin(boxes.yaw_rad)[pairs.box]
+    x, y, z = (xyz[pairs.point] - boxes.center_m[pairs.box]).T
+    return np.stack([x * c + y * s, y * c - x * s, z], axis=1)
+
+
+def box_inputs(
+    xyz: NDArray[np.float32], pairs: PointsOfBoxes, counts: NDArray[np.int64], boxes: LevelBoxes, toward_m: Array, points: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Make the inputs of the network for M boxes.
+
+    `pairs`: the points around each box, at least one each. `counts`: (M,): how many points they stand for. `toward_m`: (M, 2):
+    the way from the box to the sensor. `points`: how many to take, evenly over those of a box, again from the first where
+    there are fewer.
+
+    Returns (M, points, 7): x, y, z from the center along the axes of the box and height above the ground, m; x, y, z over half
+    the size. (M, 15): which of three groups; heat, quality; logarithms of the numbers of points in and around the box and of its
+    size; height of the center; distance from the sensor; unit vector to it in the axes of the box; how sure the heading is.
+    """
+    offset, size = in_box_axes(xyz, pairs, boxes), boxes.size_m
+    each = counts / pairs.count
+    in_box = np.bincount(pairs.box, (np.abs(offset) <= size[pairs.box] / 2).all(axis=1), minlength=pairs.boxes) * each
+    number, k = pairs.count[:, None], np.arange(points)
+    row = np.cumsum(number, axis=0) - number + np.where(number >= points, k * number // points, k % number)
+    place = offset[row]
+    height = place[..., 2] + boxes.center_m[:, None, 2]
+    values = np.concatenate([place, height[..., None], place / (size[:, None] / 2)], axis=2)
+    away = np.hypot(*toward_m.T)
+    c, s = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
+    x, y = toward_m.T / np.maximum(away, 0.1)
+    of_box = np.column_stack([
+        np.eye(3)[boxes.group], boxes.heat / 3, boxes.quality / 2, np.log1p(in_box) / 3, np.log1p(counts) / 3,
+        np.log(size), boxes.center_m[:, 2], away / 30, x * c + y * s, y * c - x * s, 2 * boxes.heading_score - 1,
+    ])  # fmt: skip
+    return values.astype(np.float32), of_box.astype(np.float32)
+
+
+def corrected(boxes: LevelBoxes, out: Array) -> LevelBoxes:
+    """Apply the corrections (M, 11) of the network to boxes.
+
+    They are the logit of an object of the box's group, the shift along the axes of the box, m, logarithms of the factors of
+    its size, sine and cosine of twice the turn, the logit that front and back are not swapped, and that of the expected IoU.
+    """
+    c, s = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
+    x, y, z = np.clip(out[:, 1:4].T, -MAX_SHIFT_M, MAX_SHIFT_M)
+    yaw = boxes.yaw_rad + np.arctan2(out[:, 7], out[:, 8]) / 2 + np.where(out[:, 9] < 0, np.pi, 0.0)
+    return replace(
+        boxes,
+        center_m=boxes.center_m + np.stack([x * c - y * s, x * s + y * c, z], axis=1),
+        size_m=boxes.size_m * np.exp(np.clip(out[:, 4:7], -MAX_LOG_SIZE, MAX_LOG_SIZE)),
+        yaw_rad=np.asarray(wrap_angle(yaw)),
+        heading_score=sigmoid(np.abs(out[:, 9])),
+        heat=out[:, 0],
+        quality=out[:, 10],
+    )
+
+
+def load_refinement(path: Path, groups: tuple[str, ...]) -> Refinement:
+    """Load the second stage of a detector of some groups; `ConfigError` for a file that is none."""
+    session = open_session(path, MAX_FILE_BYTES, "network for the points of boxes")
+    shapes = {i.name: i.shape for i in session.get_inputs() if i.type == "tensor(float)"}
+    of_points = shapes.get("points", ())
+    fits = len(of_points) == 3 and isinstance(of_points[1], int) and 0 < of_points[1] <= MOST_POINTS
+    if not fits or set(shapes) != {"points", "box"} or "corrections" not in [o.name for o in session.get_outputs()]:
+        raise ConfigError(
+            f"{path}: expected inputs 'points' (M, 1 to {MOST_POINTS}, {POINT_VALUES}) and 'box' (M, {BOX_VALUES}) and an output "
+            "'corrections'"
+        )
+    text, where = (
+        session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}"),
+        f"{path}: metadata '{METADATA_KEY}'",
+    )
+    try:
+        info = ScoreInfo.model_validate_json(text[:1_000_000])
+    except ValidationError as error:
+        raise ConfigError(f"{where}: {first_problem(error, ScoreInfo)}") from None
+    if info.groups != groups:
+        raise ConfigError(f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(groups)}")
+    network = Refinement(path, info, session, of_points[1])
+    network._run(np.zeros((1, network.points, POINT_VALUES), np.float32), np.zeros((1, BOX_VALUES), np.float32))
+    return network
