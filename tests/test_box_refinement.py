@@ -107,22 +107,15 @@ def test_a_file_that_is_no_second_stage_is_named(tmp_path: Path, changes: dict[s
 
 
 @pytest.mark.parametrize("mount", ["vehicle", "roadside"])
-def test_people_and_riders_are_placed_and_turned_better_than_by_the_first_stage(mount: Any) -> None:
+def test_people_and_riders_are_placed_better_than_by_the_first_stage(mount: Any) -> None:
     both = open_shipped(mount, LidarConfig())
-    errors: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
-    for k in range(6):
-        example = draw_example(mount, (31, k))
-        truth = example.truth
+    away: dict[bool, list[float]] = {False: [], True: []}
+    for example in [draw_example(mount, (31, k)) for k in range(10)]:
+        slim = np.isin(example.truth.category, ("pedestrian", "cyclist", "motorcycle"))
+        true = example.truth.box[slim & (example.truth.points >= 20), :2]
         for second, detector in ((False, replace(both, refinement=None)), (True, both)):
             found = detector.detect(example.cloud)
-            for row in np.flatnonzero(
-                (truth.points >= 20) & np.isin(truth.category, ("pedestrian", "cyclist", "motorcycle"))
-            ):
-                away = np.hypot(*(found.center_m[:, :2] - truth.box[row, :2]).T)
-                near = int(away.argmin())
-                if away[near] < 1.0:
-                    turned = float(wrap_angle(2 * (found.yaw_rad[near] - truth.box[row, 6]))) / 2
-                    errors[second].append((float(away[near]), abs(turned)))
-    first, second = (np.median(errors[key], axis=0) for key in (False, True))
-    assert len(errors[True]) >= len(errors[False]) > 20
-    assert (second < 0.8 * first).all(), (first, second)
+            nearest = np.hypot(*(found.center_m[:, None, :2] - true).T).min(axis=1, initial=9.0)
+            away[second] += nearest[nearest < 1.0].tolist()
+    assert len(away[True]) >= len(away[False]) > 15
+    assert np.median(away[True]) < 0.7 * np.median(away[False])

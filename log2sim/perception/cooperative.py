@@ -34,13 +34,13 @@ from log2sim.plan import ROADSIDE_NETWORK, VEHICLE_NETWORK, FusionLevel, fusion_
 # Weights of `side_terms` in the logarithm of the standard deviation of a side, m, and of `yaw_terms` in that of the yaw, rad.
 # Fitted by `tools/fit.py box_errors` to what lidar:vehicle and lidar:roadside find in random scenes with exact truth.
 SIDE_WEIGHTS: dict[str, Array] = {
-    "vehicle": np.array([-1.9, -0.12, -0.05, -0.33, 1.42, -0.51, 0.47]),
-    "two_wheeler": np.array([-1.21, -0.21, -0.13, -0.13, 1.09, -0.1, 0.47]),
-    "pedestrian": np.array([-1.16, -0.13, -0.11, -0.03, 1.5, 0.05, 0.31]),
+    "vehicle": np.array([-1.65, -0.15, -0.07, -0.32, 1.31, -0.74, 0.42]),
+    "two_wheeler": np.array([-2.03, -0.03, -0.08, -0.12, 0.79, 0.02, 0.4]),
+    "pedestrian": np.array([-1.74, -0.1, -0.13, -0.08, 0.68, 0.04, 0.35]),
 }
 YAW_WEIGHTS: dict[str, Array] = {
-    "vehicle": np.array([-0.37, -0.37, -0.22, -0.45]),
-    "two_wheeler": np.array([-1.28, -0.07, 0.04, 0.01]),
+    "vehicle": np.array([-1.03, -0.32, -0.19, -0.33]),
+    "two_wheeler": np.array([-2.28, 0.08, 0.0, -0.15]),
 }
 # Scores nearer to 0 or 1 say no more.
 MIN_SCORE, MAX_ERROR_SCORE = 0.02, 0.98
