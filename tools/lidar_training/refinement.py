@@ -168,10 +168,8 @@ def drawn(shard: dict[str, NDArray[Any]], rows: NDArray[np.intp], rng: np.random
     chosen = (np.abs(offset[:, :2]) <= size[pair, :2] / 2 + MARGIN_M).all(axis=1)
     # Half the boxes lose points anywhere, a third those of one side.
     share = np.where(rng.random(count) < 0.5, 1.0, rng.uniform(0.3, 1.0, count))
-    angle, least = (
-        rng.uniform(-np.pi, np.pi, count),
-        np.where(rng.random(count) < 0.33, rng.uniform(-0.9, 0.0, count), -np.inf),
-    )
+    angle = rng.uniform(-np.pi, np.pi, count)
+    least = np.where(rng.random(count) < 0.33, rng.uniform(-0.9, 0.0, count), -np.inf)
     x, y = (offset[:, :2] / (size[pair, :2] / 2)).T
     chosen &= (rng.random(len(pair)) < share[pair]) & (x * np.cos(angle)[pair] + y * np.sin(angle)[pair] > least[pair])
     chosen[(np.cumsum(n) - n)[np.bincount(pair, chosen, minlength=count) == 0]] = True
@@ -218,14 +216,11 @@ def reshaped(
         return np.stack([x * c[of] - y * s[of], x * s[of] + y * c[of], z], axis=1) + base[of]
 
     xyz[:] = moved(xyz.astype(np.float64), pair)
-    centers = center - base
-    along = (
-        np.stack([centers[:, 0] * c + centers[:, 1] * s, centers[:, 1] * c - centers[:, 0] * s, centers[:, 2]], axis=1)
-        * factor
-    )
     truth[:, 3:6] *= factor
     truth[:, 2] = base[:, 2] + truth[:, 5] / 2
-    return np.stack([along[:, 0] * c - along[:, 1] * s, along[:, 0] * s + along[:, 1] * c, along[:, 2]], axis=1) + base
+    dx, dy, dz = (center - base).T
+    x, y, z = (np.stack([dx * c + dy * s, dy * c - dx * s, dz], axis=1) * factor).T
+    return np.stack([x * c - y * s, x * s + y * c, z], axis=1) + base
 
 
 def targets_of(boxes: LevelBoxes, truth: Array) -> Array:

@@ -21,7 +21,14 @@ from log2sim.files.documents import first_problem
 from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.detect3d.box_points import PointsOfBoxes, points_of_boxes
 from log2sim.perception.detect3d.boxes import LevelBoxes, sigmoid
-from log2sim.perception.detect3d.network import MAX_HEIGHT_M, ScoreInfo, digest_of, first_line, open_session
+from log2sim.perception.detect3d.network import (
+    MAX_HEIGHT_M,
+    METADATA_LIMIT_CHARS,
+    ScoreInfo,
+    digest_of,
+    first_line,
+    open_session,
+)
 from log2sim.perception.lidar.cloud import ON_GROUND_M
 
 SUFFIX = ".boxes.onnx"
@@ -31,7 +38,8 @@ MAX_FILE_BYTES = 64 * 1024**2
 MARGIN_M = 0.5
 # Points of a box from which those of the network are drawn.
 MOST_POINTS = 256
-POINT_VALUES, BOX_VALUES, OUTPUTS = 7, 15, 11
+MAX_GROUPS = 3
+POINT_VALUES, BOX_VALUES, OUTPUTS = 7, 12 + MAX_GROUPS, 11
 # A box that has to be changed by more than this is of another object.
 MAX_SHIFT_M, MAX_LOG_SIZE = 2.0, 0.7
 
@@ -124,7 +132,7 @@ def box_inputs(
     c, s = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
     x, y = toward_m.T / np.maximum(away, 0.1)
     of_box = np.column_stack([
-        np.eye(3)[boxes.group], boxes.heat / 3, boxes.quality / 2, np.log1p(in_box) / 3, np.log1p(counts) / 3,
+        np.eye(MAX_GROUPS)[boxes.group], boxes.heat / 3, boxes.quality / 2, np.log1p(in_box) / 3, np.log1p(counts) / 3,
         np.log(size), boxes.center_m[:, 2], away / 30, x * c + y * s, y * c - x * s, 2 * boxes.heading_score - 1,
     ])  # fmt: skip
     return values.astype(np.float32), of_box.astype(np.float32)
@@ -161,16 +169,15 @@ def load_refinement(path: Path, groups: tuple[str, ...]) -> Refinement:
             f"{path}: expected inputs 'points' (M, 1 to {MOST_POINTS}, {POINT_VALUES}) and 'box' (M, {BOX_VALUES}) and an output "
             "'corrections'"
         )
-    text, where = (
-        session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}"),
-        f"{path}: metadata '{METADATA_KEY}'",
-    )
+    text, where = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}"), f"{path}: '{METADATA_KEY}'"
     try:
-        info = ScoreInfo.model_validate_json(text[:1_000_000])
+        info = ScoreInfo.model_validate_json(text[:METADATA_LIMIT_CHARS])
     except ValidationError as error:
         raise ConfigError(f"{where}: {first_problem(error, ScoreInfo)}") from None
-    if info.groups != groups:
-        raise ConfigError(f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(groups)}")
+    if info.groups != groups or len(groups) > MAX_GROUPS:
+        raise ConfigError(
+            f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(groups)}; expected the same, at most {MAX_GROUPS}"
+        )
     network = Refinement(path, info, session, of_points[1])
     network._run(np.zeros((1, network.points, POINT_VALUES), np.float32), np.zeros((1, BOX_VALUES), np.float32))
     return network
