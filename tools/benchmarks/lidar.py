@@ -25,7 +25,7 @@ from log2sim.synth.returns import LIDAR_MODELS
 from log2sim.synth.traffic import Mount, draw_scene
 
 SWEEPS, REPEATS = 12, 5
-HEAD = ["clouds", "points in range", "cells", "leveling", "grid", "network", "decoding", "cloud to boxes", "over network alone"]  # fmt: skip
+HEAD = ["clouds", "points in range", "cells", "leveling", "grid", "network", "decoding, second stage", "cloud to boxes", "over network alone"]  # fmt: skip
 
 
 def fastest_ms(call: Callable[[], Any]) -> float:
