@@ -95,16 +95,20 @@ def points_around(xyz: NDArray[np.float32], boxes: LevelBoxes, margin_m: float =
 
 def points_within(around: PointsOfBoxes, xyz: NDArray[np.float32], boxes: LevelBoxes) -> PointsOfBoxes:
     """Take those of some points that are in the boxes themselves."""
-    offset = in_box_axes(xyz, around, boxes)
-    inside = np.flatnonzero((np.abs(offset) <= boxes.size_m[around.box] / 2).all(axis=1))
+    half = boxes.size_m.T.astype(xyz.dtype) / 2
+    along, across, up = np.abs(in_box_axes(xyz, around, boxes)).T
+    inside = np.flatnonzero(
+        (along <= half[0].take(around.box)) & (across <= half[1].take(around.box)) & (up <= half[2].take(around.box))
+    )
     return PointsOfBoxes(around.box[inside], around.point[inside], around.boxes)
 
 
-def in_box_axes(xyz: NDArray[np.float32], pairs: PointsOfBoxes, boxes: LevelBoxes) -> Array:
-    """Express points relative to the centers of boxes, along their axes: (K, 3), m."""
-    c, s = np.cos(boxes.yaw_rad)[pairs.box], np.sin(boxes.yaw_rad)[pairs.box]
-    x, y, z = (xyz[pairs.point] - boxes.center_m[pairs.box]).T
-    return np.stack([x * c + y * s, y * c - x * s, z], axis=1)
+def in_box_axes(xyz: NDArray[np.float32], pairs: PointsOfBoxes, boxes: LevelBoxes) -> NDArray[np.float32]:
+    """Express points relative to the centers of boxes, along their axes: (K, 3), m, in the precision of the points."""
+    center, kind = boxes.center_m.T.astype(xyz.dtype), xyz.dtype
+    c, s = (v.astype(kind).take(pairs.box) for v in (np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)))
+    x, y, z = (xyz[:, axis].take(pairs.point) - center[axis].take(pairs.box) for axis in range(3))
+    return np.stack([x * c + y * s, y * c - x * s, z]).T
 
 
 def box_inputs(
