@@ -120,7 +120,7 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
         shard = {name: data[name] for name in data.files}
     points, box, *targets = refinement.drawn(shard, np.arange(len(shard["matched"])), np.random.default_rng(0))
     network: Any = open_network(tmp_path / "roadside.onnx", LidarConfig(), name="x").refinement
-    found = torch.from_numpy(network._run(points.numpy(), box.numpy()).astype(np.float32))
+    found = torch.from_numpy(network.run(points.numpy(), box.numpy()).astype(np.float32))
     nothing = torch.zeros_like(found)
     nothing[:, 8] = 1.0
     errors, none = (refinement.loss_of(out, *targets)[1] for out in (found, nothing))

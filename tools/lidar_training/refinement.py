@@ -47,6 +47,7 @@ from log2sim.perception.detect3d.refinement import (
     in_box_axes,
     points_around,
     points_within,
+    toward_sensor,
 )
 from log2sim.synth.traffic import Mount
 
@@ -78,8 +79,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
     some = np.flatnonzero(points_within(around, xyz, found).count > 0)
     boxes, around = found.take(some), around.take(some)
     sampled, center = around.sample(MOST_POINTS), boxes.center_m
-    sensors, truth = viewpoints_xy(example.cloud), example.truth
-    away = sensors - center[:, None, :2]
+    truth = example.truth
     groups = detector.network.info.groups
     names = [GROUP_OF.get(c) for c in truth.category.tolist()]
     group = np.array([groups.index(g) if g in groups else -1 for g in names], np.intp)
@@ -104,7 +104,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
         "counts": around.count.astype(np.int32),
         "box": np.column_stack([center[:, 2], boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.heat, boxes.quality]).astype(np.float32),
         "group": boxes.group.astype(np.int8),
-        "toward": away[np.arange(len(some)), np.hypot(away[..., 0], away[..., 1]).argmin(axis=1)].astype(np.float32),
+        "toward": toward_sensor(boxes, viewpoints_xy(example.cloud)).astype(np.float32),
         "truth": target.astype(np.float32),
         "matched": matched,
         "unclear": unclear,
@@ -173,7 +173,7 @@ def drawn(shard: dict[str, NDArray[Any]], rows: NDArray[np.intp], rng: np.random
     x, y = (offset[:, :2] / (size[pair, :2] / 2)).T
     chosen &= (rng.random(len(pair)) < share[pair]) & (x * np.cos(angle)[pair] + y * np.sin(angle)[pair] > least[pair])
     chosen[(np.cumsum(n) - n)[np.bincount(pair, chosen, minlength=count) == 0]] = True
-    # In another order each time, so that the network is given others.
+    # In another order each time, so that the network takes other points.
     order = np.lexsort((rng.random(len(pair)), pair))
     order = order[chosen[order]]
     pairs = PointsOfBoxes(pair[order], order, count)
@@ -189,7 +189,7 @@ def reshaped(
     """Give objects other sizes, proportions and rounder sides, in place, and return where the centers (B, 3) of their boxes are then.
 
     `xyz`: (K, 3), of the objects `pair` (K,), whose boxes are `truth` (B, 7). Wheels and windscreens of simulated cars are at parts of the
-    length that are always alike, and their ends are flat: a network would tell the length by them, and be wrong of others. What is around an
+    length that are always alike, and their ends are flat: a network would infer the length from them, and be wrong about other cars. What is around an
     object keeps its distance.
     """
     count = len(truth)

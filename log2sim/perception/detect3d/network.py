@@ -50,7 +50,7 @@ def open_session(path: Path, max_bytes: int, kind: str) -> Any:
 
 
 def digest_of(path: Path) -> str:
-    """Return what tells a network from others: the content of its file, and the version of what runs it."""
+    """Return a digest of the content of a network's file, with the version of what runs it."""
     import onnxruntime
 
     content = read_file(path, MAX_FILE_BYTES, ConfigError)
@@ -334,7 +334,7 @@ class Network:
     session: Any  # onnxruntime.InferenceSession
 
     def digest(self) -> str:
-        """Return what tells it from other networks."""
+        """Return a digest of the content of its file, with the version of what runs it."""
         return digest_of(self.path)
 
     def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,8 +1,8 @@
 """Second stage of a LiDAR detector: a network on the points in and around each box.
 
-Cells of a grid are as wide as a person is deep. The points themselves tell more: whether the box holds a road user of its
+Cells of a grid are as wide as a person is deep. The points themselves show more: whether the box holds a road user of its
 group, where the sides are, and which end is the front. Such networks follow PointNet (Qi et al., CVPR 2017) and PointRCNN
-(Shi et al., CVPR 2019). The size of the box is among the inputs, since points alone do not tell how far they are from its
+(Shi et al., CVPR 2019). The size of the box is among the inputs, since points alone do not show how far they are from its
 sides (Li, Wang and Wang, "LiDAR R-CNN", CVPR 2021).
 """
 
@@ -34,7 +34,7 @@ from log2sim.perception.lidar.cloud import ON_GROUND_M
 SUFFIX = ".boxes.onnx"
 METADATA_KEY = "log2sim.boxes"
 MAX_FILE_BYTES = 64 * 1024**2
-# Points this far outside a box are looked at, too: places of boxes err by less, and the space around tells people from walls.
+# Points this far outside a box are looked at, too: places of boxes err by less, and the space around distinguishes people from walls.
 MARGIN_M = 0.5
 # Points of a box from which those of the network are drawn.
 MOST_POINTS = 256
@@ -54,7 +54,7 @@ class Refinement:
     points: int  # number of points of a box that the network takes
 
     def digest(self) -> str:
-        """Return what tells it from other networks."""
+        """Return a digest of the content of the file and of the version of what runs it."""
         return digest_of(self.path)
 
     def refine(self, boxes: LevelBoxes, xyz: NDArray[np.float32], sensors: Array) -> tuple[LevelBoxes, PointsOfBoxes]:
@@ -70,13 +70,13 @@ class Refinement:
         if not len(some):
             return boxes.take(some), inside.take(some)
         boxes, around = boxes.take(some), around.take(some)
-        away = sensors - boxes.center_m[:, None, :2]
-        toward = away[np.arange(len(some)), np.hypot(away[..., 0], away[..., 1]).argmin(axis=1)]
+        toward = toward_sensor(boxes, sensors)
         values = box_inputs(xyz, around.sample(MOST_POINTS), around.count, boxes, toward, self.points)
-        boxes = corrected(boxes, self._run(*values))
+        boxes = corrected(boxes, self.run(*values))
         return boxes, points_within(around, xyz, boxes)
 
-    def _run(self, points: NDArray[np.float32], of_box: NDArray[np.float32]) -> Array:
+    def run(self, points: NDArray[np.float32], of_box: NDArray[np.float32]) -> Array:
+        """Compute the corrections (M, 11) from the inputs of M boxes; `ConfigError` when it fails."""
         try:
             (out,) = self.session.run(["corrections"], {"points": points, "box": of_box})
         except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
@@ -84,6 +84,12 @@ class Refinement:
         if out.shape != (len(of_box), OUTPUTS):
             raise ConfigError(f"{self.path}: output 'corrections' is {out.shape}, expected ({len(of_box)}, {OUTPUTS})")
         return np.nan_to_num(np.asarray(out, np.float64))
+
+
+def toward_sensor(boxes: LevelBoxes, sensors: Array) -> Array:
+    """Return the ways (M, 2), m, from the centers of boxes to the nearest of the sensors (V, 2) in the plane."""
+    away = sensors - boxes.center_m[:, None, :2]
+    return np.asarray(away[np.arange(len(away)), np.hypot(away[..., 0], away[..., 1]).argmin(axis=1)])
 
 
 def points_around(xyz: NDArray[np.float32], boxes: LevelBoxes, margin_m: float = MARGIN_M) -> PointsOfBoxes:
@@ -183,5 +189,5 @@ def load_refinement(path: Path, groups: tuple[str, ...]) -> Refinement:
             f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(groups)}; expected the same, at most {MAX_GROUPS}"
         )
     network = Refinement(path, info, session, of_points[1])
-    network._run(np.zeros((1, network.points, POINT_VALUES), np.float32), np.zeros((1, BOX_VALUES), np.float32))
+    network.run(np.zeros((1, network.points, POINT_VALUES), np.float32), np.zeros((1, BOX_VALUES), np.float32))
     return network
