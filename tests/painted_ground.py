@@ -82,8 +82,10 @@ class Painter:
             share = share * (noise > np.quantile(noise, worn))
         self.lay(share, color, reflects=1.0)
 
-    def ground(self, *, grain: float = 0.05, lidar: bool = True, blur: float = 0.6) -> GroundMap:
-        """Make the map: grain of the surface (share of brightness), blur in cells, and noise."""
+    def ground(
+        self, *, grain: float = 0.05, lidar: bool = True, blur: float = 0.6, reflects: float = 0.4, noise: float = 0.04
+    ) -> GroundMap:
+        """Make the map: grain of the surface (share of brightness), blur in cells, LiDAR intensity of paint above the road, and its noise."""
         texture = cv2.GaussianBlur(self.rng.normal(size=self.paint.shape).astype(np.float32), (0, 0), 0.8)
         coarse = cv2.GaussianBlur(self.rng.normal(size=self.paint.shape).astype(np.float32), (0, 0), 6)
         shade = 1 + grain * texture / texture.std() + grain / 2 * coarse / coarse.std()
@@ -91,7 +93,7 @@ class Painter:
         image = np.clip(image + self.rng.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
         intensity = np.full(self.paint.shape, np.nan, np.float32)
         if lidar:
-            value = 0.12 + 0.4 * self.paint + self.rng.normal(0, 0.04, self.paint.shape)
+            value = 0.12 + reflects * self.paint + self.rng.normal(0, noise, self.paint.shape)
             hit = self.rng.random(self.paint.shape) < 0.3
             intensity = np.where(hit, np.clip(value, 0, 1), np.nan).astype(np.float32)
         return GroundMap(image, self.alpha, self.height, intensity, self.cell_m, self.extent_m)

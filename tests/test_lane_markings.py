@@ -162,6 +162,28 @@ def test_rings_that_return_what_the_road_does_are_no_paint() -> None:
     )
 
 
+@pytest.mark.parametrize("change", [None, wet_glare], ids=["wet", "glare"])
+def test_wet_paint_returns_little_and_glare_nothing(change) -> None:
+    painter = Painter(EXTENT)
+    truth = road(painter)
+    if change:
+        change(painter)
+    precision, recall, _ = compare(find_markings(painter.ground(reflects=0.015, noise=0.01))[0], truth)
+    assert precision >= 0.95
+    assert recall >= 0.8
+
+
+def test_lidar_says_nothing_of_paint_that_its_points_miss() -> None:
+    seen = {"color": 0.4, "reflected": 0.0, "reflected_sigma": 0.05, "width_m": 0.12, "outshines": 0.4}
+    seen |= {"edge_m": 0.04, "uneven": 0.0}
+
+    def odds(**more: float) -> float:
+        return log_odds_of_line(no_pieces(6, **{k: np.full(6, v) for k, v in (seen | more).items()}), 12.0, dashes=1)
+
+    assert odds(resolved=0.0) == pytest.approx(odds(reflected=np.nan))
+    assert odds(resolved=0.0) > odds(resolved=0.5) > odds(resolved=1.0)
+
+
 def test_dashes_that_a_camera_sees_blurred_are_no_symbols() -> None:
     painter = Painter(EXTENT)
     painter.lines([np.array([[x, 0.0], [x + 3.0, 0.0]]) for x in (3.0, 9.0, 15.0)], 0.15)

@@ -92,6 +92,9 @@ class GroundMap:
     resolution_m: float  # edge of a cell
     extent_m: Extent  # x0, x1, y0, y1 of the outer edges, m
     notes: tuple[str, ...] = ()  # what could not be mapped, and why
+    spacing_m: NDArray[np.float16] | None = (
+        None  # (R, C): mean distance of neighboring LiDAR points; infinite without any
+    )
 
     @property
     def raster(self) -> Raster:
@@ -137,4 +140,5 @@ class GroundMap:
         extent = (x0 + columns.start * d, x0 + columns.stop * d, y1 - rows.stop * d, y1 - rows.start * d)
         color, alpha = (layer[rows, columns].copy() for layer in (self.color_bgr, self.alpha))
         height, intensity = (layer[rows, columns].copy() for layer in (self.height_m, self.intensity))
-        return GroundMap(color, alpha, height, intensity, d, extent, self.notes)
+        spacing = None if self.spacing_m is None else self.spacing_m[rows, columns].copy()
+        return GroundMap(color, alpha, height, intensity, d, extent, self.notes, spacing)

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.paint import Pieces, log_odds_of_line
+from log2sim.road.paint import Pieces, log_odds_of_line, returned_share
 from log2sim.road.ridges import Mask
-from log2sim.road.strokes import Curve, fit_curve, stretches_of, trace
+from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
 # The longest gaps of dashed lines are 12 m (Germany: 12 m at 6 m dashes; MUTCD: 30 ft = 9.1 m; UK: 7 m; Japan: 12 m).
@@ -273,7 +273,7 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
 
 def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[PaintedLine]:
     """Make lines of chains."""
-    out: list[PaintedLine] = []
+    found: list[tuple[Array, Stretch, Pieces, float]] = []  # with the length that is painted, m
     for chain in chains:
         corners = chain.corners(pieces)
         if np.linalg.norm(np.diff(corners, axis=0), axis=1).sum() < MIN_LINE_M:
@@ -288,8 +288,12 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
-            odds = log_odds_of_line(member, traced.painted_m(begin, end), dashes=stretch.dashes)
-            out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
+            found.append((xy, stretch, member, traced.painted_m(begin, end)))
+    returned = returned_share((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in found)
+    out = []
+    for xy, stretch, member, painted_m in found:
+        odds = log_odds_of_line(member, painted_m, dashes=stretch.dashes, returned=returned)
+        out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
     return _in_context(drop_repeats(out))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -14,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import Layer, RidgePoints, Samples, log_intensity, sample
+from log2sim.road.ridges import EXPECTED_COLOR, Layer, RidgePoints, Samples, log_intensity, sample
 from log2sim.road.surface import USUAL
 
 AROUND_M = 0.25
@@ -40,6 +41,7 @@ def at_height(ground: GroundMap, xy: Array) -> Array:
     return np.column_stack([xy, np.interp(s, s[known], z[known])])
 
 
+PAINT_WIDTH_M = 0.13  # of the usual lines of 0.1 to 0.15 m
 PROFILE_M, PROFILE_STEP_M, ALONG_SAMPLES = 1.5, 0.05, 11
 MIN_SEEN = 0.6  # share of a profile's middle; of what is hidden beside a line, the other side tells
 MAX_SHIFT_M = 0.12  # from the ridge, which is as fine as a coarse cell, to the middle of the paint
@@ -70,6 +72,7 @@ class Pieces:
     reflected: Array
     reflected_sigma: Array
     above_road: Array  # (N,): logarithm by which LiDAR intensity is above what the road around the ego's way returns
+    resolved: Array  # (N,): share of paint there that LiDAR resolves
 
     def __len__(self) -> int:
         """Count the pieces."""
@@ -123,7 +126,17 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     # Beside a road there are brighter grounds; the road itself is on one side at least.
     outshines = _quiet(np.nanmean, np.where(inside, color, np.nan)) - np.fmin(*around)
     above_road = _quiet(np.nanmean, np.where(inside, reflected, np.nan)) - float(log_intensity(np.array(USUAL)))
-    return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, edge, outshines, yellow, *by_lidar[:2], above_road)
+    resolved = np.ones(len(lines))
+    if ground.spacing_m is not None:
+        row, column = (np.rint(a).astype(int) for a in ground.raster.cells_of(xy))
+        rows, columns = ground.alpha.shape
+        spacing = ground.spacing_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)].astype(np.float64)
+        # How likely one of points that are scattered at random so far apart lies within half the width of paint. Without a camera
+        # the contrast is all there is to go by.
+        resolved = np.where(by_camera, 1 - np.exp(-np.pi / 4 * (PAINT_WIDTH_M / spacing) ** 2), 1.0)
+    return Pieces(
+        xy, lines[:, 2], lines[:, 3], width, *by_color, edge, outshines, yellow, *by_lidar[:2], above_road, resolved
+    )
 
 
 def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
@@ -232,13 +245,26 @@ MIN_ABOVE_ROAD, NO_BRIGHTER = 0.15, -4.0
 MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
 
-def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True) -> float:
-    """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks."""
+def log_odds_of_line(
+    pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True, returned: float = 1.0
+) -> float:
+    """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks.
+
+    `returned`: share of its usual contrast that paint has in LiDAR intensities of this map, see `returned_share`.
+    """
+    if np.isfinite(pieces.color).any():
+        return log_odds_by_camera(pieces, painted_m, dashes=dashes, alone=alone) + by_lidar(pieces, returned)
+    # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen. Rings of the road
+    # between darker ones stand out as paint does, but return no more than the road.
+    odds = min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(by_lidar(pieces), MAX_BY_LIDAR_ALONE)
+    odds += _by_dashes(dashes) if alone else 0.0
+    return odds + (NO_BRIGHTER if _median_known(pieces.above_road) < MIN_ABOVE_ROAD else 0.0)
+
+
+def log_odds_by_camera(pieces: Pieces, painted_m: float, *, dashes: int = 1, alone: bool = True) -> float:
+    """Log-odds that pieces in a line, some of which a camera saw, are a marking, by shape and color."""
     odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
-    odds += PER_DASH * min(max(dashes - 2, 0), MAX_DASHES)
-    by_camera = bool(np.isfinite(pieces.color).any())
-    if by_camera:
-        odds += _by_shape(pieces, alone=alone)
+    odds += _by_dashes(dashes) + _by_shape(pieces, alone=alone)
     width = median(pieces.width_m)
     by_width = 0.0 if MIN_WIDTH_M <= width <= MAX_WIDTH_M else WIDTH_UNUSUAL
     if len(pieces) >= 3:
@@ -247,14 +273,11 @@ def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, alone: bo
     odds += by_width
     if alone and dashes > 1 and width > MAX_DASH_WIDTH_M:
         odds += WIDE_DASHES
-    odds = min(odds, MAX_BY_CAMERA)
-    lidar = by_lidar(pieces)
-    if by_camera:
-        return odds + lidar
-    # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen. Rings of the road
-    # between darker ones stand out as paint does, but return no more than the road.
-    odds = min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(lidar, MAX_BY_LIDAR_ALONE)
-    return odds + (NO_BRIGHTER if _median_known(pieces.above_road) < MIN_ABOVE_ROAD else 0.0)
+    return min(odds, MAX_BY_CAMERA)
+
+
+def _by_dashes(dashes: int) -> float:
+    return PER_DASH * min(max(dashes - 2, 0), MAX_DASHES)
 
 
 def _by_shape(pieces: Pieces, *, alone: bool) -> float:
@@ -273,20 +296,63 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
     return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
 
 
-def by_lidar(pieces: Pieces) -> float:
-    """Log-odds by LiDAR intensity: 0 where it saw too little."""
+# Shares of the usual contrast that are compared: under a film of water paint returns a few percent to a fifth of it.
+RETURNED, WET_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
+# Errors that all returns along a line share, as by the angle of a ring to the ground.
+SHARED_SIGMA = 0.015
+MIN_TOLD_M = 4.0  # of lines that tell how much paint returns
+
+
+def by_lidar(pieces: Pieces, returned: float = 1.0) -> float:
+    """Log-odds by LiDAR intensity, whose contrasts are a share of what they usually are; 0 where it saw too little."""
+    told = _reflected(pieces)
+    if told is None:
+        return 0.0
+    paint, other = _log_densities(np.array(told), returned)
+    return float(np.clip(paint - other, -MAX_BY_LIDAR, MAX_BY_LIDAR))
+
+
+def returned_share(lines: Iterable[tuple[Pieces, float, int]]) -> float:
+    """Estimate which share of its usual contrast paint has in LiDAR intensities of a map.
+
+    `lines`: pieces, length with paint, m, and number of dashes. Of those that stand out to a camera, the likelihood of the
+    contrasts to LiDAR is the highest with that share, each of paint as likely as the camera says or of something else.
+    """
+    odds, told = [], []
+    for pieces, painted_m, dashes in lines:
+        contrast = _reflected(pieces) if painted_m > MIN_TOLD_M else None
+        if contrast is not None and _median_known(pieces.color) > EXPECTED_COLOR / 2:
+            odds.append(log_odds_by_camera(pieces, painted_m, dashes=dashes))
+            told.append(contrast)
+    if not told:
+        return 1.0
+    paint, other = _log_densities(np.array(told)[:, None], RETURNED)
+    by_camera = np.array(odds)[:, None]
+    likelihood = np.logaddexp(paint + by_camera, other) - np.logaddexp(by_camera, 0)
+    prior = np.log(np.where(RETURNED < 1, WET_PRIOR / (len(RETURNED) - 1), 1 - WET_PRIOR))
+    return float(RETURNED[np.argmax(likelihood.sum(axis=0) + prior)])
+
+
+def _reflected(pieces: Pieces) -> tuple[float, float, float] | None:
+    """Contrast of the logarithm of LiDAR intensity of a line, its standard error, and `resolved`; None where LiDAR saw too little."""
     known = np.isfinite(pieces.reflected) & np.isfinite(pieces.reflected_sigma)
     if np.count_nonzero(known) < MIN_REFLECTING:
-        return 0.0
+        return None
     values = pieces.reflected[known]
-    mean = median(values)
-    error = float(median(pieces.reflected_sigma[known]) / np.sqrt(len(values)))
+    error = median(pieces.reflected_sigma[known]) / np.sqrt(len(values))
+    return median(values), float(error), median(pieces.resolved[known])
 
-    def log_density(of: tuple[float, float]) -> float:
-        sigma = float(np.hypot(of[1], error))
-        return -0.5 * ((mean - of[0]) / sigma) ** 2 - float(np.log(sigma))
 
-    return float(np.clip(log_density(PAINT_REFLECTS) - log_density(OTHER_REFLECTS), -MAX_BY_LIDAR, MAX_BY_LIDAR))
+def _log_densities(reflected: Array, returned: Array | float) -> tuple[Array, Array]:
+    """Logarithms of the densities (...) of contrasts (..., 3), see `_reflected`, for paint and for something else."""
+    mean, error, resolved = np.moveaxis(reflected, -1, 0)
+    # Paint that LiDAR does not resolve looks like something else.
+    spread = np.hypot(resolved * PAINT_REFLECTS[1], (1 - resolved) * OTHER_REFLECTS[1])
+    out = []
+    for usual, sigma in ((resolved * PAINT_REFLECTS[0], spread), (OTHER_REFLECTS[0], OTHER_REFLECTS[1])):
+        sigma = np.sqrt((returned * sigma) ** 2 + error**2 + SHARED_SIGMA**2)
+        out.append(-0.5 * ((mean - returned * usual) / sigma) ** 2 - np.log(sigma))
+    return out[0], out[1]
 
 
 def probability(log_odds: float) -> float:

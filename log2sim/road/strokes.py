@@ -13,7 +13,7 @@ from scipy.ndimage import percentile_filter
 
 from log2sim.geometry import Array, median, runs_of
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import EXPECTED_COLOR, EXPECTED_INTENSITY, sample
+from log2sim.road.ridges import sample
 
 KNOT_M = 0.5
 # Change of curvature per meter that is ordinary: clothoids of A = 30 m (1 / A**2) at low speed; RAL 2012 has A of 90 m to
@@ -187,20 +187,23 @@ def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:
     sides = width_m / 2 + np.array(FLANKS_M)
     across = np.concatenate([inside, -sides, sides])
     seen = sample(ground, xy[:, :1] + normal[:, :1] * across[None, :], xy[:, 1:] + normal[:, 1:] * across[None, :])
-    # Beside a bright curb a line hardly stands out by color, and under water not by intensity: both together, as the best filter for
-    # known contrasts in independent noise weighs them, see `ridges`.
+    # Beside a bright curb a line hardly stands out by color, and under water or between far rings not by intensity: both together,
+    # as the best filter for known contrasts in independent noise weighs them. Known is what each usually has nearby.
     total, weight = np.zeros(len(s)), np.zeros(len(s))
-    for values, expected in ((seen.paint, EXPECTED_COLOR), (seen.intensity, EXPECTED_INTENSITY)):
-        contrast = _ridge(values)
+    for values in (seen.paint, seen.intensity):
+        contrast = _smoothed(_ridge(values))
         known = np.isfinite(contrast)
+        if np.count_nonzero(known) < 3:
+            continue
         # Paint begins and ends at few places, so that most differences over half a meter are noise.
         steps = np.abs(contrast[LAG:] - contrast[:-LAG])
         steps = steps[np.isfinite(steps)]
         noise = max(median(steps) / (0.6745 * np.sqrt(2)), MIN_NOISE) if len(steps) else 1.0
-        total[known] += contrast[known] * expected / noise**2
-        weight[known] += expected**2 / noise**2
-    soft = _normalized(np.divide(total, weight, out=np.full(len(s), np.nan), where=weight > 0))
-    return Trace(s, np.nan_to_num(soft) > ON_SHARE, np.isfinite(soft))
+        usual = _usual(contrast[known])
+        total[known] += contrast[known] * usual / noise**2
+        weight[known] += usual**2 / noise**2
+    share = np.divide(total, weight, out=np.full(len(s), np.nan), where=weight > 0)
+    return Trace(s, np.nan_to_num(share) > ON_SHARE, np.isfinite(share))
 
 
 def _ridge(values: NDArray[np.float32]) -> Array:
@@ -219,23 +222,21 @@ def _ridge(values: NDArray[np.float32]) -> Array:
     return np.asarray(mean(slice(0, 3)) - np.fmax(left, right))
 
 
-def _normalized(contrast: Array) -> Array:
-    """Smooth contrasts (P,) and divide by what paint has; NaN where nothing is known."""
+def _smoothed(contrast: Array) -> Array:
+    """Average contrasts (P,) over `SMOOTH_M`; NaN stays."""
     known: NDArray[np.bool_] = np.isfinite(contrast)
-    if np.count_nonzero(known) < 3:
-        return np.full(len(contrast), np.nan)
     size = (1, 2 * round(SMOOTH_M / STEP_M / 2) + 1)
     values = np.nan_to_num(contrast), known.astype(np.float64)
     total, count = (cv2.blur(a.reshape(-1, 1), size).ravel() for a in values)
-    soft = np.divide(total, count, out=np.zeros(len(total)), where=count > 0)
+    return np.asarray(np.divide(total, count, out=np.full(len(total), np.nan), where=known))
+
+
+def _usual(contrast: Array) -> Array:
+    """Return the contrast (P,) that paint has near each place of a line, 0 where nothing stands out."""
     # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
-    level = float(np.quantile(soft[known], 0.875))
-    near = percentile_filter(soft[known], 87.5, round(LEVEL_M / STEP_M), mode="nearest")
-    scale = np.ones(len(soft))
-    scale[known] = np.maximum(near, MIN_LEVEL * level)
-    soft = soft / scale if level > 0 else np.zeros(len(soft))
-    soft[~known] = np.nan
-    return np.asarray(soft, np.float64)
+    level = float(np.quantile(contrast, 0.875))
+    near = percentile_filter(contrast, 87.5, round(LEVEL_M / STEP_M), mode="nearest")
+    return np.asarray(np.maximum(near, MIN_LEVEL * level).clip(0), np.float64)
 
 
 def stretches_of(strokes: Array) -> list[Stretch]:

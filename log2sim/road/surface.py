@@ -268,12 +268,17 @@ SHARP_RANGE_M = 20.0
 # Points count in cells this near to theirs, in cells: first those nearly in it, then those within the gaps between rings.
 SPREADS = (0.8, 2.5)
 MIN_WEIGHT = 0.02
+AROUND_M = (
+    0.45  # edge of the square in which points are counted: as far apart as rings are where they still tell something
+)
 
 
 def map_intensity(
     points: GroundPoints, surface: Surface, raster: Raster, road: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
     """Map relative intensities of points onto a raster: (R, C) in [0, 1], NaN where there are none.
+
+    The second result is the mean distance of neighboring points (R, C), m, infinite where there are none.
 
     `surface`: points off it are left out. `road`: (r, c) bool: cells of the surface's raster that are road surely,
     because the ego drove there.
@@ -292,7 +297,11 @@ def map_intensity(
         near, near_sums = (cv2.GaussianBlur(a, (0, 0), spread) for a in (total, sums))
         free = np.isnan(out) & (near > MIN_WEIGHT / spread**2)
         out[free] = near_sums[free] / near[free]
-    return np.asarray(np.minimum(out * np.float32(USUAL), 1), dtype=np.float32)
+    found = np.bincount(fine, minlength=count).astype(np.float32).reshape(raster.shape)
+    size = round(AROUND_M / raster.resolution_m) | 1
+    with np.errstate(divide="ignore"):
+        spacing = raster.resolution_m / np.sqrt(cv2.blur(found, (size, size)))
+    return np.minimum(out * np.float32(USUAL), 1), spacing.astype(np.float16)
 
 
 def normalize(points: GroundPoints, ground: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:
