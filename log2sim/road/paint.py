@@ -128,7 +128,7 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     above_road = _quiet(np.nanmean, np.where(inside, reflected, np.nan)) - float(log_intensity(np.array(USUAL)))
     resolved = np.ones(len(lines))
     if ground.spacing_m is not None:
-        row, column = (np.rint(a).astype(int) for a in ground.raster.cells_of(xy))
+        row, column = (np.rint(a).astype(int) for a in ground.raster.cells_of(lines[:, :2]))
         rows, columns = ground.alpha.shape
         spacing = ground.spacing_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)].astype(np.float64)
         # How likely one of points that are scattered at random so far apart lies within half the width of paint. Without a camera
@@ -296,8 +296,9 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
     return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
 
 
-# Shares of the usual contrast that are compared: under a film of water paint returns a few percent to a fifth of it.
-RETURNED, WET_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
+# Shares of the usual contrast that are compared. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which compress
+# strong returns, a fifth; how often is a guess.
+RETURNED, LESS_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
 # Errors that all returns along a line share, as by the angle of a ring to the ground.
 SHARED_SIGMA = 0.015
 MIN_TOLD_M = 4.0  # of lines that tell how much paint returns
@@ -329,7 +330,7 @@ def returned_share(lines: Iterable[tuple[Pieces, float, int]]) -> float:
     paint, other = _log_densities(np.array(told)[:, None], RETURNED)
     by_camera = np.array(odds)[:, None]
     likelihood = np.logaddexp(paint + by_camera, other) - np.logaddexp(by_camera, 0)
-    prior = np.log(np.where(RETURNED < 1, WET_PRIOR / (len(RETURNED) - 1), 1 - WET_PRIOR))
+    prior = np.log(np.where(RETURNED < 1, LESS_PRIOR / (len(RETURNED) - 1), 1 - LESS_PRIOR))
     return float(RETURNED[np.argmax(likelihood.sum(axis=0) + prior)])
 
 
