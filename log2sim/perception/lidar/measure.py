@@ -155,7 +155,7 @@ def measure(
             columns["points"][k], columns["t_ns"][k] = len(inside), cloud.stamp_ns
             columns["seen_by"][k] |= cloud.ends_of(visible.index[inside])
     if searched:
-        _weigh_pairs(columns, images, pairs, [view for view, _, _ in frames])
+        _weigh_pairs(columns, images, pairs, len(boxes), [view for view, _, _ in frames])
     others = tuple(columns["others"]) if any(view is not None for view in columns["others"]) else ()
     return Measurements(**columns | {"cluster": tuple(columns["cluster"]), "others": others})
 
@@ -184,8 +184,6 @@ def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
 MIN_IOU = 0.3
 # The category of the image counts where the boxes overlap by this.
 MIN_CATEGORY_IOU = 0.5
-# Recall of a detector in images for objects of at least this height in px, and the height at which it finds none.
-IMAGE_RECALL, IMAGE_RECALL_PX, NO_IMAGE_RECALL_PX = 0.6, 40.0, 12.0
 # Recall of a detector in sweeps for objects with many points, within its range, by group; half of it is reached at so many
 # points.
 SWEEP_RECALL = {"vehicle": 0.75, "two_wheeler": 0.6, "pedestrian": 0.5}
@@ -217,18 +215,15 @@ class Pairs:
     box: Index  # `box`, `image`: (P,)
     image: Index
     iou: Array  # (P,): of the projected box with the image box
-    # (M,): height of the projected box in the image where it is highest; 0 for a box outside all images
-    height_px: Array
 
 
 def match_boxes(boxes: Boxes3D, images: Measurements, frame: Index, views: Sequence[View]) -> Pairs:
     """Match 3D boxes (M,) with image boxes (N,) of frames numbered (N,), the best pairs first; one of a box in each frame."""
-    iou, height_px = np.zeros((len(boxes), len(images))), np.zeros(len(boxes))
+    iou = np.zeros((len(boxes), len(images)))
     for k, view in enumerate(views):
         projected = project_boxes_in_view(view, boxes.center_m, boxes.size_m, boxes.yaw_rad)
-        box_px, of_frame = np.nan_to_num(projected.box_px), np.flatnonzero(frame == k)
-        height_px = np.maximum(height_px, box_px[:, 3] - box_px[:, 1])
-        iou[:, of_frame] = box_iou(box_px, images.box_px[of_frame])
+        of_frame = np.flatnonzero(frame == k)
+        iou[:, of_frame] = box_iou(np.nan_to_num(projected.box_px), images.box_px[of_frame])
     # Categories of one group may be of one object, and those that are confused with each other.
     a, b = (np.array([GROUP_OF[str(c)] for c in of.category], dtype="<U16") for of in (boxes, images))
     allowed = [(a[:, None] == one) & (b == other) for one, other in RELATED_GROUPS]
@@ -242,15 +237,14 @@ def match_boxes(boxes: Boxes3D, images: Measurements, frame: Index, views: Seque
             free_boxes.remove((i, int(frame[j])))
             kept.append(n)
     box, image = pairs[kept].T
-    return Pairs(box, image, iou[box, image], height_px)
+    return Pairs(box, image, iou[box, image])
 
 
-def _weigh_pairs(columns: dict[str, Any], images: Measurements, pairs: Pairs, views: Sequence[View]) -> None:
-    """Write what image boxes say into the first rows, of 3D boxes; doubt the rows that the other detector should have found."""
-    count = len(pairs.height_px)
+def _weigh_pairs(
+    columns: dict[str, Any], images: Measurements, pairs: Pairs, count: int, views: Sequence[View]
+) -> None:
+    """Write what image boxes say into the first rows, of 3D boxes; doubt the others where the LiDAR should have shown an object."""
     score = columns["score"][:count].copy()
-    tall = (pairs.height_px - NO_IMAGE_RECALL_PX) / (IMAGE_RECALL_PX - NO_IMAGE_RECALL_PX)
-    columns["score"][:count] = if_missed(score, IMAGE_RECALL * np.clip(tall, 0, 1))
     # Of images alone, by how many points they have.
     found = np.array([SWEEP_RECALL.get(GROUP_OF[str(c)], 0.0) for c in columns["category"][count:]], dtype=np.float64)
     points = columns["points"][count:]
