@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lidar_networks import INFO, write_refinement
-from lidar_training.clouds import draw_example
 from test_detect3d_network import BOX, LOG, ORIGIN, cloud_of, solid, taller_is_hotter
+from training.clouds import draw_example
 
 from log2sim.config import LidarConfig
 from log2sim.errors import ConfigError

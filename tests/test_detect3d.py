@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from lidar_networks import NAMES, empty_maps, encode, info
-from lidar_training.clouds import draw_example
 from numpy.typing import NDArray
+from training.clouds import draw_example
 
 from log2sim.config import LidarConfig
 from log2sim.evaluation.detection.boxes import SceneBoxes

@@ -31,7 +31,6 @@ from log2sim.datatypes import Frame
 from log2sim.logs.native.writer import write_log
 
 pytestmark = pytest.mark.slow
-PAPERS = ("zou2021", "two_stream")
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 
 
@@ -56,11 +55,11 @@ def test_every_command_says_what_it_takes(folder: str, capsys: pytest.CaptureFix
 
 def test_documents_give_options_that_the_tools_have() -> None:
     pytest.importorskip("torch")
-    root, folders = TOOLS.parent, {"bench": "benchmarks", "fit": "fits"}
+    root, folders = TOOLS.parent, {"bench": "benchmarks", "fit": "fits", "train": "training"}
     pages = [*root.glob("*.md"), root / "log2sim/README.md", *root.glob("samples/cookbook/*.md")]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages).replace("\\\n", " ")
     for tool, name, rest in re.findall(r"tools/(\w+)\.py(?: (\w+))?([^`\n#]*)", text):
-        inner = f"{folders[tool]}.{name}" if tool in folders else f"lidar_training.{name}" if name in PAPERS else tool
+        inner = f"{folders[tool]}.{name}" if tool in folders else tool
         asked = {option.replace("-", "_").removeprefix("no_") for option in re.findall(r" --([a-z-]+)", rest)}
         if asked and name != "NAME":
             known = set(inspect.signature(importlib.import_module(inner).main).parameters)

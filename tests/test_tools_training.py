@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lidar_training.clouds import CATEGORIES, Sample, write_shard
+from training.clouds import CATEGORIES, Sample, write_shard
 from worlds import cloud_at
 
 from log2sim.evaluation.detection.boxes import SceneBoxes
@@ -30,22 +30,22 @@ def torch() -> Any:
 
 def test_a_toy_learns_to_find_people(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of a minute from nothing: centers of people on fresh scenes are found first; chance finds one in hundreds."""
-    import train_lidar
+    from training import lidar
 
-    monkeypatch.setattr(train_lidar, "PER_SHARD", 40)
-    monkeypatch.setitem(train_lidar.CELLS, "roadside", 128)
-    rounds = [train_lidar.Round(5, 40, 200)]
-    train_lidar.generate("roadside", tmp_path / "data", 40, 5)
-    train_lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
-    train_lidar.finish("roadside", tmp_path, rounds, examples=24)
+    monkeypatch.setattr(lidar, "PER_SHARD", 40)
+    monkeypatch.setitem(lidar.CELLS, "roadside", 128)
+    rounds = [lidar.Round(5, 40, 200)]
+    lidar.generate("roadside", tmp_path / "data", 40, 5)
+    lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
+    lidar.finish("roadside", tmp_path, rounds, examples=24)
     card = json.loads((tmp_path / "roadside.json").read_text())
     assert card["simulated"]["pedestrian"]["average_precision"] > 0.08
     assert (tmp_path / "roadside.onnx").stat().st_size < 1_300_000
 
 
 def test_targets_of_the_second_stage_make_boxes_the_true_ones() -> None:
-    from lidar_training.refinement import targets_of
     from test_box_refinement import boxes_at
+    from training.refinement import targets_of
 
     from log2sim.perception.detect3d.refinement import corrected
 
@@ -64,7 +64,7 @@ def test_targets_of_the_second_stage_make_boxes_the_true_ones() -> None:
 
 
 def test_reshaped_objects_fill_their_boxes_as_before_and_what_is_around_keeps_its_distance() -> None:
-    from lidar_training.refinement import reshaped
+    from training.refinement import reshaped
 
     rng = np.random.default_rng(4)
     truth = rng.uniform([-1, -1, 0.5, 0.5, 0.5, 1.0, -3], [1, 1, 1, 8, 3, 3, 3], (40, 7))
@@ -101,7 +101,7 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, torch: Any
 ) -> None:
     """In a quarter of a minute, from a few scenes, on others: places take more steps."""
-    from lidar_training import refinement
+    from training import refinement
 
     from log2sim.config import LidarConfig
     from log2sim.perception.detect3d.detectors import WEIGHTS, open_network
@@ -129,8 +129,8 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
 
 def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any) -> None:
     """A network that is read back computes what it did, on other grids than those that its layers' moments were taken from, and so does a wider one."""
-    from lidar_training.export import description, export_onnx, import_onnx, widened
-    from lidar_training.network import BevNetwork
+    from training.export import description, export_onnx, import_onnx, widened
+    from training.network import BevNetwork
 
     network = BevNetwork((16, 24, 32, 40))
     for layer in network.modules():
@@ -156,7 +156,7 @@ def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any)
 
 
 def test_a_bicycle_without_rider_is_no_person_but_may_be_a_two_wheeler(torch: Any) -> None:
-    from lidar_training.network import GROUPS, targets_of
+    from training.network import GROUPS, targets_of
 
     boxes = np.array([[2, 2, 0.5, 1.8, 0.6, 1.1, 0.3], [-6, 2, 0.8, 0.7, 0.7, 1.7, 0.0]], np.float32)
     category = np.array([CATEGORIES.index("bicycle"), CATEGORIES.index("pedestrian")])
@@ -179,7 +179,7 @@ def points_in(boxes: np.ndarray, count: int, rng: np.random.Generator) -> np.nda
 
 
 def test_the_network_of_cells_and_votes_is_trained_from_shards_and_exported(tmp_path: Path) -> None:
-    from lidar_training import zou2021
+    from training import zou2021
 
     rng, names = np.random.default_rng(0), ("car", "truck", "pedestrian", "cyclist")
     boxes = np.array(
@@ -209,7 +209,7 @@ SLOPE = 0.02
 
 def pair_of_a_slope(yaw: float = 0.6) -> Any:
     """A sweep on a slope and a picture of a camera that looks along `yaw`."""
-    from lidar_training import real_logs, two_stream
+    from training import real_logs, two_stream
 
     rng = np.random.default_rng(3)
     flat = np.column_stack([rng.uniform(0, 40, 9000), rng.uniform(-15, 15, 9000), rng.normal(0, 0.01, 9000)])
@@ -237,7 +237,7 @@ def pair_of_a_slope(yaw: float = 0.6) -> Any:
 
 
 def test_two_streams_learn_one_pair_are_exported_and_find_its_objects(tmp_path: Path) -> None:
-    from lidar_training import fitting, two_stream
+    from training import fitting, two_stream
 
     pair = pair_of_a_slope()
     network = two_stream.TwoStream(((8, 1), (16, 1)))
@@ -263,10 +263,10 @@ def test_two_streams_learn_one_pair_are_exported_and_find_its_objects(tmp_path: 
 
 def test_a_toy_learns_to_name_colors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Chance names one of ten right."""
-    import train_colors
+    from training import colors
 
-    monkeypatch.setattr(train_colors, "TRACKS", 60)
-    train_colors.main(tmp_path, worlds=150, steps=100)
+    monkeypatch.setattr(colors, "TRACKS", 60)
+    colors.main(tmp_path, worlds=150, steps=100)
     card = json.loads((tmp_path / "colors.json").read_text())
     assert card["simulated"]["top1"] > 0.25
     assert (tmp_path / "colors.onnx").stat().st_size < 480_000
@@ -274,7 +274,7 @@ def test_a_toy_learns_to_name_colors(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_white_surface_in_even_light_is_as_bright_as_the_light() -> None:
     """By spherical harmonics of second order, whichever way it faces; under half a sky it has the share that it sees of it."""
-    from color_training.pictures import AREA, COSINE, HARMONICS, ROWS, _harmonics
+    from training.color_pictures import AREA, COSINE, HARMONICS, ROWS, _harmonics
 
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(50, 3))

@@ -1,6 +1,6 @@
 """Colors of vehicles, named by a network in the pictures that show them best.
 
-The network was trained on rendered vehicles alone (`tools/train_colors.py`); its file describes itself under `METADATA_KEY`, the card
+The network was trained on rendered vehicles alone (`tools/train.py colors`); its file describes itself under `METADATA_KEY`, the card
 beside it tells seed, data, steps and figures.
 """
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from lidar_training.clouds import level
+from training.clouds import level
 
 from benchmarks.table import markdown, replace_section
 from log2sim.config import LidarConfig

@@ -10,8 +10,8 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from lidar_training.clouds import draw_example
 from scipy.optimize import minimize
+from training.clouds import draw_example
 
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, GROUPS, Boxes3D

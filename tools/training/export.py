@@ -13,8 +13,6 @@ import torch
 from fits.logistic import logistic_regression
 from torch import Tensor, nn
 
-from lidar_training.clouds import Example
-from lidar_training.network import GROUPS, IN_CHANNELS, BevNetwork, Widths, widths_of
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
@@ -22,6 +20,8 @@ from log2sim.evaluation.detection.evaluation import calibration, operating_point
 from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, open_network
 from log2sim.perception.detect3d.network import METADATA_KEY
+from training.clouds import Example
+from training.network import GROUPS, IN_CHANNELS, BevNetwork, Widths, widths_of
 
 CATEGORIES = {
     "vehicle": ["car", "truck", "bus"],

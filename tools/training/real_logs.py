@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar_training.clouds import Example
 from log2sim.config import LidarConfig
 from log2sim.datatypes import Log
 from log2sim.errors import LogError
@@ -16,6 +15,7 @@ from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array, Camera, apply, inverse, nearest_index, project
 from log2sim.perception.detect3d.detectors import create_lidar_detector
 from log2sim.perception.lidar.cloud import Cloud, assemble_cloud, cloud_origin
+from training.clouds import Example
 
 MAX_RANGE_M = 60.0
 # The ground under a box is the mean of that under so many points nearest to it.

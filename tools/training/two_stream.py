@@ -2,7 +2,7 @@
 
     pip install 'log2sim[train]'
     log2sim synth --traffic vehicle --layout kitti --scenes 300 --out PAIRS
-    python tools/train_lidar.py two_stream PAIRS OUT --steps 1500 --test KITTI=DRIVE --write BENCHMARKS.md
+    python tools/train.py two_stream PAIRS OUT --steps 1500 --test KITTI=DRIVE --write BENCHMARKS.md
 
 A pair is a picture and a cloud of one moment with the road users in both; x of the cloud points where the camera looks.
 """
@@ -23,10 +23,6 @@ from benchmarks.table import markdown, replace_section
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_training.export import export_checked
-from lidar_training.fitting import FitPlan, fit
-from lidar_training.network import conv
-from lidar_training.real_logs import LogSweep, LogView, ground_under, labeled_by, read_sweeps
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF, Log
 from log2sim.errors import RecordError
@@ -48,6 +44,10 @@ from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, open_network
 from log2sim.perception.detect3d.network import open_session
 from log2sim.perception.lidar.cloud import Cloud
+from training.export import export_checked
+from training.fitting import FitPlan, fit
+from training.network import conv
+from training.real_logs import LogSweep, LogView, ground_under, labeled_by, read_sweeps
 
 MIN_DEPTH_M = 1.0
 MIN_GROUND_POINTS = 10

@@ -1,8 +1,8 @@
 """Train the network that names the colors of vehicles on rendered pictures: draw, fit, calibrate, report, in one command that resumes.
 
 pip install 'log2sim[train]'
-python tools/train_colors.py DIR                                # everything, with the settings of the shipped weights
-python tools/train_colors.py DIR --worlds 2000 --steps 500      # a toy
+python tools/train.py colors DIR                                # everything, with the settings of the shipped weights
+python tools/train.py colors DIR --worlds 2000 --steps 500      # a toy
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from color_training.pictures import draw_shape, draw_view, draw_world
-from entry import run
-from lidar_training import fitting
-from lidar_training.export import describe, export_checked
-from lidar_training.fitting import FitPlan, draw_once
-from lidar_training.network import conv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from log2sim.datatypes import COLOR_NAMES
 from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.road.colors import LAB_SCALE, METADATA_KEY, SIDE_PX, ColorNetwork, open_color_network
+from training import fitting
+from training.color_pictures import draw_shape, draw_view, draw_world
+from training.export import describe, export_checked
+from training.fitting import FitPlan, draw_once
+from training.network import conv
 
 WORLDS, STEPS, BATCH, RATE = 80_000, 20_000, 64, 3e-3
 PER_FILE, SHAPES_PER_FILE = 2_000, 150
@@ -181,7 +180,3 @@ def main(out: Path, worlds: int = WORLDS, steps: int = STEPS, seed: int = 1) -> 
     }  # fmt: skip
     (out / "colors.json").write_text(json.dumps(card, indent=1) + "\n")
     print(f"{path.stat().st_size / 1e3:.0f} kB", json.dumps(card), flush=True)
-
-
-if __name__ == "__main__":
-    run(main, __doc__)

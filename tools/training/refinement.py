@@ -1,8 +1,8 @@
 """Train the second stage of a LiDAR detector, a network on the points of boxes, on simulated clouds.
 
-    python tools/train_lidar.py refinement vehicle DIR --seed 43                 # that which ships: 20 minutes of two cores
-    python tools/train_lidar.py refinement roadside DIR --seed 43 --steps 6000   # likewise
-    python tools/train_lidar.py refinement vehicle DIR --scenes 200 --steps 300  # a toy
+    python tools/train.py refinement vehicle DIR --seed 43                 # that which ships: 20 minutes of two cores
+    python tools/train.py refinement roadside DIR --seed 43 --steps 6000   # likewise
+    python tools/train.py refinement vehicle DIR --scenes 200 --steps 300  # a toy
 
 It learns from the boxes that the first stage, the shipped network or that of --first, finds in scenes of its own seed. Generating resumes,
 beside the fit in a process of its own, as does the fit. The network is left in DIR with its first stage.
@@ -25,9 +25,6 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_training.clouds import CALIBRATED_KINDS, REPORTED_KINDS, STEP_M, Example, draw_example
-from lidar_training.export import CATEGORIES, RAW_CALIBRATION, calibrate, describe, export_checked, report
-from lidar_training.fitting import FitPlan, fit, wait_for
 from log2sim.config import LidarConfig
 from log2sim.datatypes import GROUP_OF
 from log2sim.geometry import Array
@@ -50,6 +47,9 @@ from log2sim.perception.detect3d.refinement import (
     toward_sensor,
 )
 from log2sim.synth.traffic import Mount
+from training.clouds import CALIBRATED_KINDS, REPORTED_KINDS, STEP_M, Example, draw_example
+from training.export import CATEGORIES, RAW_CALIBRATION, calibrate, describe, export_checked, report
+from training.fitting import FitPlan, fit, wait_for
 
 PER_SHARD = 100
 STEPS_PER_SHARD = 50

@@ -1,8 +1,8 @@
-"""Train the network of Zou, Guo, Chen and Yuan (2021) for a 16-line LiDAR at the roadside on shards of tools/train_lidar.py, and export it.
+"""Train the network of Zou, Guo, Chen and Yuan (2021) for a 16-line LiDAR at the roadside on shards of tools/train.py lidar, and export it.
 
     pip install 'log2sim[train]'
-    python tools/train_lidar.py roadside --out DIR --only generate
-    python tools/train_lidar.py zou2021 DIR/data OUT --steps 1500
+    python tools/train.py lidar roadside --out DIR --only generate
+    python tools/train.py zou2021 DIR/data OUT --steps 1500
     log2sim reconstruct LOG --detector lidar:OUT/zou2021.onnx --set lidar.decode=votes
 
 The paper leaves some things open or prints what cannot be meant. What is done here:
@@ -29,10 +29,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lidar_training.clouds import CATEGORIES, Sample, Shard, augmented, grid_of, window_of
-from lidar_training.export import describe, description, export_checked
-from lidar_training.fitting import FitPlan, fit
-from lidar_training.network import IN_CHANNELS, MIN_POINTS, conv
+from training.clouds import CATEGORIES, Sample, Shard, augmented, grid_of, window_of
+from training.export import describe, description, export_checked
+from training.fitting import FitPlan, fit
+from training.network import IN_CHANNELS, MIN_POINTS, conv
 
 PAPER_CHANNELS, PAPER_OUTPUTS = 8, 11
 OFFSET, CLASSES, HEIGHT, HEADING = slice(0, 2), slice(2, 8), slice(8, 9), slice(9, 11)
@@ -129,7 +129,7 @@ class LaidOut(nn.Module):
         # Decoding takes the angle of the axis alone, so that its length need not be 1.
         cos, sin = out[:, 9:10], out[:, 10:11]
         zero = torch.zeros_like(height)
-        parts = [  # in the order of the channels in `lidar_training.network`
+        parts = [  # in the order of the channels in `training.network`
             # Centers of three groups.
             zero.expand(-1, 3, -1, -1) + NO_CENTER_LOGIT,
             # car, truck, bus; motorcycle, cyclist: the paper's classes do not tell the last of each from the others.
@@ -260,7 +260,7 @@ def main(data: list[Path], out: Path, steps: int = 1500, seed: int = 1, share: f
     shards = [Shard(path) for folder in data for path in sorted(folder.glob("*.npz"))]
     if not shards:
         raise FileNotFoundError(
-            f"{', '.join(map(str, data))}: no shards; make them by tools/train_lidar.py --only generate"
+            f"{', '.join(map(str, data))}: no shards; make them by tools/train.py lidar --only generate"
         )
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(seed)

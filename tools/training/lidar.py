@@ -1,24 +1,24 @@
 """Train the LiDAR detector on simulated clouds and on labeled logs: generate, fit, export, check, in one command that resumes.
 
     pip install 'log2sim[train]'
-    python tools/train_lidar.py roadside DIR            # the first two rounds of the shipped weights, as of `vehicle`
-    python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300                           # a toy
-    python tools/train_lidar.py vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
-    python tools/train_lidar.py vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
-    python tools/train_lidar.py vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
-    python tools/train_lidar.py refinement vehicle DIR        # the second stage, which looks at the points of boxes, of the shipped first one
-    python tools/train_lidar.py zou2021|two_stream --help     # the networks of two papers
+    python tools/train.py lidar roadside DIR            # the first two rounds of the shipped weights, as of `vehicle`
+    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300                           # a toy
+    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
+    python tools/train.py lidar vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
+    python tools/train.py lidar vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
+    python tools/train.py refinement vehicle DIR        # the second stage, which looks at the points of boxes, of the shipped first one
+    python tools/train.py zou2021|two_stream --help     # the networks of two papers
 
 The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close to the sensor's car, end-on and at
 walls, and are means with what they went on from:
 
-    python tools/train_lidar.py vehicle B --scenes 6000 --steps 15000 --seed 3 --start A.onnx --blend A.onnx --share 0.5
-    python tools/train_lidar.py vehicle C --scenes 6000 --steps 12000 --seed 4 --start B/vehicle.onnx --blend A.onnx --share 0.25
-    python tools/train_lidar.py vehicle D --scenes 2500 --steps 5000 --seed 5 --start C/vehicle.onnx --blend C/vehicle.onnx --share 0.25
+    python tools/train.py lidar vehicle B --scenes 6000 --steps 15000 --seed 3 --start A.onnx --blend A.onnx --share 0.5
+    python tools/train.py lidar vehicle C --scenes 6000 --steps 12000 --seed 4 --start B/vehicle.onnx --blend A.onnx --share 0.25
+    python tools/train.py lidar vehicle D --scenes 2500 --steps 5000 --seed 5 --start C/vehicle.onnx --blend C/vehicle.onnx --share 0.25
 
 and then, as a wider network (`WIDTHS`; 16, 32, 48 and 64 channels until then) that computed the same at first:
 
-    python tools/train_lidar.py vehicle E --scenes 8000 --steps 30000 --seed 31 --start D/vehicle.onnx --examples 500
+    python tools/train.py lidar vehicle E --scenes 8000 --steps 30000 --seed 31 --start D/vehicle.onnx --examples 500
 
 Those of `roadside` went on likewise, not averaged: 3,000 scenes and 9,000 steps (seed 3), 3,000 and 6,000 (seed 4), 5,000 and 10,000 (seed 13);
 then 16,000 and 30,000 (seed 23) of a wider network, which computed the same at first.
@@ -30,7 +30,6 @@ then 16,000 and 30,000 (seed 23) of a wider network, which computed the same at 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import math
 import sys
@@ -42,9 +41,16 @@ from subprocess import Popen
 
 import numpy as np
 import torch
-from entry import run
-from lidar_training import export, fitting
-from lidar_training.clouds import (
+from torch import Tensor, nn
+
+from log2sim.batch.discovery import find_logs
+from log2sim.config import LidarConfig
+from log2sim.errors import ConfigError, LogError
+from log2sim.logs.opening import open_log
+from log2sim.perception.detect3d.detectors import open_network
+from log2sim.synth.traffic import Mount
+from training import export, fitting
+from training.clouds import (
     REPORTED_KINDS,
     Example,
     Sample,
@@ -57,21 +63,11 @@ from lidar_training.clouds import (
     window_of,
     write_shard,
 )
-from lidar_training.export import calibrate, describe, description, export_onnx, import_onnx, report, widened
-from lidar_training.fitting import FitPlan
-from lidar_training.network import BevNetwork, Widths, loss_of, targets_of
-from lidar_training.real_logs import example_of, read_sweeps
-from torch import Tensor, nn
+from training.export import calibrate, describe, description, export_onnx, import_onnx, report, widened
+from training.fitting import FitPlan
+from training.network import BevNetwork, Widths, loss_of, targets_of
+from training.real_logs import example_of, read_sweeps
 
-from log2sim.batch.discovery import find_logs
-from log2sim.config import LidarConfig
-from log2sim.errors import ConfigError, LogError
-from log2sim.logs.opening import open_log
-from log2sim.perception.detect3d.detectors import open_network
-from log2sim.synth.traffic import Mount
-
-PAPERS = ("zou2021", "two_stream")
-MODULES = (*PAPERS, "refinement")
 PER_SHARD = 100
 # Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.
 HELD_OUT_SHARE = 0.2
@@ -305,10 +301,3 @@ def main(
             generator.terminate()
     if only in ("", "finish"):
         finish(mount, out, rounds, examples, held_out, start, blend, share)
-
-
-if __name__ == "__main__":
-    if sys.argv[1:2] and sys.argv[1] in MODULES:
-        module = importlib.import_module(f"lidar_training.{sys.argv[1]}")
-        run(module.main, module.__doc__, sys.argv[2:], sys.argv[1])
-    run(main, __doc__)

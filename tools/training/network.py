@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lidar_training.clouds import CATEGORIES, Sample
 from log2sim.datatypes import GROUP_OF
+from training.clouds import CATEGORIES, Sample
 
 IN_CHANNELS, OUT_CHANNELS = 12, 25
 HEAT, CATEGORY, BOX, AXIS = slice(0, 3), slice(3, 8), slice(8, 14), slice(14, 16)
