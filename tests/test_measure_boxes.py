@@ -11,7 +11,7 @@ from worlds import Solid, cloud_at, scan, standing
 from log2sim.agents.evidence import image_confidence
 from log2sim.agents.moving import heading_log_odds
 from log2sim.agents.size import independent
-from log2sim.datatypes import Boxes3D, Measurements, Track
+from log2sim.datatypes import GROUP_OF, Boxes3D, Measurements, Track
 from log2sim.geometry import NS_PER_S, rotation_from_rpy, wrap_angle
 from log2sim.perception.boxes import BOX_SIGMA_M, box_sigma, weighted_center
 from log2sim.perception.lidar.cloud import Cloud
@@ -80,8 +80,10 @@ def test_the_better_of_two_centers_counts_more_and_a_missing_one_not_at_all() ->
     center, left = weighted_center(a, sigma, b, 3 * sigma)
     np.testing.assert_allclose(center, [[0.1, 0.1], [0, 0], [1, 1]])
     np.testing.assert_allclose(left[:, 0], [0.1 * 0.9**0.5, 0.1, 0.3])
-    assert box_sigma(np.array([10**9]))[0] == pytest.approx(BOX_SIGMA_M)
-    assert (np.diff(box_sigma(np.array([0, 5, 20, 100]))) <= 0).all()
+    for category in ("car", "cyclist", "pedestrian"):
+        sigma = box_sigma(np.array([0, 5, 20, 100, 10**9]), np.full(5, category))
+        assert (np.diff(sigma, axis=0) <= 0).all()
+        assert sigma[-1] == pytest.approx(BOX_SIGMA_M[GROUP_OF[category]])
 
 
 def track_of(

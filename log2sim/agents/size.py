@@ -48,7 +48,7 @@ def typical_box_size(m: BoxEvidence) -> Array | None:
     rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
     if len(rows) == 0:
         return None
-    weight = box_sigma(m.points[rows]) ** -2
+    weight = box_sigma(m.points[rows], m.category[rows])[:, 0] ** -2
     return np.array([weighted_quantile(m.box_size_m[rows, axis], weight, 0.5) for axis in range(3)])
 
 
@@ -57,7 +57,7 @@ def mean_box_axis(m: BoxEvidence) -> float | None:
     rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
     if len(rows) == 0:
         return None
-    weight, doubled = box_sigma(m.points[rows]) ** -2, 2 * m.box_yaw_rad[rows]
+    weight, doubled = box_sigma(m.points[rows], m.category[rows])[:, 0] ** -2, 2 * m.box_yaw_rad[rows]
     return float(np.arctan2(weight @ np.sin(doubled), weight @ np.cos(doubled))) / 2
 
 
@@ -235,11 +235,11 @@ def static_geometry(track: Track) -> TrackGeometry:
     center, sigma = boxes.complete_box(low, high, size, real, known is not None, gap_m=gap)
     # The robust mean of the box centers of a 3D detector and its standard deviation; NaN without boxes.
     rows = np.flatnonzero(np.isfinite(m.box_yaw_rad))
-    box_xy, box_sigma_m = np.full(2, np.nan), np.nan
+    box_xy, box_sigma_m = np.full(2, np.nan), np.full(2, np.nan)
     if len(rows):
-        sigmas = box_sigma(m.points[rows])
-        box_xy = np.array([weighted_quantile(m.box_center_m[rows, axis], sigmas**-2, 0.5) for axis in range(2)])
-        box_sigma_m = float(np.median(sigmas)) / np.sqrt(independent(len(rows)))
+        sigmas = box_sigma(m.points[rows], m.category[rows])
+        box_xy = np.array([weighted_quantile(m.box_center_m[rows, axis], sigmas[:, 0] ** -2, 0.5) for axis in range(2)])
+        box_sigma_m = np.median(sigmas, axis=0) / np.sqrt(independent(len(rows)))
     center, sigma = boxes.weighted_center(
         center, sigma, boxes.rotate(box_xy - origin[:2], -yaw), _with_size_error(box_sigma_m, known, size)
     )
@@ -285,7 +285,7 @@ def moving_geometry(track: Track, yaw_rad: Array, velocity_mps: Array | None = N
         center,
         sigma,
         boxes.rotate(m.box_center_m[rows, :2] - sensor, -yaw),
-        _with_size_error(boxes.box_sigma(m.points[rows])[:, None], m.box_size_m[rows], size),
+        _with_size_error(boxes.box_sigma(m.points[rows], m.category[rows]), m.box_size_m[rows], size),
     )
     xy, covariance = m.center_m[:, :2].copy(), m.covariance.copy()
     xy[rows] = boxes.rotate(center, yaw) + sensor
