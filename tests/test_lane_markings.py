@@ -184,6 +184,13 @@ def test_lidar_says_nothing_of_paint_that_its_points_miss() -> None:
     assert odds(resolved=0.0) > odds(resolved=0.5) > odds(resolved=1.0)
 
 
+def test_regular_dashes_are_paint_to_a_lidar_alone_and_rings_on_grass_are_not() -> None:
+    each = {"reflected": 0.28, "reflected_sigma": 0.05, "width_m": 0.35, "color": np.nan, "above_road": 0.45}
+    pieces = no_pieces(8, **{name: np.full(8, value) for name, value in each.items()})
+    odds = {(m, n): log_odds_of_line(pieces, m * n, dashes=n) for m, n in ((2.5, 8), (10.0, 2), (1.2, 8), (1.2, 17))}
+    assert odds[2.5, 8] > 0 > max(odds[10.0, 2], odds[1.2, 8], odds[1.2, 17])
+
+
 def test_dashes_that_a_camera_sees_blurred_are_no_symbols() -> None:
     painter = Painter(EXTENT)
     painter.lines([np.array([[x, 0.0], [x + 3.0, 0.0]]) for x in (3.0, 9.0, 15.0)], 0.15)

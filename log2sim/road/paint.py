@@ -240,6 +240,8 @@ MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
 MAX_BY_LIDAR, MAX_BY_LIDAR_ALONE = 6.0, 3.0
 ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
 MIN_REFLECTING = 2  # pieces
+# Rings of successive sweeps on grass are as regular as dashes, 3 m apart at 30 m/s, but shorter.
+MIN_LIDAR_DASH_M = 2.0
 # Paint returns three times as much as the road; worn and blurred, a sixth more.
 MIN_ABOVE_ROAD, NO_BRIGHTER = 0.15, -4.0
 MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
@@ -257,7 +259,7 @@ def log_odds_of_line(
     # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen. Rings of the road
     # between darker ones stand out as paint does, but return no more than the road.
     odds = min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(by_lidar(pieces), MAX_BY_LIDAR_ALONE)
-    odds += _by_dashes(dashes) if alone else 0.0
+    odds += _by_dashes(dashes) if alone and painted_m >= MIN_LIDAR_DASH_M * dashes else 0.0
     return odds + (NO_BRIGHTER if _median_known(pieces.above_road) < MIN_ABOVE_ROAD else 0.0)
 
 
