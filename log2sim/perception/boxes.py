@@ -338,8 +338,8 @@ CORNER_ROUNDING_SHARE, BOX_CORNER_ROUNDING_SHARE, MIN_BOX_WIDTH_M = 0.05, 0.02, 
 # Points nearer than this to the plane of a side that is not seen do not tell how far rays on it are apart.
 MIN_SIDE_DISTANCE_M = 0.3
 # Standard deviations of a center that a 3D detector estimates, along and across its box: with many points, and the number of points
-# with which the variances are twice that. Root mean squares of the shipped detectors on simulated sweeps; across vehicles they err by
-# 0.1 m there, but ends and sides of vehicles that a simulation does not have are off by more.
+# with which the variances are twice that. Root mean squares of the shipped detectors on simulated sweeps; vehicles are off by 0.1 m
+# across there, but by more where their sides are not those of the simulation.
 BOX_SIGMA_M = {"vehicle": (0.2, 0.2), "two_wheeler": (0.12, 0.06), "pedestrian": (0.08, 0.08), "other": (0.2, 0.2)}
 BOX_SIGMA_POINTS = 20.0
 # A side seen at a smaller angle than this (sine) shows its near end only.

@@ -92,9 +92,8 @@ class GroundMap:
     resolution_m: float  # edge of a cell
     extent_m: Extent  # x0, x1, y0, y1 of the outer edges, m
     notes: tuple[str, ...] = ()  # what could not be mapped, and why
-    spacing_m: NDArray[np.float16] | None = (
-        None  # (R, C): mean distance of neighboring LiDAR points; infinite without any
-    )
+    # (R, C): mean distance of neighboring LiDAR points; infinite without any
+    spacing_m: NDArray[np.float16] | None = None
 
     @property
     def raster(self) -> Raster:

@@ -299,19 +299,19 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
 
 
 # Shares of the usual contrast that are compared. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which compress
-# strong returns, a fifth; how often is a guess.
-RETURNED, LESS_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
+# strong returns, a fifth; that one map in ten is such is an assumption.
+RETURNED, LOW_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
 # Errors that all returns along a line share, as by the angle of a ring to the ground.
 SHARED_SIGMA = 0.015
-MIN_TOLD_M = 4.0  # of lines that tell how much paint returns
+MIN_PAINTED_M = 4.0  # of lines by which that share is estimated
 
 
 def by_lidar(pieces: Pieces, returned: float = 1.0) -> float:
     """Log-odds by LiDAR intensity, whose contrasts are a share of what they usually are; 0 where it saw too little."""
-    told = _reflected(pieces)
-    if told is None:
+    contrast = _reflected(pieces)
+    if contrast is None:
         return 0.0
-    paint, other = _log_densities(np.array(told), returned)
+    paint, other = _log_densities(np.array(contrast), returned)
     return float(np.clip(paint - other, -MAX_BY_LIDAR, MAX_BY_LIDAR))
 
 
@@ -321,18 +321,18 @@ def returned_share(lines: Iterable[tuple[Pieces, float, int]]) -> float:
     `lines`: pieces, length with paint, m, and number of dashes. Of those that stand out to a camera, the likelihood of the
     contrasts to LiDAR is the highest with that share, each of paint as likely as the camera says or of something else.
     """
-    odds, told = [], []
+    odds, contrasts = [], []
     for pieces, painted_m, dashes in lines:
-        contrast = _reflected(pieces) if painted_m > MIN_TOLD_M else None
+        contrast = _reflected(pieces) if painted_m > MIN_PAINTED_M else None
         if contrast is not None and _median_known(pieces.color) > EXPECTED_COLOR / 2:
             odds.append(log_odds_by_camera(pieces, painted_m, dashes=dashes))
-            told.append(contrast)
-    if not told:
+            contrasts.append(contrast)
+    if not contrasts:
         return 1.0
-    paint, other = _log_densities(np.array(told)[:, None], RETURNED)
+    paint, other = _log_densities(np.array(contrasts)[:, None], RETURNED)
     by_camera = np.array(odds)[:, None]
     likelihood = np.logaddexp(paint + by_camera, other) - np.logaddexp(by_camera, 0)
-    prior = np.log(np.where(RETURNED < 1, LESS_PRIOR / (len(RETURNED) - 1), 1 - LESS_PRIOR))
+    prior = np.log(np.where(RETURNED < 1, LOW_PRIOR / (len(RETURNED) - 1), 1 - LOW_PRIOR))
     return float(RETURNED[np.argmax(likelihood.sum(axis=0) + prior)])
 
 

@@ -268,9 +268,8 @@ SHARP_RANGE_M = 20.0
 # Points count in cells this near to theirs, in cells: first those nearly in it, then those within the gaps between rings.
 SPREADS = (0.8, 2.5)
 MIN_WEIGHT = 0.02
-AROUND_M = (
-    0.45  # edge of the square in which points are counted: as far apart as rings are where they still tell something
-)
+# Edge of the square in which points are counted: as far apart as rings are where they still show paint.
+COUNTED_M = 0.45
 
 
 def map_intensity(
@@ -298,7 +297,7 @@ def map_intensity(
         free = np.isnan(out) & (near > MIN_WEIGHT / spread**2)
         out[free] = near_sums[free] / near[free]
     found = np.bincount(fine, minlength=count).astype(np.float32).reshape(raster.shape)
-    size = round(AROUND_M / raster.resolution_m) | 1
+    size = round(COUNTED_M / raster.resolution_m) | 1
     with np.errstate(divide="ignore"):
         spacing = raster.resolution_m / np.sqrt(cv2.blur(found, (size, size)))
     return np.minimum(out * np.float32(USUAL), 1), spacing.astype(np.float16)
