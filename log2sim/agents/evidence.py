@@ -51,8 +51,8 @@ SIGNS = {
   where negative; and of its detections in images. 0 without any.
 - no_image: 1 without any detection in an image, where others have some.
 - travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
-- few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1; less the same of the whole log, in which
-  nothing has more.
+- few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1; minus the same of a track through
+  the whole log.
 - scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
 - sigma: logarithm of the standard deviation of its position, in units of 0.1 m.
 - unlikely_size: 1 where the observed size is none of its category.

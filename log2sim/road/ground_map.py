@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 
-# While it is filled a map takes 44 bytes a cell, with this many 1.1 GB.
+# While it is filled a map takes 46 bytes a cell, with this many 1.1 GB.
 MAX_CELLS = 24_000_000
 # OpenCV warps rasters of at most this many cells along an edge.
 MAX_EDGE_CELLS = 32_766

@@ -273,7 +273,7 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
 
 def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[PaintedLine]:
     """Make lines of chains."""
-    found: list[tuple[Array, Stretch, Pieces, float]] = []  # with the length that is painted, m
+    parts: list[tuple[Array, Stretch, Pieces, float]] = []  # with the length that is painted, m
     for chain in chains:
         corners = chain.corners(pieces)
         if np.linalg.norm(np.diff(corners, axis=0), axis=1).sum() < MIN_LINE_M:
@@ -288,10 +288,10 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
-            found.append((xy, stretch, member, traced.painted_m(begin, end)))
-    returned = returned_share((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in found)
+            parts.append((xy, stretch, member, traced.painted_m(begin, end)))
+    returned = returned_share((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in parts)
     out = []
-    for xy, stretch, member, painted_m in found:
+    for xy, stretch, member, painted_m in parts:
         odds = log_odds_of_line(member, painted_m, dashes=stretch.dashes, returned=returned)
         out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
     return _in_context(drop_repeats(out))

@@ -352,9 +352,9 @@ def _log_densities(reflected: Array, returned: Array | float) -> tuple[Array, Ar
     # Paint that LiDAR does not resolve looks like something else.
     spread = np.hypot(resolved * PAINT_REFLECTS[1], (1 - resolved) * OTHER_REFLECTS[1])
     out = []
-    for usual, sigma in ((resolved * PAINT_REFLECTS[0], spread), (OTHER_REFLECTS[0], OTHER_REFLECTS[1])):
+    for expected, sigma in ((resolved * PAINT_REFLECTS[0], spread), (OTHER_REFLECTS[0], OTHER_REFLECTS[1])):
         sigma = np.sqrt((returned * sigma) ** 2 + error**2 + SHARED_SIGMA**2)
-        out.append(-0.5 * ((mean - returned * usual) / sigma) ** 2 - np.log(sigma))
+        out.append(-0.5 * ((mean - returned * expected) / sigma) ** 2 - np.log(sigma))
     return out[0], out[1]
 
 

@@ -199,9 +199,9 @@ def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:
         steps = np.abs(contrast[LAG:] - contrast[:-LAG])
         steps = steps[np.isfinite(steps)]
         noise = max(median(steps) / (0.6745 * np.sqrt(2)), MIN_NOISE) if len(steps) else 1.0
-        usual = _usual(contrast[known])
-        total[known] += contrast[known] * usual / noise**2
-        weight[known] += usual**2 / noise**2
+        expected = _paint_contrast(contrast[known])
+        total[known] += contrast[known] * expected / noise**2
+        weight[known] += expected**2 / noise**2
     share = np.divide(total, weight, out=np.full(len(s), np.nan), where=weight > 0)
     return Trace(s, np.nan_to_num(share) > ON_SHARE, np.isfinite(share))
 
@@ -231,7 +231,7 @@ def _smoothed(contrast: Array) -> Array:
     return np.asarray(np.divide(total, count, out=np.full(len(total), np.nan), where=known))
 
 
-def _usual(contrast: Array) -> Array:
+def _paint_contrast(contrast: Array) -> Array:
     """Return the contrast (P,) that paint has near each place of a line, 0 where nothing stands out."""
     # Dashes of a quarter of the period (MUTCD: 10 ft of 40 ft): the upper eighth is the middle of their paint.
     level = float(np.quantile(contrast, 0.875))

@@ -289,6 +289,11 @@ def map_intensity(
     fine = cells_of_points(points, raster)[kept]
     weight = 1 / (1 + (points.range_m[kept] / SHARP_RANGE_M) ** 2)
     count = raster.shape[0] * raster.shape[1]
+    points_in_cell = np.bincount(fine, minlength=count).astype(np.float32).reshape(raster.shape)
+    size = round(COUNTED_M / raster.resolution_m) | 1
+    with np.errstate(divide="ignore"):
+        spacing = (raster.resolution_m / np.sqrt(cv2.blur(points_in_cell, (size, size)))).astype(np.float16)
+    del points_in_cell  # four bytes a cell
     total = np.bincount(fine, weight, count).astype(np.float32).reshape(raster.shape)
     sums = np.bincount(fine, weight * relative[kept], count).astype(np.float32).reshape(raster.shape)
     out = np.full(raster.shape, np.nan, np.float32)
@@ -296,11 +301,7 @@ def map_intensity(
         near, near_sums = (cv2.GaussianBlur(a, (0, 0), spread) for a in (total, sums))
         free = np.isnan(out) & (near > MIN_WEIGHT / spread**2)
         out[free] = near_sums[free] / near[free]
-    found = np.bincount(fine, minlength=count).astype(np.float32).reshape(raster.shape)
-    size = round(COUNTED_M / raster.resolution_m) | 1
-    with np.errstate(divide="ignore"):
-        spacing = raster.resolution_m / np.sqrt(cv2.blur(found, (size, size)))
-    return np.minimum(out * np.float32(USUAL), 1), spacing.astype(np.float16)
+    return np.minimum(out * np.float32(USUAL), 1), spacing
 
 
 def normalize(points: GroundPoints, ground: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:

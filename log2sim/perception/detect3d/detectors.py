@@ -23,6 +23,7 @@ from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach
 from log2sim.perception.detect3d.boxes import MIN_SCORE, LevelBoxes, decode_centers, decode_votes, sigmoid, suppress
 from log2sim.perception.detect3d.network import (
     Network,
+    digest_of,
     grid_window,
     ground_under,
     level_points,
@@ -134,8 +135,8 @@ class NetworkDetector:
     @property
     def cache_key(self) -> str:
         """All that its boxes depend on besides the clouds."""
-        second = f" {self.refinement.digest()}" if self.refinement is not None else ""
-        return f"{self.network.digest()}{second} {self.decode} {self.range_m} {self.min_score}"
+        digests = " ".join(digest_of(of.path) for of in (self.network, self.refinement) if of is not None)
+        return f"{digests} {self.decode} {self.range_m} {self.min_score}"
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; points of `earlier` clouds make the grid denser."""

@@ -333,10 +333,6 @@ class Network:
     info: NetworkInfo
     session: Any  # onnxruntime.InferenceSession
 
-    def digest(self) -> str:
-        """Return a digest of the content of its file, with the version of what runs it."""
-        return digest_of(self.path)
-
     def run(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
         """Compute the maps (C, H / stride, W / stride) of a grid (12, H, W); `ConfigError` when it fails or they have another shape."""
         try:

@@ -25,7 +25,6 @@ from log2sim.perception.detect3d.network import (
     MAX_HEIGHT_M,
     METADATA_LIMIT_CHARS,
     ScoreInfo,
-    digest_of,
     first_line,
     open_session,
 )
@@ -52,10 +51,6 @@ class Refinement:
     info: ScoreInfo  # its groups are those of the first stage
     session: Any  # onnxruntime.InferenceSession
     points: int  # number of points of a box that the network takes
-
-    def digest(self) -> str:
-        """Return a digest of the content of the file and of the version of what runs it."""
-        return digest_of(self.path)
 
     def refine(self, boxes: LevelBoxes, xyz: NDArray[np.float32], sensors: Array) -> tuple[LevelBoxes, PointsOfBoxes]:
         """Correct boxes by their points; those without points are left out.
