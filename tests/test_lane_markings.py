@@ -191,6 +191,11 @@ def test_regular_dashes_are_paint_to_a_lidar_alone_and_rings_on_grass_are_not() 
     assert odds[2.5, 8] > 0 > max(odds[10.0, 2], odds[1.2, 8], odds[1.2, 17])
 
 
+def test_two_solid_lines_before_and_behind_a_junction_are_no_dashes() -> None:
+    assert [s.kind for s in stretches_of(np.array([[0.0, 5.0], [15.6, 20.0]]))] == ["solid", "solid"]
+    assert [s.kind for s in stretches_of(np.array([[0.0, 3.0], [9.0, 12.0]]))] == ["dashed"]
+
+
 def test_dashes_that_a_camera_sees_blurred_are_no_symbols() -> None:
     painter = Painter(EXTENT)
     painter.lines([np.array([[x, 0.0], [x + 3.0, 0.0]]) for x in (3.0, 9.0, 15.0)], 0.15)

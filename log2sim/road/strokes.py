@@ -270,7 +270,8 @@ def is_dashed(strokes: Array) -> bool:
     """
     if len(strokes) == 2:
         length, gap = strokes[:, 1] - strokes[:, 0], strokes[1, 0] - strokes[0, 1]
-        return bool(length.max() < 1.4 * length.min() + 0.3 and gap >= MIN_BARE_M and length.max() <= MAX_DASH_M)
+        alike = length.max() < 1.4 * length.min() + 0.3 and length.max() <= MAX_DASH_M
+        return bool(alike and MIN_BARE_M <= gap <= JUNCTION_M)
     if len(strokes) < 2:
         return False
     s = np.arange(strokes[0, 0], strokes[-1, 1], STEP_M)
