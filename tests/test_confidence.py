@@ -109,17 +109,6 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     assert judge([], None, RECORDING) == []
 
 
-def test_what_is_there_for_the_whole_of_a_short_log_is_neither_few_nor_brief():
-    candidate = parked(1)
-    tick = int(np.searchsorted(TIMELINE.t_ns, candidate.track.measurements.t_ns[0]))
-    shown = slice(tick, tick + 1)
-    short = replace(RECORDING, clouds=DARK[shown], timeline=Timeline(TIMELINE.t_ns[shown], T0_NS))
-    long, alone = (gather([candidate], recording) for recording in (RECORDING, short))
-    assert long["few"][0] == pytest.approx(1 - 1 / 60)
-    assert long["brief"][0] > 0.5
-    assert (alone["few"][0], alone["brief"][0]) == (0, 0)
-
-
 @given(st.floats(1e-6, 1 - 1e-6))
 def test_one_undoes_the_other_and_a_complement_has_the_opposite_sign(p: float) -> None:
     assert probability_of(log_odds_of(p)) == pytest.approx(p, rel=1e-9)

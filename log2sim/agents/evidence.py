@@ -51,8 +51,7 @@ SIGNS = {
   where negative; and of its detections in images. 0 without any.
 - no_image: 1 without any detection in an image, where others have some.
 - travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
-- few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1; minus the same of a track through
-  the whole log.
+- few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
 - scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
 - sigma: logarithm of the standard deviation of its position, in units of 0.1 m.
 - unlikely_size: 1 where the observed size is none of its category.
@@ -142,15 +141,14 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     shown = image_confidence(track)
     sure = shown >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
     speed_sigma = w.sigma_speed_mps if moving else None
-    duration_s, timeline_s = (float(t[-1] - t[0]) for t in (w.t_s, timeline.seconds(timeline.t_ns)))
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
         "image": float(logit(np.array(shown))) if in_image.any() else 0.0,
         "no_image": float(not in_image.any()),
         "travel": float(np.log1p(way_m / agent.size_m[0])),
-        "few": 1.0 / len(m) - 1.0 / max(len(timeline.t_ns), len(m)),
-        "brief": 1.0 / (1.0 + duration_s) - 1.0 / (1.0 + max(timeline_s, duration_s)),
+        "few": 1.0 / len(m),
+        "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
         "scatter": np.log1p(scatter),
         "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
         "unlikely_size": float(not geometry.is_likely),
