@@ -339,3 +339,29 @@ def test_a_slow_truck_is_laid_along_its_sides_not_along_a_way_that_errors_bend()
     w = moving_candidate(replace(track, measurements=rows), [None] * count, timeline, smooth=True).agent.waypoints
     assert np.abs(w.y_m - 6.0).max() < 0.15
     assert apart(w.yaw_rad, 0.0, np.pi).max() < np.deg2rad(4)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.8])
+def test_a_bus_that_leaves_the_view_goes_on_though_boxes_take_its_flank_for_an_end(heading):
+    bus, count, step_m = (11.0, 2.5, 3.1), 20, 0.7
+    along = np.array([np.cos(heading), np.sin(heading)])
+    aside = np.array([-along[1], along[0]])
+    xy = (-8.0 + step_m * np.arange(count))[:, None] * along + 4.0 * aside
+    m = measured([(*place, heading) for place in xy.tolist()], bus, "bus").measurements
+    z = np.full(count, 1.55)
+    columns = {
+        "center_m": np.column_stack([xy, z]), "box_center_m": np.column_stack([xy, z]),
+        "box_size_m": np.tile(bus, (count, 1)), "box_yaw_rad": np.full(count, heading),
+    }  # fmt: skip
+    for k in range(count - 3, count):  # two meters of the flank are left, which a box stands behind
+        turned = np.append(xy[k] - 4.5 * along + 4.3 * aside, 1.55)
+        columns["center_m"][k] = columns["box_center_m"][k] = turned
+        columns["box_yaw_rad"][k] += np.pi / 2
+    clusters = tuple(
+        points if k < count - 3 else points[(points[:, :2] - xy[k]) @ along < -3.5] for k, points in enumerate(m.cluster)
+    )
+    track = Track("bus", np.arange(count), replace(m, **columns, cluster=clusters))
+    timeline = Timeline(T0_NS + np.arange(count) * STEP_NS, T0_NS)
+    w = moving_candidate(track, [None] * count, timeline, smooth=True).agent.waypoints
+    assert np.abs((np.column_stack([w.x_m, w.y_m]) - xy) @ aside).max() < 0.4
+    assert apart(w.yaw_rad, heading, np.pi).max() < np.deg2rad(5)
