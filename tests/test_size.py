@@ -353,15 +353,17 @@ def test_a_bus_that_leaves_the_view_goes_on_though_boxes_take_its_flank_for_an_e
         "center_m": np.column_stack([xy, z]), "box_center_m": np.column_stack([xy, z]),
         "box_size_m": np.tile(bus, (count, 1)), "box_yaw_rad": np.full(count, heading),
     }  # fmt: skip
-    for k in range(count - 3, count):  # two meters of the flank are left, which a box stands behind
+    for k in range(count - 4, count):  # two meters of the flank are left, which a box stands behind
         turned = np.append(xy[k] - 4.5 * along + 4.3 * aside, 1.55)
         columns["center_m"][k] = columns["box_center_m"][k] = turned
         columns["box_yaw_rad"][k] += np.pi / 2
     clusters = tuple(
-        points if k < count - 3 else points[(points[:, :2] - xy[k]) @ along < -3.5] for k, points in enumerate(m.cluster)
+        points if k < count - 4 else points[(points[:, :2] - xy[k]) @ along < -3.5] for k, points in enumerate(m.cluster)
     )
-    track = Track("bus", np.arange(count), replace(m, **columns, cluster=clusters))
+    track = Track("bus", np.arange(count), replace(m, **columns, cluster=(*clusters[:-1], clusters[-1][:0])))
     timeline = Timeline(T0_NS + np.arange(count) * STEP_NS, T0_NS)
-    w = moving_candidate(track, [None] * count, timeline, smooth=True).agent.waypoints
+    found = moving_candidate(track, [None] * count, timeline, smooth=True)
+    assert np.isfinite(found.geometry.xy_m).all()
+    w = found.agent.waypoints
     assert np.abs((np.column_stack([w.x_m, w.y_m]) - xy) @ aside).max() < 0.4
     assert apart(w.yaw_rad, heading, np.pi).max() < np.deg2rad(5)

@@ -223,7 +223,7 @@ def moving_candidate(
     heading, heading_sigma = _first_heading(track)
     curvature = MAX_CURVATURE_1PM[group]
     motion = MotionModel(JERK_DENSITY.get(group), group == "pedestrian", heading, heading_sigma, curvature)
-    xy, covariance = placed.measurements.center_m[:, :2], m.covariance
+    xy, covariance = m.center_m[:, :2], placed.measurements.covariance
     for _ in range(PRELIMINARY_SMOOTHINGS):
         rough = smooth_track(t, xy, covariance=covariance + noise, at_s=t, motion=motion)
         headings = _headings(rough, group)
@@ -295,19 +295,20 @@ def moving_candidate(
 
 
 def without_boxes_laid_across(m: Measurements) -> Measurements:
-    """Return the measurements (n,) of a vehicle without the boxes that lie across most of those within `TURN_S`, and their positions.
+    """Return the measurements (n,) of a vehicle without the boxes that lie across most of those within `TURN_S`.
 
-    Of a long vehicle that is cut off at the edge of the view a detector may take the side that is left for an end.
+    Of a long vehicle that is cut off at the edge of the view a detector may take the side that is left for an end. The center that it gives is
+    off by about half a length.
     """
     has_box = np.isfinite(m.box_yaw_rad)
     axis = np.where(has_box, m.score, 0.0) * np.exp(2j * np.where(has_box, m.box_yaw_rad, 0.0))
     begin, end = (np.searchsorted(m.t_ns, m.t_ns + s * TURN_S * NS_PER_S, side=d) for s, d in ((-1, "left"), (1, "right")))  # type: ignore[call-overload]
     total = np.cumsum(np.append(0.0, axis))
     across = (axis * np.conj(total[end] - total[begin])).real < 0
-    if not across.any() or across.all():
-        return m
-    columns = {name: np.where(across[:, None], np.nan, getattr(m, name)) for name in ("center_m", "box_center_m", "box_size_m")}
-    return replace(m, **columns, box_yaw_rad=np.where(across, np.nan, m.box_yaw_rad))
+    error_m = np.where(across, m.box_size_m[:, 0] / 2, 0.0)
+    columns = {name: np.where(across[:, None], np.nan, getattr(m, name)) for name in ("box_center_m", "box_size_m")}
+    columns["box_yaw_rad"] = np.where(across, np.nan, m.box_yaw_rad)
+    return replace(m, **columns, covariance=m.covariance + error_m[:, None, None] ** 2 * np.eye(2))
 
 
 def _headings(path: SmoothedTrack, group: str) -> Array:
