@@ -18,7 +18,7 @@ from log2sim.agents.judge import judge, probabilities
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
 from log2sim.agents.weights import RIGHT, THERE, VARIANCES
-from log2sim.datatypes import Finding, Log, Track
+from log2sim.datatypes import MAX_SIZE_M, Finding, Log, Track
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
 from log2sim.perception.sync import Schedule
 
@@ -95,6 +95,16 @@ def test_doubts_and_scattered_positions_lower_a_confidence_and_a_hidden_length_w
     high = m.low_m + (m.high_m - m.low_m) * [0.3, 1.0]
     part = replace(candidate, track=replace(candidate.track, measurements=replace(m, high_m=high)))
     assert rated(part).agent.waypoints.sigma_xy_m[0] > rated(candidate).agent.waypoints.sigma_xy_m[0]
+
+
+def test_reasons_are_told_of_what_is_rather_wrong_alone():
+    candidate = parked()
+    longest = replace(candidate.agent, size_m=(MAX_SIZE_M["car"][0], *candidate.agent.size_m[1:]))
+    sure, vague = (
+        rated(replace(candidate, agent=replace(longest, quality={"heading_confidence": p}))).agent for p in (0.999, 0.5)
+    )
+    assert (sure.confidence > 0.5, sure.doubts) == (True, ())
+    assert (vague.confidence < 0.5, [d.kind for d in vague.doubts]) == (True, ["unlikely_size"])
 
 
 def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():

@@ -22,7 +22,7 @@ from log2sim.agents.evidence import (
     missing_nats,
     remaining,
 )
-from log2sim.agents.judge import decide, probabilities
+from log2sim.agents.judge import doubts_by_evidence, probabilities, suffices
 from log2sim.agents.rays import Ending, classify_rays, count_rays
 from log2sim.agents.size import static_geometry
 from log2sim.datatypes import AgentTable, Log, Obstacles, Rays, Track
@@ -109,15 +109,15 @@ def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
     assert (missing_nats(shown, np.zeros(5)) == 0).all()
 
 
-def test_what_is_likely_there_is_kept_and_its_strong_reasons_are_doubts():
-    row = dict.fromkeys((*SIGNS, "pointless", "shown_ticks", "image_ticks"), 0.0) | {"confirmed": 1.0}
-    assert decide(agent(5.0), row, MIN_THERE[True] - 0.01, lidar=True) is None
-    assert decide(agent(5.0), row, MIN_THERE[True], lidar=True) == []
-    weak = row | {"confirmed": 0.0}
-    assert decide(agent(5.0), weak, MIN_TENTATIVE_THERE, lidar=True) == []
-    assert decide(agent(5.0), weak, MIN_TENTATIVE_THERE - 0.01, lidar=True) is None
-    assert decide(agent(5.0), weak, 0.9, lidar=False) is None
-    (doubt,) = decide(agent(5.0), row | {"through": np.log(10)}, 0.9, lidar=True)
+def test_what_is_likely_there_is_kept_and_a_strong_reason_is_told():
+    assert suffices(MIN_THERE[True], confirmed=True, lidar=True)
+    assert not suffices(MIN_THERE[True] - 0.01, confirmed=True, lidar=True)
+    assert suffices(MIN_TENTATIVE_THERE, confirmed=False, lidar=True)
+    assert not suffices(MIN_TENTATIVE_THERE - 0.01, confirmed=False, lidar=True)
+    assert not suffices(0.9, confirmed=False, lidar=False)
+    row = dict.fromkeys((*SIGNS, "pointless", "shown_ticks", "image_ticks"), 0.0)
+    assert doubts_by_evidence(agent(5.0), row, lidar=True) == []
+    (doubt,) = doubts_by_evidence(agent(5.0), row | {"through": np.log(10)}, lidar=True)
     assert (doubt.kind, doubt.values["through_share"]) == ("empty", pytest.approx(0.9))
 
 

@@ -358,7 +358,8 @@ def test_a_bus_that_leaves_the_view_goes_on_though_boxes_take_its_flank_for_an_e
         columns["center_m"][k] = columns["box_center_m"][k] = turned
         columns["box_yaw_rad"][k] += np.pi / 2
     clusters = tuple(
-        points if k < count - 4 else points[(points[:, :2] - xy[k]) @ along < -3.5] for k, points in enumerate(m.cluster)
+        points if k < count - 4 else points[(points[:, :2] - xy[k]) @ along < -3.5]
+        for k, points in enumerate(m.cluster)
     )
     track = Track("bus", np.arange(count), replace(m, **columns, cluster=(*clusters[:-1], clusters[-1][:0])))
     timeline = Timeline(T0_NS + np.arange(count) * STEP_NS, T0_NS)

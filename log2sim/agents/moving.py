@@ -227,7 +227,8 @@ def moving_candidate(
     for _ in range(PRELIMINARY_SMOOTHINGS):
         rough = smooth_track(t, xy, covariance=covariance + noise, at_s=t, motion=motion)
         headings = _headings(rough, group)
-        geometry = moving_geometry(placed, _body_axes(placed.measurements, headings, rough.sigma_yaw_rad, group), rough.velocity_mps)
+        axes = _body_axes(placed.measurements, headings, rough.sigma_yaw_rad, group)
+        geometry = moving_geometry(placed, axes, rough.velocity_mps)
         xy, covariance = geometry.xy_m, geometry.covariance
     # The box is looked for before, after and in the gaps of its track.
     tick = track.tick.tolist()
@@ -300,15 +301,18 @@ def without_boxes_laid_across(m: Measurements) -> Measurements:
     Of a long vehicle that is cut off at the edge of the view a detector may take the side that is left for an end. The center that it gives is
     off by about half a length.
     """
-    has_box = np.isfinite(m.box_yaw_rad)
-    axis = np.where(has_box, m.score, 0.0) * np.exp(2j * np.where(has_box, m.box_yaw_rad, 0.0))
-    begin, end = (np.searchsorted(m.t_ns, m.t_ns + s * TURN_S * NS_PER_S, side=d) for s, d in ((-1, "left"), (1, "right")))  # type: ignore[call-overload]
-    total = np.cumsum(np.append(0.0, axis))
+    axis = np.nan_to_num(m.score * np.exp(2j * m.box_yaw_rad))  # each counts by its score, up to half turns
+    total, window_ns = np.cumsum(np.append(0.0, axis)), round(TURN_S * NS_PER_S)
+    end, begin = np.searchsorted(m.t_ns, m.t_ns + window_ns, "right"), np.searchsorted(m.t_ns, m.t_ns - window_ns)
     across = (axis * np.conj(total[end] - total[begin])).real < 0
     error_m = np.where(across, m.box_size_m[:, 0] / 2, 0.0)
-    columns = {name: np.where(across[:, None], np.nan, getattr(m, name)) for name in ("box_center_m", "box_size_m")}
-    columns["box_yaw_rad"] = np.where(across, np.nan, m.box_yaw_rad)
-    return replace(m, **columns, covariance=m.covariance + error_m[:, None, None] ** 2 * np.eye(2))
+    return replace(
+        m,
+        box_center_m=np.where(across[:, None], np.nan, m.box_center_m),
+        box_size_m=np.where(across[:, None], np.nan, m.box_size_m),
+        box_yaw_rad=np.where(across, np.nan, m.box_yaw_rad),
+        covariance=m.covariance + error_m[:, None, None] ** 2 * np.eye(2),
+    )
 
 
 def _headings(path: SmoothedTrack, group: str) -> Array:

@@ -71,13 +71,7 @@ AGENT_KINDS: Mapping[str, Kind] = {
         },
         ("detected_ticks", "shown_ticks"),
     ),
-    "unlikely_size": Kind(
-        {
-            "width": "is {width_m:.1f} m wide, road vehicles have at most {limit_m:.1f} m",
-            "length": "is longer than the {limit_m:.1f} m of the longest {other}",
-        },
-        ("width_m", "limit_m"),
-    ),
+    "unlikely_size": Kind("is longer than the {limit_m:.1f} m of the longest {other}", ("limit_m",)),
     "heading_ambiguous": Kind("front and back may be swapped"),
 }
 """The kinds that speak against an agent; a scenario file calls them flags."""
