@@ -3,8 +3,9 @@
     python tools/bench.py lanes [--only PATTERN] [--rig cameras|lidar]
 
 Each scene is rendered in its conditions, reconstructed and compared with its truth as `log2sim evaluate` does: precision and
-recall of lane lines at 0.3 m within 40 m of the ego's path where a sensor saw the ground, lateral error, kinds, false length,
-stop lines and crosswalks, borders of the roads, and how much of the true paths lies in a found lane. `--rig` leaves out the other sensors.
+recall of lane lines at 0.3 m within 40 m of the ego's path where a sensor saw the ground, the same recall where they stand out of the map,
+lateral error, kinds, false length, stop lines and crosswalks, borders of the roads, and how much of the true paths lies in a found lane.
+`--rig` leaves out the other sensors.
 """
 
 from __future__ import annotations
@@ -12,23 +13,30 @@ from __future__ import annotations
 import fnmatch
 import sys
 import tempfile
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from entry import SAMPLES
+from scipy.ndimage import uniform_filter1d
 
 from benchmarks.table import cell, markdown
 from log2sim import Config, open_log, reconstruct
 from log2sim.datatypes import Log, Scenario
 from log2sim.errors import Log2SimError
 from log2sim.evaluation.metrics.evaluator import evaluate
+from log2sim.evaluation.road import MATCH_M, Area, RoadSamples, nearest_road
+from log2sim.road.builder import map_ground
+from log2sim.road.ground_map import GroundMap
+from log2sim.road.ridges import sample
 from log2sim.synth.scene import load_scene
 from log2sim.synth.synthesis import write_synthetic
 
 Rig = Literal["all", "cameras", "lidar"]
 HEADER = [
-    "scene", "condition", "precision", "recall", "within 20 m", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
+    "scene", "condition", "precision", "recall", "within 20 m", "where it stands out", "off by, median", "95 %", "kind right", "false per 100 m", "stop lines",
     "crosswalks", "borders precision", "recall", "lanes precision", "recall", "center off by", "paths inside",
 ]  # fmt: skip
 
@@ -85,14 +93,86 @@ def with_rig(log: Log, rig: str) -> Log:
     return replace(log, cameras={}, streams=streams, reference_camera=None, image_labels={})
 
 
+# A line stands out where the means along 8 m of it are brighter than beside it by five sigmas of the same means around and by a least
+# logarithm, of color or of LiDAR intensity, and by more than anything else across 1.5 m, such as a curb.
+ALONG_M, STEP_M, REACH_M = 8.0, 0.05, 1.5
+MIN_SIGMAS, MIN_COLOR, MIN_INTENSITY, MORE_THAN_AROUND = 5.0, 0.05, 0.1, 1.2
+LINE_M, AROUND_M, MIN_NOISE, MIN_KNOWN = 0.2, 0.4, 0.01, 0.25
+
+
+def stands_out(ground: GroundMap, line: RoadSamples) -> np.ndarray:
+    """Say at which points (S, 2) of a true line it stands out of a map (S,)."""
+    across = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
+    xy, normal = line.xy_m, np.stack([-np.sin(line.heading_rad), np.cos(line.heading_rad)])
+    seen = sample(ground, *(xy[:, k, None] + normal[k][:, None] * across for k in range(2)))
+    inside, around = np.abs(across) <= LINE_M, np.abs(across) > AROUND_M
+    out, window = np.zeros(len(xy), dtype=bool), max(round(ALONG_M / line.length_m.max(initial=STEP_M)), 3)
+    for values, least in ((seen.paint, MIN_COLOR), (seen.intensity, MIN_INTENSITY)):
+        known = np.isfinite(values).astype(np.float64)
+        count, total = (uniform_filter1d(a, window, axis=0) for a in (known, np.nan_to_num(values)))
+        mean = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > MIN_KNOWN)
+        middle = (mean[:, 5:-5] + mean[:, 4:-6] + mean[:, 6:-4]) / 3
+        left, right = (mean[:, :-10] + mean[:, 1:-9]) / 2, (mean[:, 9:-1] + mean[:, 10:]) / 2  # 0.2 and 0.25 m away
+        contrast = np.pad(middle - np.fmax(left, right), ((0, 0), (5, 5)), constant_values=np.nan)
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # where nothing is known
+            beside = contrast[:, around]
+            noise = np.nanmedian(np.abs(beside - np.nanmedian(beside, axis=1, keepdims=True)), axis=1) / 0.6745
+            own, most = np.nanmax(contrast[:, inside], axis=1), np.nanmax(beside, axis=1)
+            out |= (own > least) & (own > MIN_SIGMAS * np.maximum(noise, MIN_NOISE)) & (own > MORE_THAN_AROUND * most)
+    return out
+
+
+def lengths_that_stand_out(ground: GroundMap, scenario: Scenario, truth: Scenario) -> tuple[float, float]:
+    """Return the length of true lane lines that stand out of a map, and how much of it is found, m."""
+    moved = truth.aligned_to(scenario)
+    area = Area.of(scenario, moved, truth.shift_to(scenario))
+    ours, true = (
+        [m for m in s.map_features.markings if m.is_lane_line] if s.map_features else [] for s in (scenario, moved)
+    )
+    shown_m = found_m = 0.0
+    for line in true:
+        whole = RoadSamples.of([line], lambda xy_m: np.ones(len(xy_m), dtype=bool))
+        shown = area.expects(whole.xy_m) & stands_out(ground, whole)
+        near = nearest_road(whole, ours)[1] <= MATCH_M
+        shown_m, found_m = shown_m + float(whole.length_m @ shown), found_m + float(whole.length_m @ (shown & near))
+    return shown_m, found_m
+
+
 def measure(case: Case, rig: Rig, folder: Path) -> dict[str, Any]:
     """Render one case, reconstruct it by its labels and compare the map with its truth."""
     scene = load_scene(SAMPLES / case.scene)
     light = scene.environment.model_copy(update={"light": case.light, "weather": case.weather})
     write_synthetic(scene.model_copy(update={"environment": light}), folder, seed=1)
-    detector = "lidar:labels" if rig == "lidar" else "labels"
-    result = reconstruct(with_rig(open_log(folder), rig), Config.load(detect={"name": detector}))
-    return evaluate(result.scenario, Scenario.load(folder / "truth.json"))["map_features"] or {}
+    detector, log = "lidar:labels" if rig == "lidar" else "labels", with_rig(open_log(folder), rig)
+    scenario, truth = (
+        reconstruct(log, Config.load(detect={"name": detector})).scenario,
+        Scenario.load(folder / "truth.json"),
+    )
+    figures = evaluate(scenario, truth)["map_features"] or {}
+    return figures | {"standing_out_m": lengths_that_stand_out(map_ground(log, scenario), scenario, truth)}
+
+
+def share(found: dict[str, Any]) -> float | None:
+    """Of the length of true lines that stand out, that which is found."""
+    shown_m, found_m = found["standing_out_m"]
+    return found_m / shown_m if shown_m else None
+
+
+def summary(all_found: list[dict[str, Any]]) -> str:
+    """Precision and recall of the lane lines of all cases by their length."""
+    lines, shown = (
+        [f["lane_lines"] for f in all_found if f.get("lane_lines")],
+        np.sum([f["standing_out_m"] for f in all_found], axis=0),
+    )
+
+    def mean(name: str, length: str) -> float:
+        return sum((line[name] or 0.0) * line[length] for line in lines) / max(
+            sum(line[length] for line in lines), 1e-9
+        )
+
+    by_length = mean("precision", "found_m"), mean("recall", "true_m"), shown[1] / max(shown[0], 1e-9)
+    return "All lane lines: precision {:.3f}, recall {:.3f}, where they stand out {:.3f}.".format(*by_length)
 
 
 def row(case: Case, found: dict[str, Any]) -> list[str]:
@@ -105,7 +185,7 @@ def row(case: Case, found: dict[str, Any]) -> list[str]:
         return f"{n['found']} of {n['true']}{false}" if n.get("true") or false else "-"
 
     return [
-        Path(case.scene).stem, case.condition, *(cell(lines.get(k)) for k in ("precision", "recall", "recall_20_m")),
+        Path(case.scene).stem, case.condition, *(cell(lines.get(k)) for k in ("precision", "recall", "recall_20_m")), cell(share(found)),
         *(cell(lines.get(k), 3, " m") for k in ("lateral_median_m", "lateral_p95_m")), cell(lines.get("kind_accuracy")),
         cell(lines.get("false_m_per_100_m"), 1, " m"), count("stop_lines"), count("crosswalks"),
         *(cell(of.get(k)) for of in (borders, lanes) for k in ("precision", "recall")), cell(lanes.get("center_median_m"), 2, " m"), cell(lanes.get("inside")),
@@ -114,11 +194,13 @@ def row(case: Case, found: dict[str, Any]) -> list[str]:
 
 def main(only: str = "*", rig: Rig = "all") -> None:
     """Print the table of the cases that a pattern names, such as 'worn*' or '*_night_*'."""
-    rows = []
+    rows, all_found = [], []
     with tempfile.TemporaryDirectory() as folder:
         for case in (case for case in CASES if fnmatch.fnmatch(case.name, only)):
             try:
-                rows.append(row(case, measure(case, rig, Path(folder) / case.name)))
+                all_found.append(measure(case, rig, Path(folder) / case.name))
+                rows.append(row(case, all_found[-1]))
             except Log2SimError as error:
                 print(f"{case.name}: {error}", file=sys.stderr)
     print(markdown(HEADER, rows))
+    print(f"\n{summary(all_found)}" if all_found else "")
