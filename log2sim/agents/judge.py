@@ -37,7 +37,7 @@ TOUCHING = 0.05
 ROUNDING = 1e-3
 # Boxes are not so deep in each other by their errors alone: two standard deviations of the distance of two positions that are
 # known to 0.2 m each.
-IN_ONE_PLACE_M = 0.5
+IN_ONE_PLACE_M = 2 * np.hypot(0.2, 0.2)
 # What is left of a life without its conflicts is kept alone if it is at least this share.
 MIN_KEPT_SHARE = 0.5
 # Fewer ticks are no trajectory.
