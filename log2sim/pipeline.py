@@ -83,7 +83,7 @@ def start(
     sensors = select_sensors(log, config)
     with clock.stage("calibration"):
         check, asked = partial(check_calibration, log, config, sensors, progress=progress), config.calibration
-        # What mends the log gives more than findings, which alone are kept.
+        # The cache keeps findings alone: a check that also corrects the log runs again.
         if asked.check and not (asked.fix_time or asked.fix_mounts):
             of = [{name: value for name, value in config.to_dict().items() if name not in LATER}, sensors]
             faults = earlier.known("calibration", log, of, (Finding,), lambda: check()[1])

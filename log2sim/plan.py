@@ -262,10 +262,6 @@ class Plan:
     # Whether every second tile of a picture is searched in turn, where sweeps are searched at every tick.
     tiles_by_turns: bool = False
 
-    def decision(self, stage: Stage) -> Decision:
-        """Return the decision about a stage."""
-        return next(d for d in self.decisions if d.stage is stage)
-
     def keeps(self, stage: Stage) -> bool:
         """Return whether a stage runs."""
         return any(d.kept for d in self.decisions if d.stage is stage)

@@ -217,3 +217,19 @@ def test_the_package_and_the_examples_have_the_types_that_they_use(tmp_path: Pat
     # By name: of what did not change since an earlier run, errors come with the folder of that run.
     assert [line for line in errors if not (line.endswith(UNTYPED) and re.search(r"/readme_\d+\.py:", line))] == []
     assert ran.returncode in (0, 1), ran.stderr[-1000:]
+
+
+def test_the_networks_run_without_telemetry(tmp_path: Path) -> None:
+    """ONNX Runtime collects events in a file below the home folder and one in that of temporary files unless it is told not to."""
+    code = "from log2sim.perception.detect3d.network import import_onnxruntime as run; print(run().__version__)"
+    environment = {
+        "HOME": str(tmp_path),
+        "TMPDIR": str(tmp_path),
+        "PATH": os.environ["PATH"],
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    ended = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert ended.stdout.strip()
+    assert list(tmp_path.rglob("*")) == []

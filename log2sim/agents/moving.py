@@ -31,7 +31,6 @@ from log2sim.datatypes import (
 from log2sim.datatypes.categories import MAX_CURVATURE_1PM as ROAD_CURVATURE_1PM
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_999, NS_PER_S, Array, wrap_angle
-from log2sim.perception.boxes import align_to
 from log2sim.perception.cooperative import yaw_sigma, yaw_terms
 from log2sim.tracking.forward import CENTER_SIGMA_M
 from log2sim.tracking.tracker import VELOCITY_WINDOW_S, track, velocities
@@ -359,5 +358,5 @@ def _first_heading(track: Track) -> tuple[float | None, float]:
     yaws = m.yaw_rad[np.isfinite(m.yaw_rad)]
     if len(yaws) == 0:
         return None, UNKNOWN_YAW_RAD
-    yaw = align_to(float(yaws[0]), 0.0, np.pi)
+    yaw = float(wrap_angle(2 * yaws[0])) / 2  # up to half turns, as by boxes
     return (yaw if heading_log_odds(m, yaw) >= 0 else float(wrap_angle(yaw + np.pi))), BOX_YAW_SIGMA_RAD

@@ -108,7 +108,11 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     """Fit the yaw of the points (n, 2) of a static track and find the ends (one view) of all its views together."""
     m = track.measurements
     axis = mean_box_axis(m)
-    yaw = boxes.fit_yaw(xy)[0] if axis is None else boxes.corrected_yaw(xy, axis)
+    yaw = (
+        boxes.fit_yaw(xy)[0]
+        if axis is None
+        else float(boxes.correct_yaws(xy, np.array([len(xy)]), np.array([axis]))[0])
+    )
     low, high = boxes.extents(xy, yaw)
     rows = np.flatnonzero(m.kept_points >= MIN_CLUSTER_POINTS)
     if track.category in BOXES and len(rows):

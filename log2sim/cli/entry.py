@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def _run(ended: options.Ended) -> NoReturn:
-    # Taken off here, too: before the name of a command they mean the same.
+    # Both options may also stand before the name of the command.
     arguments = [a for a in sys.argv[1:] if a not in (options.DEBUG, OPTION)]
     debug = options.DEBUG in sys.argv
     try:

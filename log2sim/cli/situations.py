@@ -103,7 +103,7 @@ def find(
     """
     from log2sim.files.documents import check_targets
     from log2sim.scenarios.hits import say_hit, say_quantities, write_hits
-    from log2sim.scenarios.index import open_index, write_table
+    from log2sim.scenarios.index import open_index, table_of_rows, write_table
     from log2sim.scenarios.query import ask
 
     check_targets(out, table, overwrite=overwrite)
@@ -137,7 +137,7 @@ def find(
     if out is not None:
         write_hits(out, index, condition, found.rows)
     if table is not None:
-        write_table(table, found.rows)
+        write_table(table, table_of_rows(found.rows))
     opt.report_written(out, table)
     if open_ is not None:
         if open_ > len(found.rows):

@@ -81,10 +81,10 @@ MARGIN_S = 1e-6
 """Times this far outside a trajectory are at its ends: stamps of ticks and waypoints are the same up to rounding."""
 
 MIN_DISCONTINUITY_M = 2.0
-"""A waypoint is discontinuous when it is farther than this from where the speeds lead, and"""
+"""A waypoint counts as a jump when it is farther than this from where the speeds lead and the next constant holds, too."""
 
 MIN_DISCONTINUITY_MPS = 15.0
-"""when getting there would take this much more speed: no road user, but another object under the same id."""
+"""Speed by which a vehicle would have to be faster to reach such a waypoint: it is another object under the same id."""
 
 
 class TrajectoryStates(NamedTuple):

@@ -21,13 +21,13 @@ from log2sim.errors import ConfigError, ScenarioError
 from log2sim.files.documents import check, read_json
 from log2sim.geometry import NS_PER_S, Array, wrap_angle
 
-# A later run places an agent elsewhere by its errors, and a hand points beside it: together less than half the gap between parked cars.
+# How far a stored point may be from its agent in a later run: errors of the place and of the click, less than half the gap between parked cars.
 MAX_AWAY_M = 1.0
 # A later run may begin or end a track by some ticks.
 MAX_OUTSIDE_S = 1.0
 # No camera or LiDAR shows an object beyond this.
 MAX_BEYOND_M = 1000.0
-# What a trajectory has wrong it has wrong for about as long as the view of an object stays the same.
+# Errors of a trajectory are alike for about this long, as long as the same side of the object is seen.
 CORRELATION_S = 2.0
 # Some pixels of a map in which a car fills a tenth of the screen.
 POSE_SIGMA_M, POSE_SIGMA_RAD = 0.05, 0.02

@@ -256,7 +256,7 @@ def replaced_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
         yield temporary
         if overwrite and target.exists() and exchange_names(temporary, target):
             return  # what was there is under the temporary name now, and is removed with it
-        # Under another name than what the next run removes at its start: it is the only copy until a new folder is in its place.
+        # A name that the next run does not remove at its start: until the new folder is in its place it is the only copy.
         earlier = target.with_name(f".{target.name}.{secrets.token_hex(4)}.old")
         if overwrite and target.exists():
             target.rename(earlier)

@@ -505,16 +505,14 @@ def bridge(
     rows = np.flatnonzero(known)
     before, after = rows[t_s[rows] < asked_s[0]], rows[t_s[rows] > asked_s[-1]]
     inside = rows[(t_s[rows] >= asked_s[0]) & (t_s[rows] <= asked_s[-1])]
-    near = np.concatenate(
-        [_side(t_s, before, asked_s[0], last=True), inside, _side(t_s, after, asked_s[-1], last=False)]
-    )
+    near = np.concatenate([_side(t_s, before, last=True), inside, _side(t_s, after, last=False)])
     if not len(near):
         return None
     return fit_path(t_s[near], values[near], noise, asked_s, prior)
 
 
-def _side(t_s: Array, rows: NDArray[np.intp], edge_s: float, *, last: bool) -> NDArray[np.intp]:
-    """Choose samples on one side of a time: those within `WINDOW_S` of the nearest one, thinned, and some where they are sparse."""
+def _side(t_s: Array, rows: NDArray[np.intp], *, last: bool) -> NDArray[np.intp]:
+    """Choose the last or first of some samples: those within `WINDOW_S` of the nearest one, thinned, and some where they are sparse."""
     if not len(rows):
         return rows
     nearest = t_s[rows[-1 if last else 0]]
@@ -554,8 +552,8 @@ def _step(samples: Samples, first: Part, second: Part, noise: float, limits: Lim
     """Estimate by how much the path steps between two parts, and the standard deviation."""
     if first.right and second.right:
         return np.zeros(samples.values.shape[1]), 0.0
-    before = _side(samples.t_s, first.rows, 0.0, last=True)
-    after = _side(samples.t_s, second.rows, 0.0, last=False)
+    before = _side(samples.t_s, first.rows, last=True)
+    after = _side(samples.t_s, second.rows, last=False)
     near = np.concatenate([before, after])
     is_after = np.arange(len(near)) >= len(before)
     t = samples.t_s[near]

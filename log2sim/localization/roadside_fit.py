@@ -338,7 +338,7 @@ def detectors_of(log: Log, config: Config) -> tuple[LidarDetector, LidarDetector
     return create_lidar_detector(names[0], log, config.lidar), create_lidar_detector(names[1], log, config.lidar)
 
 
-# What an error may be before anything is known; a direction that nothing holds stays where it was.
+# Standard deviations before the fit: a direction that the data do not determine keeps its value.
 PRIOR_SIGMA = np.array([0.5, 0.5, 0.5, np.radians(2.0), np.radians(2.0), np.radians(2.0), 0.3])
 DELAY = 6
 # Errors of poses last for seconds, by GNSS with an IMU: their time constant.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, BoxEvidence, Measurements
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array
 
 SEARCH_STEP_RAD = np.deg2rad(2.0)
 # Distances to an edge below the noise of a LiDAR score alike.
@@ -204,11 +204,6 @@ def quantile_of_clusters(ordered: Array, count: NDArray[np.intp], share: float) 
     return np.asarray(first + (place - below) * (second - first))
 
 
-def corrected_yaw(points: Array, yaw_rad: float) -> float:
-    """Correct a yaw that is known roughly by the direction of the sides of points (n, 2), where they show it."""
-    return float(correct_yaws(points, np.array([len(points)]), np.array([yaw_rad]))[0])
-
-
 def fit_yaw(xy_m: Array) -> tuple[float, float]:
     """Find the yaw of the rectangle whose sides are nearest to the points (N, 2), and its contrast, see `fit_yaws`."""
     yaw_rad, contrast = fit_yaws(xy_m, np.array([len(xy_m)]))
@@ -318,12 +313,6 @@ def swapped_log_odds(extents_m: Array, whole: NDArray[np.bool_], sigma_m: Array,
     longer = np.log([[max(math.erfc(v / math.sqrt(2)) / 2, MIN_PROBABILITY) for v in row] for row in z.tolist()])
     score = np.where(whole[:, None], density, longer)
     return float(score[0, 1] + score[1, 0] - score[0, 0] - score[1, 1])
-
-
-def align_to(yaw_rad: float, toward_rad: float, period_rad: float) -> float:
-    """Return the yaw nearest to `toward_rad` that equals `yaw_rad` up to multiples of `period_rad`."""
-    turns = round(float(wrap_angle(toward_rad - yaw_rad)) / period_rad)
-    return float(wrap_angle(yaw_rad + turns * period_rad))
 
 
 # Standard deviation of an observed end: range noise of a LiDAR and the spacing of its rays.

@@ -94,7 +94,7 @@ def describe(
         Stage.COLORS: "; ".join([f"colors of {colored} vehicles", *uncolored]),
         Stage.SIGNALS: seen_lights,
     }
-    planned = [plan.decision(stage) for stage in said]
+    planned = [next(d for d in plan.decisions if d.stage is stage) for stage in said]
     decisions = [replace(d, reason=said[d.stage]) if d.kept else d for d in planned]
     mapped = None
     if features is not None:

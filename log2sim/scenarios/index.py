@@ -175,7 +175,7 @@ def open_index(
     table = table_of_rows(rows)
     about = {"version": INDEX_VERSION, "tags": sorted(TAGS), "files": files, "problems": problems}
     table_with_files = table.replace_schema_metadata({KEY: json.dumps(about).encode()})
-    _write(path / INDEX_FILE, table_with_files, row_group_size=20_000)
+    write_table(path / INDEX_FILE, table_with_files, row_group_size=20_000)
     return Index(path, table, len(files), tuple(problems[name] for name in sorted(problems)))
 
 
@@ -194,17 +194,13 @@ def _read(path: Path) -> tuple[dict[str, Any], Any]:
         return {}, None
 
 
-def write_table(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows as a Parquet file with the columns of an index."""
-    _write(path, table_of_rows(rows))
-
-
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write rows of any columns, all the same, as a Parquet file."""
-    _write(path, import_arrow().Table.from_pylist(list(rows)))
+    write_table(path, import_arrow().Table.from_pylist(list(rows)))
 
 
-def _write(path: Path, table: Any, **options: Any) -> None:
+def write_table(path: Path, table: Any, **options: Any) -> None:
+    """Write an Arrow table as a Parquet file."""
     import pyarrow.parquet as pq
 
     with replaced(path) as temporary:

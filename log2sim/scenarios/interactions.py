@@ -29,13 +29,13 @@ APPROACHING_MPS, APPROACHING_S = 2.0, 10.0
 """Closing speed and time to collision of who approaches another."""
 
 CROSSING_S = 5.0
-"""Post-encroachment time up to which two that cross each other's path have to do with each other."""
+"""Two agents whose paths cross are paired where the second is there within this time after the first."""
 
 NEAR_TTC_S, NEAR_PET_S, NEAR_DRAC_MPS2 = 1.5, 1.0, 3.35
 """Limits of near misses: TTC of Hyden (1987), PET of Allen, Shin and Cooper (1978), DRAC of Archer (2005)."""
 
 JOINING_RAD = np.radians(25.0)
-"""Who comes into a lane with more than that turns into it; lane changes have less than 10 degrees."""
+"""An agent that enters a lane at a larger angle turns into it; in lane changes the angle is below 10 degrees."""
 
 ONCOMING_RAD = np.radians(135.0)
 MOST_PER_TICK_M = 5.0  # by which one gets ahead of another within a tick: 50 m/s

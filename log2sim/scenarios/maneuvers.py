@@ -25,7 +25,7 @@ MAX_BRAKING_MPS2 = 11.0
 """No brakes decelerate harder on tires for the road (ABS tests on dry asphalt: 9 to 11 m/s2)."""
 
 MOVING_MPS = 2.0
-"""Who is faster moves on: faster than people walk, and than smoothed speeds of who stands may be off."""
+"""From this speed on an agent counts as moving: faster than people walk, and than smoothed speeds of standing agents err."""
 
 TURN_RAD, BACK_RAD = np.radians(60.0), np.radians(150.0)
 """Turns at junctions, and back to where the agent came from; bends of roads are wider than `TURN_WITHIN_M`."""
@@ -34,10 +34,10 @@ TURN_WITHIN_M = 40.0
 """Within which a vehicle turns at a junction: a quarter of a circle of 25 m."""
 
 LEAST_RADIUS_M = 1.5
-"""No rider turns on a smaller circle; boxes of who stands do, and headings that flip."""
+"""Smaller turning circles are of boxes of standing agents and of headings that flip, not driven."""
 
 LEAST_SHIFT_M = 1.0
-"""Who changes between lanes moves that far to the side; where lanes of a map overlap, who goes straight on leaves one for another."""
+"""A lane change goes at least so far to the side: where lanes of a map overlap, agents that go straight on leave one for another."""
 
 BREAK = round(0.5 / TICK_S)
 """Ticks that an activity may be interrupted for."""

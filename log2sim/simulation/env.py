@@ -86,8 +86,7 @@ class ScenarioEnv(gymnasium.Env[ObservationArrays, Any]):
         self._observation: Observation
         self._begun = False
         ego = self.world.ego
-        if ego is None:  # open_world refuses such a scenario
-            raise ValueError("the world has no ego to drive")
+        assert ego is not None  # without an ego `open_world` refuses a scenario
         p = ego.parameters
         self.accel_limits_mps2 = float(p.max_brake_mps2[0]), float(p.max_throttle_mps2[0])
         self.max_steer_rad = float(p.max_steer_rad[0])

@@ -249,8 +249,7 @@ def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:
     return np.asarray(values[row, k] + part * (values[row, k + 1] - values[row, k]))
 
 
-# Drivers keep to a lane within some 0.3 m, which they may be off after about a second: what nearly touches may just
-# as well not.
+# Within about a second drivers deviate by some 0.3 m from the middle of their lane, so that a near touch may also be a miss.
 KEEPING_SIGMA_M, KEEPING_S = 0.3, 1.0
 
 

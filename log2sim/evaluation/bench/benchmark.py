@@ -238,8 +238,8 @@ def place_point_labels(ax: Axes, points: Sequence[settings.Point], xy: Array, li
     ]  # fmt: skip
     for k in sorted(range(len(points)), key=lambda k: (not points[k].present, -at[k, 1])):
         # Without its stage where the name identifies it; with the share found or placed where the present setting has more.
-        stage, _, name = points[k].setting.partition(": ")
-        name = points[k].setting if name in ("", "on", "off") or stage == "smooth" else name
+        _, _, name = points[k].setting.partition(": ")
+        name = points[k].setting if name in ("", "on", "off") else name
         if not points[k].covers_as_many_as(present):
             key, share = min(points[k].coverage.items(), key=lambda item: item[1])
             name = f"{name} ({share:.0%} {settings.COVERAGE[key]})"

@@ -105,23 +105,17 @@ def make_grid(log: Log, config: Config, detectors: Sequence[str] = ()) -> Grid:
         for n in HYPOTHESES
         if n != config.topdown.hypotheses
     ]
-    # List smoothing on and off, and all values of its other settings.
-    keys = type(config.smooth).model_fields
-    switches = [key for key in keys if isinstance(getattr(config.smooth, key), bool)]
-    named = [key for key in keys if config.smooth.choices(key)]
-    out = [Setting("smooth", _smooth_name(config, switches, named), config, True)]
-    for key in switches:
-        other = config.changed(smooth={key: not getattr(config.smooth, key)})
-        out.append(Setting("smooth", _smooth_name(other, [key], []), other, False))
-    for key in named:
-        values = choices(config.smooth, key)[1:]
-        out += [Setting("smooth", value, config.changed(smooth={key: value}), False) for value in values]
+    on, other = config.smooth.enabled, config.changed(smooth={"enabled": not config.smooth.enabled})
+    smooth = (
+        Setting("smooth", "on" if on else "off", config, True),
+        Setting("smooth", "off" if on else "on", other, False),
+    )
     return Grid(
         detect=tuple(_detector_settings(log, config, detectors)),
         measure=_choices("measure", config, "measure", "mode"),
         homography=tuple(homography),
         hypotheses=tuple(hypotheses),
-        smooth=tuple(out),
+        smooth=smooth,
     )
 
 
@@ -142,13 +136,6 @@ def choices(section: Section, key: str) -> list[str]:
 def _choices(stage: str, config: Config, section: str, key: str) -> tuple[Setting, ...]:
     names = choices(getattr(config, section), key)
     return tuple(Setting(stage, name, config.changed(**{section: {key: name}}), k == 0) for k, name in enumerate(names))
-
-
-def _smooth_name(config: Config, switches: Sequence[str], named: Sequence[str]) -> str:
-    values = [str(getattr(config.smooth, key)) for key in named]
-    if "enabled" in switches and (not config.smooth.enabled or not values):
-        return "on" if config.smooth.enabled else "off"
-    return " ".join(values) or f"{switches[0]}={str(getattr(config.smooth, switches[0])).lower()}"
 
 
 def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> list[Setting]:
@@ -192,7 +179,7 @@ NO_ERROR = "no error of the present setting is known; objects have to be in sigh
 ERROR_TOLERANCE = 0.05
 # Fraction of bootstrap resamples in which a setting must be no worse than the present one to be recommended.
 MIN_CONFIDENCE = 0.9
-# A log has no objects but its own, so resamples of them never make sure.
+# Resamples are of the objects of one log, so that more certainty is never stated.
 MAX_CONFIDENCE = 0.99
 # Figures that say how many of the objects an error is of, in words.
 COVERAGE = {"recall": "found", "placed_share": "placed"}

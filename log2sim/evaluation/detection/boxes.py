@@ -148,7 +148,7 @@ class DetectedBoxes:
         """
         if not is_boxes_document(document):
             raise LogError(f"not a boxes file: expected format '{FORMAT}', as `log2sim detect` writes it")
-        # The boxes are validated column by column: item by item, a long log takes minutes. What that refuses the full check words.
+        # The boxes are validated column by column: item by item, a long log takes minutes. Where that finds a fault, the full check gives its message.
         box: dict[str, Any] = load_schema("boxes-1")["$defs"]["box"]
         try:
             listed = all(type(frame["boxes"]) is list for frame in document["frames"])

@@ -409,7 +409,7 @@ def build_network(lanes: Sequence[MapLane]) -> tuple[list[Road], dict[int, str]]
     place |= {name: _Place(len(plain) + k + 1, -1) for k, name in enumerate(inside)}
     names = list(dict.fromkeys(str(by_id[name].junction) for name in inside))
     number_of = {name: len(place) + k + 1 for k, name in enumerate(names)}
-    headings = _shared_headings(plain, place, by_id)
+    headings = _shared_headings(plain, place)
     roads: list[Road] = []
     ends: dict[tuple[str, int], End] = {}
     # Those of more lanes first, since neighbors share an edge and the lane that goes on alone has to follow it.
@@ -536,9 +536,7 @@ def _linked(group: Sequence[MapLane], place: Mapping[str, _Place], at: int) -> l
 
 
 def _shared_headings(
-    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]],
-    place: Mapping[str, _Place],
-    by_id: Mapping[str, MapLane],
+    plain: Mapping[int, tuple[Sequence[MapLane], Sequence[MapLane]]], place: Mapping[str, _Place]
 ) -> dict[tuple[int, int], float]:
     """Return the headings of cross sections where two roads meet, by road and end (0 or -1)."""
     found: dict[tuple[int, int], float] = {}
