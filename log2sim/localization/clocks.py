@@ -339,9 +339,6 @@ Progress = Callable[[str, int, int], None]
 
 # Poses that err by more within seconds, or that belong to other sweeps, are no base for a calibration.
 MAX_POSE_ERROR_M = 0.5
-# Errors of poses last for seconds, so that a shorter log does not show how large they are: the first 3 and 4 s of KITTI 0005 seem to
-# have a mount that is turned by 2.1 and 1.5 degrees, by six and four sigmas; from 5 s on by less than two.
-MIN_SPAN_S = 4.5
 
 
 def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progress) -> tuple[Log, tuple[Finding, ...]]:
@@ -356,8 +353,6 @@ def check_lidars(log: Log, config: Config, sensors: Sensors, *, progress: Progre
     asked = config.calibration
     for lidar in lidars_on_ego(sensors.restrict(log)):
         seen = pair_sweeps(log, lidar, during_ns(log, config), partial(progress, f"check {lidar}"))
-        if seen is not None and np.ptp(seen.t_ns) < MIN_SPAN_S * NS_PER_S:
-            seen = None
         found = None if seen is None else fit_clock_and_mount(seen)
         if seen is None or found is None or found.pose_error_m > MAX_POSE_ERROR_M:
             faults += unseen_faults(lidar, None, asked)
