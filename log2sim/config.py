@@ -10,9 +10,9 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from log2sim.errors import ConfigError
 from log2sim.files.documents import first_problem
@@ -293,6 +293,12 @@ class Config(Section):
     smooth: SmoothConfig = SmoothConfig()
     map: MapConfig = MapConfig()
     appearance: AppearanceConfig = AppearanceConfig()
+
+    @model_validator(mode="after")
+    def _starts_before_it_stops(self) -> Self:
+        if self.start_s is not None and self.stop_s is not None and self.stop_s <= self.start_s:
+            raise ValueError(f"stop_s is {self.stop_s:g}, expected more than start_s, {self.start_s:g}")
+        return self
 
     def __init__(self, **settings: Any) -> None:
         """Check the settings; `ConfigError` names the one that is wrong.

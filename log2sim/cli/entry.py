@@ -102,7 +102,8 @@ def _run(ended: options.Ended) -> NoReturn:
         if not arguments:
             sys.stderr.write(options.printable(format_message()) + "\n")
             sys.exit(2)
-        options.fail(f"{format_message()} (see log2sim --help)", getattr(error, "exit_code", 2))
+        command = getattr(getattr(error, "ctx", None), "command_path", "log2sim")
+        options.fail(f"{format_message()} (see {command} --help)", getattr(error, "exit_code", 2))
     _end(code, ended)
 
 

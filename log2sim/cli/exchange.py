@@ -94,14 +94,15 @@ def synth(
     scene: Annotated[Path | None, typer.Argument(metavar="[SCENE.toml]", help="Scene file.")] = None,
     traffic: Annotated[Literal["vehicle", "roadside"] | None, opt.option(
         "Instead of a scene file: random traffic around a LiDAR on a vehicle or at the roadside.")] = None,
-    scenes: Annotated[int, opt.option("Number of random scenes.", min=1, max=1_000_000)] = 10,
+    scenes: Annotated[int | None, opt.option("Number of random scenes. [default: 10]", min=1, max=1_000_000)] = None,
     sensor: Annotated[str | None, opt.option(
         "LiDAR of random scenes: a name, a TOML file, or random. [default: hdl64e, rslidar16-roadside]",
         "NAME")] = None,
     layout: Annotated[Literal["kitti", "log2sim"] | None, opt.option(
         "Layout of random scenes: KITTI's object layout or a log folder each. [default: kitti, log2sim without "
         "pictures]")] = None,
-    duration: Annotated[float, opt.option("Length of each log of random traffic in s.", min=0.5, max=60.0)] = 5.0,
+    duration: Annotated[float | None, opt.option(
+        "Length of each log of random traffic in s. [default: 5]", min=0.5, max=60.0)] = None,
     light: Annotated[Literal["noon", "overcast", "dusk", "night"] | None, opt.option(
         "Light; random scenes draw it otherwise.")] = None,
     weather: Annotated[Literal["clear", "rain", "fog"] | None, opt.option(
@@ -124,6 +125,10 @@ def synth(
 
     if (scene is None) == (traffic is None):
         raise ConfigError("give either a scene file or --traffic vehicle or --traffic roadside")
+    random = {"--scenes": scenes, "--sensor": sensor, "--layout": layout, "--duration": duration}
+    given = [name for name, value in random.items() if value is not None]
+    if scene is not None and given:
+        raise ConfigError(f"{', '.join(given)}: for random scenes of --traffic; the file of a scene says what is in it")
     with progress() as report_progress:
         if scene is not None:
             loaded = load_scene(scene)
@@ -144,7 +149,7 @@ def synth(
 
             chosen = layout or ("log2sim" if no_pictures else "kitti")
             settings = TrafficSettings(
-                traffic, scenes, seed, sensor, chosen, duration, light, weather, pictures=not no_pictures
+                traffic, scenes or 10, seed, sensor, chosen, duration or 5.0, light, weather, pictures=not no_pictures
             )  # fmt: skip
             write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
     opt.report_written(out)

@@ -160,16 +160,13 @@ def inspect(
     opt.tell(json.dumps(document, indent=2) if as_json else "\n".join(describe(document, verbose=verbose)))
 
 
-SCHEMAS = {
-    f"{name.replace('-', '_')}_version": f"{name}-1"
-    for name in ("metrics", "detection-metrics", "report", "prediction", "bench")
-}
+SCHEMAS = ("metrics", "batch-metrics", "detection-metrics", "report", "prediction", "bench", "corrections")
 
 
 def validate(
     path: Annotated[Path, typer.Argument(
         metavar="FILE_OR_LOG",
-        help="Scenario, replay, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.")],
+        help="Scenario, replay, corrections, boxes, report, metrics or bench file, or a log: a folder, or the file of a bag.")],
     format: opt.Format = "auto",
     sequence: opt.SequenceName = None,
 ) -> None:  # fmt: skip
@@ -200,15 +197,14 @@ def validate(
     else:
         from log2sim.datatypes import Scenario
         from log2sim.evaluation.detection.boxes import DetectedBoxes, is_boxes_document
-        from log2sim.files.documents import check, read_json
+        from log2sim.files.documents import check, kind_of, read_json
         from log2sim.simulation.result import Replay
 
         document = read_json(path, ScenarioError)
-        keys = document if isinstance(document, dict) else {}
-        schema = next((name for key, name in SCHEMAS.items() if key in keys), None)
-        if schema is not None:
-            check(document, schema, ScenarioError)
-        elif "replay_version" in keys:
+        kind = kind_of(document)
+        if kind in SCHEMAS:
+            check(document, f"{kind}-1", ScenarioError)
+        elif kind == "replay":
             Replay.load(path)
         elif is_boxes_document(document):
             DetectedBoxes.load(path)

@@ -17,7 +17,7 @@ from log2sim.datatypes.agent import Agent, agent_from_dict, agent_to_dict
 from log2sim.datatypes.log import IgnoreRegions, MapFrame
 from log2sim.errors import ConfigError, MissingExtra, ScenarioError
 from log2sim.files import plugins
-from log2sim.files.documents import check, from_entry, read_json, replaced, short_repr, to_entry, write_json
+from log2sim.files.documents import check, from_entry, kind_of, read_json, replaced, short_repr, to_entry, write_json
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array
 
@@ -527,10 +527,11 @@ class Scenario:
     def from_dict(cls, document: Any) -> Scenario:
         """Build a scenario from a document; `ScenarioError` when it violates the schema or holds impossible values."""
         version = document.get("scenario_version") if isinstance(document, dict) else None
+        if version is None:
+            kind = kind_of(document)
+            raise ScenarioError(f"is no scenario file of log2sim{f', but a {kind} file' if kind else ''}")
         if version != VERSION:
-            raise ScenarioError(
-                f"scenario_version is {version!r}, expected {VERSION}; is this a scenario file of log2sim?"
-            )
+            raise ScenarioError(f"scenario_version is {version!r}, expected {VERSION}")
         if "plan" in document and "stages" not in document:  # their name in files up to version 0.1
             document = {**document, "stages": document["plan"]}
             del document["plan"]

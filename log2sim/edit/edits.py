@@ -375,6 +375,12 @@ class CutIn(_AgentEdit):
         return station[k] + c * dx + s * dy - np.interp(end_s, path.t_s, station), c * dy - s * dx
 
 
+def no_category(name: str) -> str:
+    """Say that there is no such category, and the nearest or all that there are."""
+    known = list(CATEGORIES)
+    return f"no category '{name}'{nearest(name, known) or '; there are ' + ', '.join(known)}"
+
+
 @dataclass(frozen=True)
 class Add(Edit):
     """Add an agent of the typical size of its category."""
@@ -392,7 +398,7 @@ class Add(Edit):
     def __post_init__(self) -> None:
         """Check the category and the numbers."""
         if self.category not in CATEGORIES:
-            raise ConfigError(f"add: no category '{self.category}'{nearest(self.category, list(CATEGORIES))}")
+            raise ConfigError(f"add: {no_category(self.category)}")
         numbers = (self.x_m, self.y_m, self.yaw_rad, self.speed_mps, self.meters)
         if not all(math.isfinite(v) and abs(v) < 1e8 for v in numbers) or not -20 <= self.speed_mps <= 100:
             raise ConfigError("add: expected a finite place, and a speed from -20 to 100 m/s")
@@ -434,7 +440,7 @@ class Replace(_AgentEdit):
     def __post_init__(self) -> None:
         """Check the category."""
         if self.category not in CATEGORIES:
-            raise ConfigError(f"replace: no category '{self.category}'{nearest(self.category, list(CATEGORIES))}")
+            raise ConfigError(f"replace: {no_category(self.category)}")
 
     def applied(self, agents: Agents) -> Agents:
         """Give the agent its category, size and height above the ground."""

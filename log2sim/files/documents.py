@@ -369,6 +369,16 @@ def load_schema(name: str) -> dict[str, Any]:
     return document
 
 
+def kind_of(document: Any) -> str | None:
+    """Name the kind of file of log2sim that a document is, by its version or format, such as "replay"; None for what is none."""
+    keys = document if isinstance(document, dict) else {}
+    if str(keys.get("format")).startswith("log2sim-"):
+        return str(keys["format"]).removeprefix("log2sim-")
+    return next(
+        (str(key).removesuffix("_version").replace("_", "-") for key in keys if str(key).endswith("_version")), None
+    )
+
+
 def check(document: Any, name: str, error: type[Log2SimError]) -> None:
     """Validate a document against a schema; `error` names the first field that violates it and what was expected there."""
     problem = next(_validator()(load_schema(name)).iter_errors(document), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -196,12 +197,26 @@ def _find_reader(root: Path, readers: Mapping[str, Reader], defects: list[str]) 
         if holds is not None:
             above = f"; {folder}, which it is in, holds logs of the format '{holds}'"
             break
+    if what := _file_of_ours(root):
+        raise LogError(f"{root}: is {what}{broken}")
     if root.is_file():
         suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
         expected = f"give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}"
         raise LogError(f"{root}: is a file of no known log format; {expected}{above}{broken}")
+    if not any(root.iterdir()):
+        raise LogError(f"{root}: is an empty folder, not a log")
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
     raise LogError(f"{root}: no known log format{above}; a log is one of: {known}. Force one with --format{broken}")
+
+
+def _file_of_ours(path: Path) -> str:
+    """Say what a file of log2sim is that is no log; empty for others."""
+    if path.suffix == ".toml" and path.is_file():
+        return "a TOML file, not a log; `log2sim synth` renders scenes"
+    with suppress(OSError), path.open("rb") as file:
+        if kind := re.match(rb'\s*\{\s*"(\w+)_version"', file.read(100)):
+            return f"a {kind[1].decode().replace('_', '-')} file of log2sim, not a log"
+    return ""
 
 
 def _usable_readers() -> tuple[dict[str, Reader], list[str]]:
