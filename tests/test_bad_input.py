@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ import numpy as np
 import pytest
 from command_line import Ran, names, run
 from plain_settings import AGENTS_ONLY
+
+from log2sim.errors import LogError
+from log2sim.logs.opening import find_reader
 
 Change = Callable[[Path], Any]
 
@@ -115,7 +119,7 @@ LOG_FAULTS: dict[str, tuple[Change, tuple[str, ...], int, list[str]]] = {
     "unreadable model": (lambda f: (f.parent / "m.onnx").write_bytes(b"hello"), ("--detector", "{out}/../m.onnx"), 2, ["m.onnx", "not a model"]),
     "missing model": (lambda f: None, ("--detector", "none.onnx"), 2, ["none.onnx", "no such file"]),
     "unknown detector": (lambda f: None, ("--detector", "label"), 2, ["'label'", "did you mean 'labels'", ".onnx"]),
-    "unknown option": (lambda f: None, ("--detektor", "x"), 2, ["--detektor", "log2sim --help"]),
+    "unknown option": (lambda f: None, ("--detektor", "x"), 2, ["--detektor", "log2sim reconstruct --help"]),
 }  # fmt: skip
 
 
@@ -189,7 +193,7 @@ def agent(change: Callable[[dict[str, Any]], Any]) -> Callable[[dict[str, Any]],
 
 SCENARIO_FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], list[str]]] = {
     "version": (lambda d: d.update(scenario_version=2), ["scenario_version is 2", "expected 1"]),
-    "no version": (lambda d: d.pop("scenario_version"), ["scenario_version is None", "is this a scenario file"]),
+    "no version": (lambda d: d.pop("scenario_version"), ["is no scenario file of log2sim"]),
     "NaN": (agent(lambda a: a["waypoints"]["x_m"].__setitem__(3, float("nan"))), ["agents[1].waypoints.x_m[3] is NaN", "finite number"]),
     "infinity": (agent(lambda a: a["size_m"].update(length=float("-inf"))), ["agents[1].size_m.length is -Infinity"]),
     "null": (agent(lambda a: a["waypoints"]["x_m"].__setitem__(3, None)), ["agents[1].waypoints.x_m[3]", "not of type 'number'"]),
@@ -296,3 +300,20 @@ def test_a_wrong_argument_is_one_clear_line(
 def test_a_traceback_only_with_debug(tmp_path: Path) -> None:
     with pytest.raises(Exception, match="no such folder"):
         run("--debug", "inspect", tmp_path / "none")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("s.json", '{"scenario_version": 1}', "s.json: is a scenario file of log2sim, not a log"),
+        ("crossing.toml", "", "crossing.toml: is a TOML file, not a log; `log2sim synth` renders scenes"),
+        ("some.json", "{}", "some.json: is a file of no known log format"),
+    ],
+)
+def test_files_of_log2sim_that_are_no_logs_are_named(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(LogError, match=re.escape(message)):
+        find_reader(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(LogError, match="is an empty folder"):
+        find_reader(tmp_path / "empty")

@@ -69,6 +69,14 @@ def test_runs_are_judged_by_what_the_ego_did(traffic_folder, monkeypatch) -> Non
     base = with_ego(Base.of(Scenario.load(index.folder / chosen["file"]), chosen))
     assert base.row["other"] == EGO
     assert {a.id for a in base.scenario.agents} == {EGO, chosen["agent"]}
+    walks = replace(
+        base.scenario,
+        agents=tuple(
+            replace(a, id=chosen["other"], category="cyclist") if a.id == EGO else a for a in base.scenario.agents
+        ),
+    )
+    with pytest.raises(ConfigError, match="a cyclist, which no policy drives"):
+        with_ego(replace(base, scenario=walks, row=chosen))
     near, far = np.array([18.0, 26.0, 4.0]), np.array([25.0, 20.0, 60.0])
 
     def keeps(seen):

@@ -56,6 +56,7 @@ def evaluate(
     from log2sim.datatypes import Scenario
     from log2sim.evaluation.detection.boxes import is_boxes_document
     from log2sim.evaluation.metrics.evaluator import evaluate as run
+    from log2sim.evaluation.metrics.evaluator import select_categories
     from log2sim.evaluation.metrics.table import format_table, format_verdict
     from log2sim.evaluation.metrics.truth import load_truth
     from log2sim.files.documents import check_targets, read_json, write_json
@@ -104,6 +105,7 @@ def evaluate(
             result = evaluate_boxes(detected, labeled, options, progress=partial(report_progress, "count points"))
         table = boxes_verdict(result) + (f"\n\n{boxes_table(result)}" if verbose else "")
     else:
+        select_categories(wanted)  # an unknown one is told before a log is read
         for name in (name for name, value in only_boxes.items() if value is not None):
             raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
         scenario = Scenario.load(path)

@@ -106,9 +106,10 @@ def view(
     """
     from log2sim.datatypes import Scenario, count_agents
     from log2sim.files.documents import check_targets
-    from log2sim.visualization.page.writer import write_page
+    from log2sim.visualization.page.writer import check_name, write_page
 
     check_targets(out, overwrite=overwrite)
+    check_name(out)
     for name, value in (("--max-mb", max_mb), ("--cameras", cameras)):
         if log is None and value is not None:
             raise ConfigError(f"{name}: is for the pictures of a log; add --log")

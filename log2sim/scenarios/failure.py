@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from log2sim.datatypes import EGO, Scenario
+from log2sim.datatypes import EGO, GROUP_OF, Scenario
+from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.scenarios.hits import page
 from log2sim.scenarios.logical import Base, Logical
@@ -184,6 +185,11 @@ def with_ego(base: Base) -> Base:
     if any(a.id == EGO for a in base.scenario.agents):
         return base
     driver = base.row.get("other", base.row["agent"])
+    category = next(a.category for a in base.scenario.agents if a.id == driver)
+    if GROUP_OF[category] != "vehicle":
+        raise ConfigError(
+            f"the situation that is varied is of '{driver}', a {category}, which no policy drives; narrow the condition to vehicles"
+        )
     agents = tuple(replace(a, id=EGO) if a.id == driver else a for a in base.scenario.agents)
     moments = {EGO if id == driver else id: t_s for id, t_s in base.moment_s.items()}
     row = {**base.row, **{role: EGO for role in ("agent", "other") if base.row.get(role) == driver}}

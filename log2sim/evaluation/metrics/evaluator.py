@@ -315,7 +315,7 @@ def evaluate(
         agents.append(agent)
     scenario = replace(scenario, agents=tuple(agents))
     truth, placement = place_truth(load_truth(truth, scenario, points=True), scenario)
-    selection = comparison.Selection(max_range_m, _selected(categories))
+    selection = comparison.Selection(max_range_m, select_categories(categories))
     compared, ticks_s, ego = compare_scenarios(scenario, truth, selection)
     ours, tick_s = compared.other, _tick_s(ticks_s)
     truth_ticks_s = ticks_s + (scenario.t0_ns - truth.t0_ns) / geometry.NS_PER_S
@@ -445,7 +445,8 @@ def _figures(
     }  # fmt: skip
 
 
-def _selected(categories: Sequence[str] | None) -> frozenset[str]:
+def select_categories(categories: Sequence[str] | None) -> frozenset[str]:
+    """Return the categories of names and groups, all by default; `ConfigError` for an unknown one."""
     if categories is None:
         return frozenset(CATEGORIES)
     known = [*CATEGORIES, *(g for g in GROUPS if g not in CATEGORIES)]

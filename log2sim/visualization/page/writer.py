@@ -30,6 +30,12 @@ SCRIPT_FILES = (
 )  # fmt: skip
 
 
+def check_name(path: Path) -> None:
+    """Raise `ConfigError` for a name that is none of a page."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"{path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{path.suffix}'")
+
+
 def write_page(
     scenario: Scenario,
     out_path: Path | str,
@@ -55,8 +61,7 @@ def write_page(
     replay are shown too. Returns what was taken of the log, in sentences; empty without one.
     """
     out_path = Path(out_path)
-    if out_path.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"{out_path}: a page's name must end in {' or '.join(SUFFIXES)}, not in '{out_path.suffix}'")
+    check_name(out_path)
     refuse_existing(out_path, overwrite=overwrite)
     if isinstance(recorded, Log):
         recorded = Recorded(localize_like(recorded, scenario.provenance))
