@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -13,10 +13,6 @@ from log2sim.cli import options as opt
 from log2sim.cli.progress import progress
 from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.files.outputs import together
-
-if TYPE_CHECKING:
-    from log2sim.datatypes import Scenario
-
 
 PROTOCOL = "center"
 MAX_LOGS = 20  # of a batch that are printed; the document has all
@@ -119,8 +115,13 @@ def evaluate(
             )  # fmt: skip
         opt.say_all("note", known.provenance.get("notes", ()) if labels is not None else ())
         result = run(scenario, known, max_range_m=range, categories=wanted)
-        if result["placement"]["method"] == "same_map" and (note := _other_map(scenario, truth)) is not None:
-            opt.tell(f"note: {note}")
+        made_with = scenario.provenance.get("poses")
+        source = made_with.get("source") if isinstance(made_with, dict) else None
+        # A truth in a file of its own cannot be placed by the estimated poses.
+        unplaced = truth.suffix == ".json" or (truth / "truth.json").is_file()
+        if result["placement"]["method"] == "same_map" and source in ("lidar", "camera") and unplaced:
+            differ = "what the two maps differ by counts as error"
+            opt.tell(f"note: the scenario's poses are estimated ({source}), {truth} has its own: {differ}")
         table = format_verdict(result) + (f"\n\n{format_table(result)}" if verbose else "")
     with together():
         if out is not None:
@@ -142,15 +143,6 @@ def _stated(made_with: Any, requested: str | None) -> dict[str, Any]:
     if requested not in PosesConfig.choices("source"):
         raise ConfigError(f"--poses {requested}: expected {', '.join(PosesConfig.choices('source'))}")
     return {"poses": {**(made_with if isinstance(made_with, dict) else {}), "source": requested}}
-
-
-def _other_map(scenario: Scenario, truth: Path) -> str | None:
-    """Say where a scenario of estimated poses is compared with a truth that cannot be placed by them; None elsewhere."""
-    made_with = scenario.provenance.get("poses")
-    source = made_with.get("source") if isinstance(made_with, dict) else None
-    if source not in ("lidar", "camera") or not (truth.suffix == ".json" or (truth / "truth.json").is_file()):
-        return None
-    return f"the scenario's poses are estimated ({source}), {truth} has its own: what the two maps differ by counts as error"
 
 
 def bench(

@@ -85,12 +85,6 @@ class MapLane:
     inferred_from: str = "markings"  # one of `LANE_ORIGINS`
     confidence: float = 1.0  # probability that it is a lane, in this direction, in [0, 1]
 
-    @property
-    def neighbors(self) -> tuple[str, ...]:
-        """Ids of all lanes that it refers to."""
-        beside = (self.left_lane, self.right_lane, self.opposite)
-        return (*self.predecessors, *self.successors, *(lane for lane in beside if lane is not None))
-
 
 @dataclass(frozen=True, eq=False)
 class MapFeatures:
@@ -141,8 +135,10 @@ class MapFeatures:
                 raise ScenarioError(
                     f"lane '{lane.id}': width_m has {len(lane.width_m)} values for {len(lane.points_m)} points, expected equal"
                 )
+            beside = (lane.left_lane, lane.right_lane, lane.opposite)
             for name, known, what in (
-                *((name, lanes, "lane") for name in lane.neighbors),
+                *((name, lanes, "lane") for name in (*lane.predecessors, *lane.successors)),
+                *((name, lanes, "lane") for name in beside if name is not None),
                 *((name, sides, "marking or border") for name in (lane.left, lane.right) if name is not None),
             ):
                 if name not in known:

@@ -295,9 +295,13 @@ def check_cameras(
     else:
         case = "either" if sum(yaw is not None for yaw in check.yaws.values()) == 1 else "camera"
         faults += [
-            Finding("camera_rotation", name, treatment, values=_values(yaw), other=lidar, case=case)
+            Finding(
+                "camera_rotation", name, treatment, other=lidar, case=case,
+                # Of the mount in the calibration against the truth: minus the yaw that it lacks.
+                values={"yaw_deg": float(np.rad2deg(-yaw.yaw_rad)), "yaw_sigma_deg": float(np.rad2deg(yaw.sigma_rad))},
+            )
             for name, yaw in off.items()
-        ]
+        ]  # fmt: skip
     mounts |= {name: turn_by(log.cameras[name].mount_T_cam, yaw.yaw_rad) for name, yaw in off.items()}
     unknown = [name for name, yaw in check.yaws.items() if fix and lidar and yaw is None and name not in mistakes]
     faults += [Finding("unknown_rotation", name, other=lidar, case="edges") for name in unknown]
@@ -341,12 +345,6 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Prog
                 break
     progress("check cameras", len(moments.sweeps), len(moments.sweeps))
     return MountCheck(log, lidar, views, unknown | yaws)
-
-
-def _values(yaw: YawEstimate) -> dict[str, float]:
-    """Return the yaw of the mount in the calibration against the truth, which is minus that which it lacks."""
-    off, sigma = np.rad2deg([-yaw.yaw_rad, yaw.sigma_rad])
-    return {"yaw_deg": float(off), "yaw_sigma_deg": float(sigma)}
 
 
 def check_calibration(

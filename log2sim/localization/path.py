@@ -348,12 +348,6 @@ def _same_rate(samples: Samples, end: _End, start: _End, share: float = 1.0) -> 
     return off <= share * samples.max_change * (start.t_s - end.t_s) + slack + MAX_SIGMAS * float(sigma)
 
 
-def _is_possible(samples: Samples, end: _End, start: _End) -> bool:
-    """Return whether a vehicle can get from the end of a part to the start of a later one."""
-    off, most = _step_and_limit(samples, end, start)
-    return _same_rate(samples, end, start) and float(np.linalg.norm(off)) <= most
-
-
 def is_skip(samples: Samples, first: Part, second: Part) -> bool:
     """Return whether the path steps forward between two parts as it would if stamps missed some time."""
     end, start = _end(samples, first.rows, first=False), _end(samples, second.rows, first=True)
@@ -406,7 +400,11 @@ def _choose(samples: Samples, parts: list[Part]) -> list[Part]:
     best: dict[int, tuple[float, int | None]] = {}
     for n, k in enumerate(moving):
         before = moving[max(n - MAX_COMPARED, 0) : n]
-        earlier = [(best[j][0], j) for j in before if _is_possible(samples, tails[j], heads[k])]
+        earlier = []  # parts from whose end a vehicle can get to the start of this one
+        for j in before:
+            off, most = _step_and_limit(samples, tails[j], heads[k])
+            if _same_rate(samples, tails[j], heads[k]) and np.linalg.norm(off) <= most:
+                earlier.append((best[j][0], j))
         total, from_part = max(earlier, default=(0.0, None), key=lambda e: e[0])
         best[k] = (total + float(np.ptp(samples.t_s[parts[k].rows])), from_part)
     chosen: set[int] = set()

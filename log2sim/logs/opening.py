@@ -289,8 +289,13 @@ def validate_log(
                 bad += 1
                 problems.append(f"stream '{stream.name}': {error}")
             else:
-                defect = _defect_of(record) if isinstance(record, Sweep) else ""
-                problems += [f"stream '{stream.name}', stamp {stream.t_ns[i]}: {defect}"] if defect else []
+                where = f"stream '{stream.name}', stamp {stream.t_ns[i]}"
+                if isinstance(record, Sweep) and not len(record.xyz_m):
+                    problems.append(f"{where}: the sweep has no points")
+                elif isinstance(record, Sweep) and record.frame == "lidar":
+                    most_m = float(np.abs(record.xyz_m).max())
+                    if most_m > MAX_POINT_DISTANCE_M:
+                        problems.append(f"{where}: a point is {most_m:.0f} m from the LiDAR; are the units meters?")
             done += 1
             if progress is not None:
                 progress(done, total)
@@ -306,14 +311,6 @@ def validate_log(
             count, first = f"{np.sum(~known)} of {len(known)} records", stream.t_ns[np.argmin(known)]
             problems.append(f"stream '{name}': no ego pose for {count}, first at stamp {first}")
     return problems
-
-
-def _defect_of(sweep: Sweep) -> str:
-    if not len(sweep.xyz_m):
-        return "the sweep has no points"
-    most_m = float(np.abs(sweep.xyz_m).max())
-    is_far = sweep.frame == "lidar" and most_m > MAX_POINT_DISTANCE_M
-    return f"a point is {most_m:.0f} m from the LiDAR; are the units meters?" if is_far else ""
 
 
 def list_gaps(log: Log) -> list[str]:

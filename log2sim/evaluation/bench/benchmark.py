@@ -22,7 +22,6 @@ from log2sim.evaluation.bench import settings
 from log2sim.evaluation.bench.runs import STAGE as ENDS_STAGE
 from log2sim.evaluation.bench.runs import (
     BenchContext,
-    BenchRun,
     Progress,
     ends_settings,
     homography_points,
@@ -103,7 +102,15 @@ def make_panels(context: BenchContext, report: Progress, default: Sequence[setti
         whole = [replace(p, figures={**p.figures, "placed_share": share}) for p, share in zip(whole, placed)]
 
     def own(stage: str) -> list[settings.Point]:
-        return [_point(context, stage, r) for r in runs if r is runs[0] or r.setting.stage == stage]
+        points = []
+        for r in runs:
+            if r is not runs[0] and r.setting.stage != stage:  # the present run belongs to every stage
+                continue
+            name = r.setting.name if r.setting.stage == stage else getattr(context.grid, stage)[0].name
+            ms = context.ms_per_tick(sum(r.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
+            score = r.measurement_score if stage == "measure" and context.truth is not None else r.score
+            points.append(score.point(name, r.setting.present, ms, ERRORS[stage][context.truth is None][0]))
+        return points
 
     points = {
         "detect": own("detect"), "measure": own("measure"), "homography": homographies, "smooth": own("smooth"),
@@ -121,14 +128,6 @@ def _panel(stage: str, points: Sequence[settings.Point], whole_ms: float, known:
     errors = [np.nan if p.error is None else p.error for p in points]
     front = settings.pareto_front([p.ms_per_tick for p in points], errors)
     return Panel(stage, error, label, unit, tuple(points), tuple(front.tolist()), recommendation)
-
-
-def _point(context: BenchContext, stage: str, run: BenchRun) -> settings.Point:
-    """Make the point of a run in a stage; the present run belongs to every stage."""
-    name = run.setting.name if run.setting.stage == stage else getattr(context.grid, stage)[0].name
-    ms = context.ms_per_tick(sum(run.stages_s.get(s, 0.0) for s in OWN_STAGES[stage]))
-    score = run.measurement_score if stage == "measure" and context.truth is not None else run.score
-    return score.point(name, run.setting.present, ms, ERRORS[stage][context.truth is None][0])
 
 
 @dataclass(frozen=True, eq=False)

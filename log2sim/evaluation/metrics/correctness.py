@@ -80,7 +80,11 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
     """
     v = judge_against_truth(c, ego)
     wrong, confidences = v.wrong, np.array([a.confidence for a in agents], dtype=np.float64)
-    doubted = np.array([doubted_at(a, ticks_s) for a in agents], dtype=bool).reshape(len(agents), len(ticks_s))
+    # Agents of low confidence are doubted at all times.
+    doubted = np.repeat(confidences[:, None] < MIN_TRUSTED_CONFIDENCE, len(ticks_s), axis=1)
+    for k, agent in enumerate(agents):
+        for doubt in agent.doubts:
+            doubted[k] |= doubt.holds(ticks_s)
     # (B, T) standard deviations, for each axis of positions; NaN where the scenario states none.
     sigmas = {name: np.full(wrong.shape, np.nan) for name in ("sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps")}
     for name, out in sigmas.items():
@@ -136,14 +140,15 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
 
     rows, everything = [], np.ones_like(v.judged)
     for k in np.flatnonzero(v.judged.any(axis=1)).tolist():
-        ticks, reasons = v.judged[k], doubts(agents[k])
+        ticks, low = v.judged[k], ["confidence"] if agents[k].confidence < MIN_TRUSTED_CONFIDENCE else []
+        reasons = [*low, *dict.fromkeys(doubt.kind for doubt in agents[k].doubts)]
         there, count = np.unique(v.taken_for[k, ticks], return_counts=True)
         rows.append({
             "id": c.other.agents[k].id, "category": str(c.other.category[k]), "ticks": int(ticks.sum()),
             "wrong_ticks": int((wrong[k] & ticks).sum()),
             **{f"{name}_ticks": int((v.measures[name][k] & ticks).sum()) for name in REPORTED},
             "taken_for": {c.truth.agents[i].id if i >= 0 else "nothing": int(n) for i, n in zip(there, count)},
-            "confidence": float(confidences[k]), "doubted": bool(reasons), "doubts": list(reasons),
+            "confidence": float(confidences[k]), "doubted": bool(reasons), "doubts": reasons,
             "mean_range_m": float(c.other.range_m[k, ticks].mean()),
         })  # fmt: skip
     shown = (v.judged | v.undecided).any(axis=1)
@@ -158,18 +163,6 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
         "confusion": _confusion(v, c.other.category, c.truth.category),
         "judged_agents": rows,
     }
-
-
-def doubts(agent: Agent) -> tuple[str, ...]:
-    """Name the reasons for which a scenario doubts an agent: its doubts, and a confidence below one half."""
-    low = ("confidence",) if agent.confidence < MIN_TRUSTED_CONFIDENCE else ()
-    return (*low, *dict.fromkeys(doubt.kind for doubt in agent.doubts))
-
-
-def doubted_at(agent: Agent, t_s: Array) -> Mask:
-    """Return whether a scenario doubts an agent at times (T,)."""
-    low = np.full(len(t_s), agent.confidence < MIN_TRUSTED_CONFIDENCE)
-    return np.asarray(np.any([low, *(doubt.holds(t_s) for doubt in agent.doubts)], axis=0))
 
 
 def over_ticks(which: Mask, like: Mask) -> Mask:

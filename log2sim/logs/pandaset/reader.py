@@ -127,9 +127,7 @@ class SweepFiles:
 
 
 # One file holds the sweeps of both LiDARs, which are read one after the other.
-@lru_cache(maxsize=4)
-def _read_points(path: Path) -> Columns:
-    return read_pickled_table(path)
+_read_points = lru_cache(maxsize=4)(read_pickled_table)
 
 
 def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Sweep:

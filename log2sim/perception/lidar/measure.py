@@ -251,7 +251,9 @@ def _weigh_pairs(
     with np.errstate(invalid="ignore"):
         covered = np.hypot(*(columns["center_m"] - columns["sensor_m"])[count:, :2].T) <= SWEEP_RANGE_M
     recall = np.where(covered, found * points / (points + SWEEP_RECALL_POINTS), 0.0)
-    columns["score"][count:] = if_missed(columns["score"][count:], recall)
+    # The odds of an object that the LiDAR missed are those of its score times 1 - recall.
+    alone = columns["score"][count:]
+    columns["score"][count:] = np.where(recall > 0, probability_of(logit(alone) + np.log1p(-recall)), alone)
     view_of = {view.camera.name: view for view in views}
     # Of several images the best one is written last.
     for n in np.argsort(pairs.iou * images.score[pairs.image], kind="stable").tolist():
@@ -265,11 +267,6 @@ def _weigh_pairs(
         depth_m = (places - view.map_T_cam[:3, 3]) @ view.map_T_cam[:3, 2]
         category = str(columns["category"][row])
         columns["height_px_m"][row] = _height_m(images.box_px[image], depth_m, category, view.camera)
-
-
-def if_missed(score: Array, recall: Array) -> Array:
-    """Return the probability (M,) of objects that another detector missed: the odds of the score times 1 - recall."""
-    return np.where(recall > 0, probability_of(logit(score) + np.log1p(-recall)), score)
 
 
 def logit(p: Array) -> Array:
