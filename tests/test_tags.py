@@ -158,14 +158,13 @@ def test_measures_have_their_closed_forms() -> None:
     assert c.time_headway(gap, np.array([10.0, 0.0, 10.0, 5.0])) == pytest.approx([2.0, np.inf, 0.0, 2.0])
     assert c.deceleration_to_avoid(gap, closing) == pytest.approx([0.625, 0.0, np.inf, 5.0])
     # Braking so from the gap, after the reaction for MDRAC, leads to the speed of the one ahead in touch with it.
-    assert c.modified_deceleration(gap, closing, 1.0)[0] == pytest.approx(5.0**2 / (2 * (20.0 - 5.0 * 1.0)))
-    assert c.modified_deceleration(gap, closing, 1.0)[3] == np.inf
+    assert c.modified_deceleration(gap, closing)[0] == pytest.approx(5.0**2 / (2 * (20.0 - 5.0 * 1.0)))
+    assert c.modified_deceleration(gap, closing)[3] == np.inf
     assert c.braking_required(gap, closing, np.array([-1.0, 0.0, 0.0, 2.0])) == pytest.approx([1.625, 0.0, np.inf, 3.0])
-    assert c.brake_threat_number(gap, closing, np.zeros(4), 8.0)[3] == pytest.approx(0.625)
+    assert c.brake_threat_number(gap, closing, np.zeros(4))[3] == pytest.approx(0.625)
     # Within 2 s, 1.8 m less 0.5 m aside are to be gained: a t^2 / 2.
-    assert c.steer_threat_number(
-        np.array([2.0]), np.array([0.5]), np.array([0.0]), np.array([1.8]), 8.0
-    ) == pytest.approx(1.3 / 2.0 / 8.0)
+    steer = c.steer_threat_number(np.array([2.0]), np.array([0.5]), np.array([0.0]), np.array([1.8]))
+    assert steer == pytest.approx(1.3 / 2.0 / 8.0)
     assert c.encroachment_time(np.array([4.0]), np.array([6.0])) == pytest.approx(1.5)
 
 

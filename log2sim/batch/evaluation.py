@@ -141,16 +141,19 @@ def format_batch_verdict(document: Figures) -> str:
     return table.verdict_text([*lines, *(("note:", note) for note in notes)])
 
 
-def format_batch_table(document: Figures, *, max_rows: int) -> str:
-    """Format the figures: a line for each log up to a number of them, the worst recall first, and one for all."""
+MAX_LOGS = 20  # that are printed; the document has all
+
+
+def format_batch_table(document: Figures) -> str:
+    """Format the figures: a line for each of `MAX_LOGS` logs, the worst recall first, and one for all."""
     rows = sorted(
         (entry for entry in document["logs"] if "error" not in entry),
         key=lambda e: (1.0 if e["recall"] is None else e["recall"], e["log"]),
     )
     total = document["total"]
     whole = {**dict.fromkeys(OF_A_LOG), **total["median_of_logs"], **{k: total[k] for k in OF_A_LOG if k in total}}
-    lines = [("all", {**whole, "counts": total["counts"]}), *((entry["log"], entry) for entry in rows[:max_rows])]
+    lines = [("all", {**whole, "counts": total["counts"]}), *((entry["log"], entry) for entry in rows[:MAX_LOGS])]
     cells = [["", "agents", *(title for _, title, _ in table.COLUMNS)]]
     cells += [[name, str(f["counts"].get("truth_agents", 0)), *table.figure_cells(f)] for name, f in lines]
-    notes = [f"and {len(rows) - max_rows} more logs with higher recall"] if len(rows) > max_rows else []
+    notes = [f"and {len(rows) - MAX_LOGS} more logs with higher recall"] if len(rows) > MAX_LOGS else []
     return "\n".join([*table.columns_text(cells), *notes, "medians and HOTA of all are medians over the logs"])

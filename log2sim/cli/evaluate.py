@@ -15,7 +15,6 @@ from log2sim.errors import ConfigError, LogError, ScenarioError
 from log2sim.files.outputs import together
 
 PROTOCOL = "center"
-MAX_LOGS = 20  # of a batch that are printed; the document has all
 
 
 def evaluate(
@@ -78,7 +77,7 @@ def evaluate(
                 max_range_m=range, categories=wanted, progress=partial(report_progress, "logs"),
             )  # fmt: skip
         table = format_batch_verdict(result)
-        table += f"\n\n{format_batch_table(result, max_rows=MAX_LOGS)}" if verbose else ""
+        table += f"\n\n{format_batch_table(result)}" if verbose else ""
     elif is_boxes_document(document := read_json(path, ScenarioError)):
         from log2sim.evaluation.detection.boxes import DetectedBoxes
         from log2sim.evaluation.detection.evaluation import DEFAULT_SCORE, DetectionOptions, evaluate_boxes

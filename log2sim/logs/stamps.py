@@ -113,16 +113,20 @@ def compute_scan_offset_ns(xy_lidar: Array, turn_ns: int) -> NDArray[np.int64]:
     return np.round((compute_turn_share(xy_lidar) - 1) * turn_ns).astype(np.int64)
 
 
-def select_spaced(t_ns: NDArray[np.int64], track_id: NDArray[np.str_], min_step_ns: int) -> NDArray[np.intp]:
+# Between labels of one object.
+MIN_STEP_NS = 20_000_000
+
+
+def select_spaced(t_ns: NDArray[np.int64], track_id: NDArray[np.str_]) -> NDArray[np.intp]:
     """Select the rows (M,) that keep the stamps of each track, in the order of the turns, apart.
 
     An object that crosses the direction in which the turns start is scanned at the end of one turn and at the start of the
-    next: what comes sooner than `min_step_ns` after the last one that was kept is dropped.
+    next: what comes sooner than `MIN_STEP_NS` after the last one that was kept is dropped.
     """
     last: dict[str, int] = {}
     keep = []
     for row, (t, track) in enumerate(zip(t_ns.tolist(), track_id.tolist())):
-        if track not in last or t - last[track] >= min_step_ns:
+        if track not in last or t - last[track] >= MIN_STEP_NS:
             last[track] = t
             keep.append(row)
     return np.array(keep, dtype=np.intp)

@@ -233,19 +233,24 @@ def azimuth_steps(xy_m: Array, count: NDArray[np.intp]) -> Array:
     return np.where(columns > 0, (low + high) / 2, 0.0)
 
 
-def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    """Return the indices of at most so many points of each cluster, at distances (N,), m, evenly spread over its surface.
+# Points of a cluster that are kept as evidence; its extents are those of all, since ends are told by their outermost points.
+MAX_KEPT_POINTS = 400
+
+
+def sample_surfaces(range_m: NDArray[np.floating[Any]], count: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the indices of at most `MAX_KEPT_POINTS` points of each cluster, at distances (N,), m, evenly spread over its surface.
 
     A ray stands for a surface that grows with the square of the distance. Of every n-th point hardly one would be on
     the far end of a long vehicle beside the sensor.
     """
-    kept = np.repeat(count <= most, count)
-    many = np.flatnonzero(count > most)
+    kept = np.repeat(count <= MAX_KEPT_POINTS, count)
+    many = np.flatnonzero(count > MAX_KEPT_POINTS)
     if len(many):
         area = np.concatenate([[0.0], np.cumsum(range_m.astype(np.float64) ** 2)])
         first = (np.cumsum(count) - count)[many]
         low, high = area[first], area[first + count[many]]
-        wanted = low[:, None] + (np.arange(most) + 0.5) / most * (high - low)[:, None]
+        share = (np.arange(MAX_KEPT_POINTS) + 0.5) / MAX_KEPT_POINTS
+        wanted = low[:, None] + share * (high - low)[:, None]
         kept[np.searchsorted(area[1:], wanted.ravel())] = True
     return np.flatnonzero(kept)
 

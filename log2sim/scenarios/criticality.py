@@ -40,10 +40,10 @@ def deceleration_to_avoid(gap_m: Array, closing_mps: Array) -> Array:
     return np.where(closing > 0, _ratio(closing**2, 2.0 * np.maximum(gap_m, 0.0)), 0.0)
 
 
-def modified_deceleration(gap_m: Array, closing_mps: Array, reaction_s: float = REACTION_S) -> Array:
+def modified_deceleration(gap_m: Array, closing_mps: Array) -> Array:
     """Compute MDRAC, m/s2 (Fu and Sayed 2021): closing speed / (2 (TTC - reaction)); infinite when the reaction takes longer than the TTC."""
     closing = np.maximum(closing_mps, 0.0)
-    left_s = time_to_collision(gap_m, closing_mps) - reaction_s
+    left_s = time_to_collision(gap_m, closing_mps) - REACTION_S
     return np.where(closing > 0, _ratio(closing, 2.0 * left_s), 0.0)
 
 
@@ -55,16 +55,12 @@ def braking_required(gap_m: Array, closing_mps: Array, accel_ahead_mps2: Array) 
     return np.maximum(deceleration_to_avoid(gap_m, closing_mps) - np.where(closing_mps > 0, accel_ahead_mps2, 0.0), 0.0)
 
 
-def brake_threat_number(
-    gap_m: Array, closing_mps: Array, accel_ahead_mps2: Array, available_mps2: float = BRAKES_MPS2
-) -> Array:
+def brake_threat_number(gap_m: Array, closing_mps: Array, accel_ahead_mps2: Array) -> Array:
     """Compute BTN (Brannstrom et al. 2008): deceleration required by the one available; from 1 on braking alone does not help."""
-    return braking_required(gap_m, closing_mps, accel_ahead_mps2) / available_mps2
+    return braking_required(gap_m, closing_mps, accel_ahead_mps2) / BRAKES_MPS2
 
 
-def steer_threat_number(
-    ttc_s: Array, aside_m: Array, lateral_mps: Array, width_m: Array, available_mps2: float = BRAKES_MPS2
-) -> Array:
+def steer_threat_number(ttc_s: Array, aside_m: Array, lateral_mps: Array, width_m: Array) -> Array:
     """Compute STN (Brannstrom et al. 2008): lateral acceleration to pass on the nearer side by the one available; 0 without a collision.
 
     `aside_m`: how far to the left the one ahead is, and `lateral_mps` how fast it moves there, relative to who steers; `width_m` is
@@ -74,7 +70,7 @@ def steer_threat_number(
     t = np.where(clear, ttc_s, 1.0)
     then = aside_m + lateral_mps * t
     need = np.maximum(width_m - np.abs(then), 0.0)
-    return np.where(clear, 2.0 * need / t**2 / available_mps2, np.where(ttc_s == 0, np.inf, 0.0))
+    return np.where(clear, 2.0 * need / t**2 / BRAKES_MPS2, np.where(ttc_s == 0, np.inf, 0.0))
 
 
 def encroachment_time(speed_mps: Array, way_m: Array) -> Array:

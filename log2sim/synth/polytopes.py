@@ -98,15 +98,15 @@ def column(
     return _made(normals, offsets, (at[0] - reach, at[1] - reach, z[0]), (at[0] + reach, at[1] + reach, z[1]), material)
 
 
-def tube(radius: float, x: tuple[float, float], z: float, material: Material) -> Polytope:
-    """Make a lying prism of eight sides around a circle of a radius at height z, between two x, m."""
+def tube(radius: float, x: tuple[float, float], z: float) -> Polytope:
+    """Make a lying prism of metal with eight sides around a circle of a radius at height z, between two x, m."""
     sides = 8
     angles = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     around = np.column_stack([np.zeros(sides), np.cos(angles), np.sin(angles)])
     normals = np.vstack([around, [[1, 0, 0], [-1, 0, 0]]])
     offsets = np.append(radius + around[:, 2] * z, [x[1], -x[0]])
     reach = radius / np.cos(np.pi / sides)
-    return _made(normals, offsets, (x[0], -reach, z - reach), (x[1], reach, z + reach), material)
+    return _made(normals, offsets, (x[0], -reach, z - reach), (x[1], reach, z + reach), Material.METAL)
 
 
 _ROUND = (np.arange(8) + 0.5) * np.pi / 4

@@ -151,9 +151,9 @@ def disc_wheel(center: ArrayLike, radius_m: float, width_m: float, part: int) ->
     return loft(np.array(rings), part)
 
 
-def hoop(center: ArrayLike, radius_m: float, thickness_m: float, part: int) -> Mesh:
+def hoop(center: ArrayLike, radius_m: float, part: int) -> Mesh:
     """Make a thin tire around an axle along y."""
-    count, c = 28, np.asarray(center, dtype=np.float64)
+    count, thickness_m, c = 28, 0.026, np.asarray(center, dtype=np.float64)
     angle = -np.arange(count) * 2 * np.pi / count
     out = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], 1)
     rings = [
@@ -369,7 +369,7 @@ def _rider(step: int) -> Mesh:
     radius = 0.34
     rear, front = np.array([-0.53, 0.0, radius]), np.array([0.53, 0.0, radius])
     crank, seat, head = np.array([-0.08, 0.0, 0.28]), np.array([-0.26, 0.0, 0.92]), np.array([0.38, 0.0, 0.88])
-    parts = [hoop(c, radius, 0.026, Material.TIRE) for c in (rear, front)]
+    parts = [hoop(c, radius, Material.TIRE) for c in (rear, front)]
     for hub in (rear, front):
         for k in range(8):
             a = k * np.pi / 8 + phase

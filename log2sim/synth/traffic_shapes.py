@@ -267,7 +267,7 @@ def _load(back: float, front: float, width: float, floor: float, height: float, 
             box((front - 0.08, -w, floor), (front, w, floor + wall + 0.3), METAL),
         ]
     if kind < 0.87:
-        return [*bed, tube(min(w, (height - floor) / 2), (back, front), floor + min(w, (height - floor) / 2), METAL)]
+        return [*bed, tube(min(w, (height - floor) / 2), (back, front), floor + min(w, (height - floor) / 2))]
     load = rng.uniform(0.5, 1.0)
     end, top = back + (front - back) * load, floor + rng.uniform(0.6, 1.8)
     cargo = box((back + 0.3, -w * 0.9, floor + 0.2), (end, w * 0.9, top), WOOD)

@@ -32,9 +32,9 @@ from log2sim.datatypes import CATEGORIES, GROUP_OF
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, probability_of
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.metrics.comparison import Selection
-from log2sim.evaluation.metrics.correctness import MAX_WRONG_SHARE, reliability
+from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.evaluation.metrics.evaluator import compare_scenarios
-from log2sim.evaluation.metrics.verdicts import judge_against_truth
+from log2sim.evaluation.metrics.verdicts import MAX_WRONG_SHARE, judge_against_truth
 from log2sim.geometry import Array
 
 Weights = dict[bool, dict[str, float]]

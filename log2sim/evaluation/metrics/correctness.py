@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import CATEGORIES, GROUPS, MIN_TRUSTED_CONFIDENCE, Agent
 from log2sim.evaluation.metrics.comparison import Comparison, Mask, StateTable
-from log2sim.evaluation.metrics.verdicts import REPORTED, Verdicts, correctness_rules, judge_against_truth
+from log2sim.evaluation.metrics.verdicts import (
+    MAX_WRONG_SHARE,
+    REPORTED,
+    Verdicts,
+    correctness_rules,
+    judge_against_truth,
+)
 from log2sim.geometry import Array
 from log2sim.geometry.statistics import CHI2_2DOF_95
 
@@ -67,9 +73,6 @@ def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:
 
 
 RANGES_M = ((0.0, 15.0), (15.0, 30.0), (30.0, 50.0), (50.0, np.inf))
-# An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
-# Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009).
-MAX_WRONG_SHARE = 0.2
 
 
 def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: StateTable | None) -> dict[str, Any]:
@@ -154,7 +157,7 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
     shown = (v.judged | v.undecided).any(axis=1)
     kinds, categories = (set(column[shown].tolist()) for column in (c.other.group, c.other.category))
     return {
-        "rules": correctness_rules(MAX_WRONG_SHARE, MIN_TRUSTED_CONFIDENCE),
+        "rules": correctness_rules(),
         **detailed(everything),
         "by_kind": {k: detailed(over_ticks(c.other.group == k, everything)) for k in GROUPS if k in kinds},
         "by_category": {

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUPS, Scenario
+from log2sim.datatypes import GROUPS, MIN_TRUSTED_CONFIDENCE, Scenario
 from log2sim.evaluation.metrics import comparison
 from log2sim.evaluation.metrics.comparison import Comparison, Index, Mask, StateTable
 from log2sim.files.arrays import Columns
@@ -94,6 +94,9 @@ MIN_SIZE_ERROR_M = 0.3
 # An agent is wrong at a tick when at least one of these is true of it.
 MEASURES = ("invented", "duplicate", "in_ego", "wrong_speed", "wrong_motion", "backwards", "wrong_size")
 REPORTED = (*MEASURES, "wrong_class")
+# An agent is wrong when more of its ticks are. Trackers are scored alike: "mostly tracked" is 80 % of a life (Wu and
+# Nevatia, CVPR 2006; Li, Huang, Nevatia, CVPR 2009).
+MAX_WRONG_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +257,7 @@ def counting_rules(truth: Scenario) -> dict[str, Any]:
     }
 
 
-def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str, Any]:
+def correctness_rules() -> dict[str, Any]:
     """Describe what is wrong with an agent, and when a scenario doubts one; see `verdicts.judge_against_truth`."""
     return {
         "judged": "ticks of a reconstructed agent at which it matches a labeled object, or matches none and the labels "
@@ -273,8 +276,9 @@ def correctness_rules(max_wrong_share: float, min_confidence: float) -> dict[str
         f"and by more than {MIN_SIZE_ERROR_M:g} m",
         "wrong_class": "the matched object, or the nearest within the gate, has another category; no reason to be wrong",
         "wrong": f"at a tick, any of {', '.join(MEASURES)}; of agents, and likewise for each measure, more than "
-        f"{max_wrong_share:.0%} of the ticks",
-        "doubted": f"the scenario doubts the agent at the tick, or gives it a confidence below {min_confidence:g}; of agents, at any tick",
+        f"{MAX_WRONG_SHARE:.0%} of the ticks",
+        "doubted": f"the scenario doubts the agent at the tick, or gives it a confidence below "
+        f"{MIN_TRUSTED_CONFIDENCE:g}; of agents, at any tick",
         "sigma": "nees: mean of squared position errors of matched ticks over two times the squared sigma, 1 expected; "
         "median, 0.69 expected; within_95: share inside of the 95 % circle, 0.95 expected",
         "sigma_yaw": "likewise of yaw, up to half turns; median, 0.45 expected",

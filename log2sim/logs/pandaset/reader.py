@@ -152,7 +152,6 @@ def _read_sweep(kept: Columns | None, path: Path, t_ns: int, number: int) -> Swe
 
 
 PERIOD_NS = 100_000_000
-MIN_STEP_NS = 20_000_000
 
 CATEGORY_OF = {
     "Car": "car", "Pickup Truck": "truck", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Bus": "bus",
@@ -215,7 +214,7 @@ def read_labels(
     if not parts:
         raise LogError(f"{next(iter(files.values())).parent}: no cuboids of the sweeps of this log")
     columns = [np.concatenate(column) for column in zip(*parts)]
-    keep = select_spaced(columns[0], columns[1], MIN_STEP_NS)
+    keep = select_spaced(columns[0], columns[1])
     t_ns, track_id, category, center, size, yaw = (c[keep] for c in columns)
     # A bicycle of unknown rider is what it is in most other sweeps.
     alone = 0

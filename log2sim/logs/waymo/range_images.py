@@ -159,8 +159,6 @@ def turn_of(xyz_vehicle: Array, laser: LaserCalibration) -> Array:
 # Vehicles are cars, trucks, buses and motorcycles.
 CATEGORY_OF = {"vehicle": "car", "pedestrian": "pedestrian", "cyclist": "cyclist"}
 NO_ROAD_USERS = {"sign"}
-# Of labels of one object; see `select_spaced`.
-MIN_STEP_NS = 20_000_000
 MAX_COORDINATE_M = 1e4
 
 
@@ -188,7 +186,7 @@ def labels_of(
     turn = None if top is None else turn_of(table.center, top)
     t_ns = times.pose_ns[table.frame] if turn is None else times.at_turn(table.frame, turn)
     order = np.argsort(t_ns, kind="stable")
-    keep = order[select_spaced(t_ns[order], table.track_id[order], MIN_STEP_NS)]
+    keep = order[select_spaced(t_ns[order], table.track_id[order])]
     table, kind, t_ns = table.take(keep), kind[keep], t_ns[keep]
     pose = map_T_vehicle[table.frame]
     turned = pose[:, :3, :3] @ rotation_from_rpy(0.0, 0.0, table.heading_rad)

@@ -325,10 +325,6 @@ def _height_m(box_px: Array, depth_m: NDArray[np.floating[Any]], category: str, 
     return float((box_px[3] - box_px[1]) * at_m / camera.K[1, 1])
 
 
-# Points of a cluster that are kept as evidence; its extents are those of all, since ends are told by their outermost points.
-MAX_KEPT_POINTS = 400
-
-
 def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequence[Index], cloud: Cloud) -> None:
     """Write what points show into rows of columns; a box of a 3D detector says which side is the length.
 
@@ -360,7 +356,7 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
         columns["t_ns"][of] = view.stamp_ns + mean_ns
         columns["sensor_m"][of] = view.sensor + view.origin
         columns["ends_visible"][of] = view.azimuth_index.ends_visible(parts)
-        shown = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count, MAX_KEPT_POINTS)
+        shown = sample_surfaces(np.sqrt(np.einsum("ij,ij->i", of_sensor, of_sensor)), count)
         late_s = t_s[shown] - np.repeat(mean_ns, count)[shown] / NS_PER_S
         timed = np.column_stack([xyz.take(shown, axis=0) + view.origin, late_s])
         for row, points in zip(of.tolist(), np.split(timed, np.searchsorted(shown, edges[1:-1]))):
@@ -371,7 +367,7 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
         if len(split[i]) > 1 and len(split[i][1][1]) >= MIN_CLUSTER_POINTS:
             view, index = split[i][1]
             of_sensor = view.xyz.take(index, axis=0).astype(np.float64) - view.sensor
-            shown = sample_surfaces(np.linalg.norm(of_sensor, axis=1), np.array([len(index)]), MAX_KEPT_POINTS)
+            shown = sample_surfaces(np.linalg.norm(of_sensor, axis=1), np.array([len(index)]))
             late_s = (
                 view.t_s[index[shown]].astype(np.float64) + (view.stamp_ns - int(columns["t_ns"][rows[i]])) / NS_PER_S
             )
