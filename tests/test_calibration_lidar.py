@@ -35,10 +35,6 @@ def seen_lively(lively: Log) -> SweepPairs:
     return seen_in(lively)
 
 
-def late(log: Log, offset_s: float) -> Log:
-    return log.changed(streams={TOP: shift_stream(log.streams[TOP], round(offset_s * NS_PER_S))})
-
-
 def turned(log: Log, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> Log:
     lidar, turn = log.lidars[TOP], np.radians([0.0, pitch_deg, yaw_deg])
     return log.changed(lidars={TOP: replace(lidar, mount_T_lidar=turn_mount(lidar.mount_T_lidar, turn))})
@@ -119,7 +115,8 @@ def test_a_sound_log_tells_nothing_even_if_corrections_are_asked_for(lively: Log
 
 
 def test_late_stamps_are_corrected_with_those_of_the_points(lively: Log) -> None:
-    log, (fault,) = check(late(lively, 0.1), fix_time=True)
+    late = lively.changed(streams={TOP: shift_stream(lively.streams[TOP], NS_PER_S // 10)})
+    log, (fault,) = check(late, fix_time=True)
     assert fault.treatment == "corrected"
     shift_ns = log.streams[TOP].t_ns - lively.streams[TOP].t_ns
     assert np.abs(shift_ns).max() < 0.004 * NS_PER_S

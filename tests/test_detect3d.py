@@ -14,7 +14,6 @@ from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.detect3d.boxes import (
     MIN_HEAT,
-    LevelBoxes,
     decode_centers,
     decode_votes,
     headings,
@@ -137,17 +136,13 @@ def grid_of(maps: NDArray[np.float32], top_m: float = 1.5) -> NDArray[np.float32
     return grid
 
 
-def decode(maps: NDArray[np.float32], top_m: float = 1.5) -> LevelBoxes:
-    return decode_votes(maps, grid_of(maps, top_m), info(), LOW_VOTES)
-
-
 def test_the_majority_decides_and_the_score_is_its_mean_probability() -> None:
     maps = empty_maps(40, 40)
     encode(maps, (0.2, 0.2, 0.8, *CAR, 0.0), "car", low=LOW_VOTES, cells=1)
     maps[19:23, 19:22, 19:22] = 0
     maps[20, 19:22, 19:22] = np.log(6.0)
     maps[19:23, 19, 19:21] = np.array([0, 0, np.log(6.0), 0])[:, None]
-    found = decode(maps)
+    found = decode_votes(maps, grid_of(maps, 1.5), info(), LOW_VOTES)
     assert found.category.tolist() == ["car"]
     # Six ninths of the cells give the class 6 / 9, one third of the remaining ones 1 / 9.
     assert sigmoid(found.heat)[0] == pytest.approx((7 * 6 / 9 + 2 * 1 / 9) / 9)

@@ -191,16 +191,12 @@ def test_clouds_without_anything_to_find_give_no_boxes(level: Array, decode: str
     assert len(chosen.detect(cloud_of(level), [cloud_of(level)])) == 0
 
 
-def without(key: str) -> dict[str, Any]:
-    return {k: v for k, v in INFO.items() if k != key}
-
-
 @pytest.mark.parametrize(
     ("metadata", "message"),
     [
         (None, r"no entry 'log2sim\.lidar', a JSON document with cell_m"),
         ("{", r"'log2sim\.lidar'.*JSON"),
-        (without("stride"), r"'stride' is missing"),
+        ({k: v for k, v in INFO.items() if k != "stride"}, r"'stride' is missing"),
         ({**INFO, "version": 2}, r"'version' is 2, expected 1"),
         ({**INFO, "cell_m": -1.0}, r"'cell_m' is -1\.0, expected a number from 0\.05 to 2"),
         ({**INFO, "range_m": 1000.0}, r"'range_m' is 1000, expected at most 512 cells"),

@@ -375,9 +375,7 @@ def test_damaged_and_foreign_results_of_stages_are_made_again(folder: Path) -> N
 # --- keys
 
 
-def test_the_key_of_a_network_changes_with_its_weights_and_settings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_key_of_a_network_changes_with_its_weights_and_settings(tmp_path: Path) -> None:
     onnx = pytest.importorskip("onnx", reason="building test models needs onnx")
     from test_detect_onnx import LOG, save_model, yolov8, yolox
 

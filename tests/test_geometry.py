@@ -78,13 +78,9 @@ def pose_track(t_s: list[float], **options: float) -> PoseTrack:
 EPOCH_NS = 1_700_000_000_123_456_789
 
 
-def at_s(track: PoseTrack, t_s: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    return track.at(EPOCH_NS + np.rint(np.array(t_s) * 1e9).astype(np.int64))
-
-
 def test_poses_between_stamps_lie_on_the_way() -> None:
     track, asked = pose_track([0.0, 0.1, 0.25, 1.0]), [-0.1, 0.0, 0.05, 0.1, 0.2, 0.7, 1.0, 1.2]
-    poses, valid = at_s(track, asked)
+    poses, valid = track.at(EPOCH_NS + np.rint(np.array(asked) * 1e9).astype(np.int64))
     assert valid.all()
     np.testing.assert_allclose(poses[:, 0, 3], 10.0 * np.array(asked), atol=1e-9)
     np.testing.assert_allclose(yaw_of(poses), 0.4 * np.array(asked), atol=1e-9)

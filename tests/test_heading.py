@@ -61,10 +61,6 @@ def decided(*candidates, path=None):
     return [round(float(np.rad2deg(a.waypoints.yaw_rad[0]))) % 360 for a in agents], agents
 
 
-def ambiguous(agent):
-    return [d.kind for d in agent.doubts] == ["heading_ambiguous"]
-
-
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("yaw", [0.0, np.pi])
 def test_parked_cars_point_with_the_traffic_of_their_side(side, yaw):
@@ -142,7 +138,7 @@ def test_a_lone_car_is_doubted_and_says_so_in_its_quality():
     (heading,), (agent,) = decided(candidate(30.0, 40.0, 1.0), path=np.zeros((0, 3)))
     assert heading == 57
     assert agent.quality["heading_confidence"] == 0.5
-    assert ambiguous(agent)
+    assert [d.kind for d in agent.doubts] == ["heading_ambiguous"]
 
 
 def test_headings_do_not_depend_on_the_map_or_on_the_order():

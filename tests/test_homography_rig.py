@@ -27,10 +27,6 @@ def make_camera(name: str, yaw_deg: float, at: tuple[float, float, float], mount
     return Camera(name, 1280, 720, K, mount, transform(turn @ EGO_R_CAM, np.array(at)))  # type: ignore[arg-type]
 
 
-def make_cameras() -> dict[str, Camera]:
-    return {n: make_camera(n, y, (1.0 + 0.5 * k, 0.3 * k, 1.6)) for k, (n, y) in enumerate(YAWS_DEG.items())}
-
-
 def turned(camera: Camera, degrees: tuple[float, float, float]) -> Camera:
     """The camera as it really stands, turned about its own axes against what the calibration says."""
     turn = transform(rotation_of(np.radians(degrees)), np.zeros(3))
@@ -64,16 +60,12 @@ class World:
 PLANE = np.array([0.02, -0.01, 0.1])
 
 
-def at_origin(rig: Rig) -> np.ndarray:
-    """The plane in the rig frame."""
-    return np.array([*PLANE[:2], rig.origin_m[:2] @ PLANE[:2] + PLANE[2]])
-
-
 def make_world(
     *, mounts: dict[str, tuple[float, float, float]] | None = None, noise_px: float = 0.0, outliers: float = 0.0,
     ticks: int = 20, tilt: float = 0.0, each: int = 6, seed: int = 0,
 ) -> World:  # fmt: skip
-    rng, cameras = np.random.default_rng(seed), make_cameras()
+    rng = np.random.default_rng(seed)
+    cameras = {n: make_camera(n, y, (1.0 + 0.5 * k, 0.3 * k, 1.6)) for k, (n, y) in enumerate(YAWS_DEG.items())}
     true = {n: turned(c, (mounts or {}).get(n, (0.0, 0.0, 0.0))) for n, c in cameras.items()}
     slopes = PLANE + np.column_stack([tilt * rng.normal(size=(ticks, 2)), np.zeros(ticks)])
     feet, ground = {}, {}
@@ -98,7 +90,8 @@ def test_exact_data_give_the_plane_and_the_homographies() -> None:
     fit = world.fit()
     assert fit.reason == ""
     assert fit.state is not None
-    np.testing.assert_allclose(fit.state.plane, at_origin(fit.rig), atol=1e-9)
+    plane = [*PLANE[:2], fit.rig.origin_m[:2] @ PLANE[:2] + PLANE[2]]  # in the rig frame
+    np.testing.assert_allclose(fit.state.plane, plane, atol=1e-9)
     assert world.error_m({n: f.ground_H_image for n, f in fit.fits.items()}, PLANE) < 1e-3
     assert all(f.ok and f.inliers.all() and f.error_m < 1e-3 for f in fit.fits.values())
 

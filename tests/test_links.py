@@ -54,10 +54,6 @@ def test_symbolic_links_may_stay_inside_but_not_leave(log_folder: Path) -> None:
             inside(log_folder, relative, "log.json")
 
 
-def db3(log: Log, folder: Path) -> Path:
-    return ros.encode_as(log, folder, ros.Style(container="db3"))
-
-
 # How a log is written, and which of its files becomes a link.
 FORMATS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "log2sim": (native.encode, "front/*.jpg"),
@@ -68,7 +64,7 @@ FORMATS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "argoverse2": (argoverse.encode, "sensors/lidar/*.feather"),
     "waymo-parquet": (waymo_parquet.encode, "vehicle_pose/*.parquet"),
     "ros": (lambda log, folder: ros.encode_as(log, folder, ros.Style("bag")).parent, "*.bag"),
-    "ros database": (db3, "*.db3"),
+    "ros database": (lambda log, folder: ros.encode_as(log, folder, ros.Style("db3")), "*.db3"),
     "nuscenes poses": (nuscenes.encode_world, "v1.0-mini/ego_pose.json"),
     "waymo": (lambda log, folder: waymo.encode(log, folder).parent, "*.tfrecord"),
     "log2sim manifest": (native.encode, "log.json"),

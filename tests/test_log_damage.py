@@ -47,14 +47,6 @@ def with_stamps(log: Log, name: str, t_ns: np.ndarray) -> Log:
     return log.changed(streams={**log.streams, name: stream})
 
 
-def with_poses(log: Log, seconds: float) -> Log:
-    return log.changed(ego=PoseTrack(moved(log.ego.t_ns, seconds), log.ego.map_T_ego))
-
-
-def with_camera(log: Log, **changes: Any) -> Log:
-    return log.changed(cameras={**log.cameras, "front": replace(log.cameras["front"], **changes)})
-
-
 CLOCKS = {
     18.0: "GPS time against UTC",
     -37.0: "TAI against UTC",
@@ -67,7 +59,8 @@ CLOCKS = {
 
 @pytest.mark.parametrize("seconds", CLOCKS)
 def test_poses_of_another_clock_are_named_with_the_clock(seconds: float) -> None:
-    log = with_poses(sound(), seconds + 0.05)
+    log = sound()
+    log = log.changed(ego=PoseTrack(moved(log.ego.t_ns, seconds + 0.05), log.ego.map_T_ego))
     (problem,) = list_time_problems(log)
     assert problem.startswith("the ego poses are from ")
     assert f"do not overlap (the difference is {abs(seconds):.5g}"[:35] in problem
@@ -137,7 +130,9 @@ CALIBRATIONS: dict[str, tuple[Callable[[Camera], dict[str, Any]], str, bool]] = 
 @pytest.mark.parametrize("name", CALIBRATIONS)
 def test_a_calibration_that_no_camera_has_is_named_by_its_field(name: str) -> None:
     change, words, refused = CALIBRATIONS[name]
-    log = with_camera(sound(), **change(sound().cameras["front"])).changed(calibrations={"front": "calib.txt"})
+    log = sound()
+    front = replace(log.cameras["front"], **change(log.cameras["front"]))
+    log = log.changed(cameras={**log.cameras, "front": front}, calibrations={"front": "calib.txt"})
     (problem,) = list_calibration_problems(log)
     assert problem.startswith("calib.txt, camera 'front': ")
     assert words in problem
@@ -211,10 +206,6 @@ def short_world() -> Log:
 @pytest.fixture
 def encoded(tmp_path: Path) -> Callable[[Encode], Path]:
     return lambda encode: encode(short_world(), tmp_path / "log")
-
-
-def encode_nuscenes(log: Log, folder: Path) -> Path:
-    return nuscenes.encode_world(replace(log), folder)
 
 
 @pytest.mark.parametrize(
@@ -299,7 +290,7 @@ def test_a_png_whose_header_is_damaged_does_not_size_the_camera(encoded: Callabl
 
 
 def test_key_frames_that_are_missing_are_told(encoded: Callable[[Encode], Path]) -> None:
-    log = encoded(encode_nuscenes)
+    log = encoded(nuscenes.encode_world)
     assert not any("key frames" in note for note in open_log(log).notes)
     path = log / "v1.0-mini" / "sample.json"
     samples = json.loads(path.read_text())

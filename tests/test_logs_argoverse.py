@@ -161,10 +161,6 @@ def set_cell(name: str, row: int, value: object) -> Callable[[dict[str, Any]], N
     return edit
 
 
-def drop(name: str) -> Callable[[dict[str, Any]], None]:
-    return lambda columns: columns.pop(name)
-
-
 @pytest.mark.parametrize(
     ("file", "edit", "words"),
     [
@@ -177,7 +173,7 @@ def drop(name: str) -> Callable[[dict[str, Any]], None]:
         (ANNOTATIONS, set_cell("length_m", 4, 0.0), "row 4: size [0.0,"),
         (ANNOTATIONS, set_cell("category", 1, None), "row 1: no 'category'"),
         (ANNOTATIONS, set_cell("qz", 0, float("inf")), "row 0: position"),
-        (ANNOTATIONS, drop("num_interior_pts"), "no column 'num_interior_pts'"),
+        (ANNOTATIONS, lambda c: c.pop("num_interior_pts"), "no column 'num_interior_pts'"),
     ],
 )
 def test_faults_of_tables_are_named(

@@ -239,21 +239,19 @@ def test_the_map_is_tied_to_earth_only_where_gnss_shows_its_north() -> None:
         assert frame.projection is None
 
 
-def frame_columns() -> dict[str, object]:
-    return {
-        "x": [1.5, 2.5, np.nan],
-        "t": [1.5e9, 1.5e9 + 0.1, 1.5e9],
-        "d": np.array([0, 1, 0]),
-        "flag": [True, False, True],
-        "word": np.array(["a", np.nan, "ü"], dtype=object),
-    }
-
-
 @pytest.mark.parametrize("name", ["plain.pkl", "packed.pkl.gz"])
 @pytest.mark.parametrize("strings", [False, True])
 def test_a_table_of_todays_pandas_is_read_without_it(tmp_path: Path, name: str, strings: bool) -> None:
     pandas = pytest.importorskip("pandas")
-    table = pandas.DataFrame(frame_columns())
+    table = pandas.DataFrame(
+        {
+            "x": [1.5, 2.5, np.nan],
+            "t": [1.5e9, 1.5e9 + 0.1, 1.5e9],
+            "d": np.array([0, 1, 0]),
+            "flag": [True, False, True],
+            "word": np.array(["a", np.nan, "ü"], dtype=object),
+        }
+    )
     if strings:
         table["word"] = table["word"].astype("str")
     table.to_pickle(tmp_path / name)
@@ -284,14 +282,6 @@ class Bomb:
         return os.system, ("touch exploded",)
 
 
-def memo_bomb() -> bytes:
-    return b"\x80\x04]r" + struct.pack("<I", 2**31 - 1) + b"."
-
-
-def byte_bomb() -> bytes:
-    return b"\x80\x05" + pickle.BYTEARRAY8 + struct.pack("<Q", 2**40) + b"."
-
-
 @pytest.mark.parametrize(
     ("data", "words"),
     [
@@ -299,8 +289,9 @@ def byte_bomb() -> bytes:
         (pickle.dumps({"a": 1}), "holds a dict, expected a DataFrame"),
         (pickle.dumps(np.zeros(3)), "holds a"),
         (b"\x80\x04c__builtin__\neval\n(S'1'\ntR.", "eval, which a table does not need"),
-        (memo_bomb(), "holds a list"),
-        (byte_bomb(), "truncated"),
+        # A memo, and an array of bytes, that would take all memory.
+        (b"\x80\x04]r" + struct.pack("<I", 2**31 - 1) + b".", "holds a list"),
+        (b"\x80\x05" + pickle.BYTEARRAY8 + struct.pack("<Q", 2**40) + b".", "truncated"),
         (b"", "not a pickled table"),
         (b"hello", "not a pickled table"),
         (gzip.compress(b"\0" * 3_000_000), "unpacks to more than"),

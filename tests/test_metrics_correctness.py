@@ -61,10 +61,6 @@ def sized(*size_m):
     return [agent("x", 0.0, size_m=size_m)], [STANDING]
 
 
-def at_speed(ours, true):
-    return [agent("x", true * T_S, speed=ours)], [agent("a", true * T_S, speed=true, visible=True, static=False)]
-
-
 def turned(degrees):
     return [agent("x", 0.0, yaw=np.radians(degrees))], [STANDING]
 
@@ -114,7 +110,8 @@ def test_an_agent_is_wrong_by_these_limits(ours, truth, expected):
      (0.99, 0.0, False), (1.2, 0.49, True), (1.2, 0.51, False), (-0.6, 0.4, False), (-0.51, 0.51, True)],
 )  # fmt: skip
 def test_standing_and_moving_are_told_apart_with_a_margin(ours, true, wrong):
-    assert ("wrong_motion" in faults(judged(*at_speed(ours, true)))) == wrong
+    labeled = agent("a", true * T_S, speed=true, visible=True, static=False)
+    assert ("wrong_motion" in faults(judged([agent("x", true * T_S, speed=ours)], [labeled]))) == wrong
 
 
 def test_a_second_agent_at_an_object_is_a_duplicate_even_where_the_object_is_hidden():

@@ -56,10 +56,6 @@ def front_face_px(x, y=0.0):
     return np.array([u - FOCAL / depth, v - 0.75 * FOCAL / depth, u + FOCAL / depth, v + 0.75 * FOCAL / depth])
 
 
-def grown(box, by_px=2.0):
-    return np.asarray(box) + by_px * np.array([-1, -1, 1, 1])
-
-
 def part(box, left, right):
     """The part of a box between two shares of its width."""
     u0, v0, u1, v1 = box
@@ -72,11 +68,6 @@ def counts(ours, truth, **kwargs):
     return result, result["counts"]["false_ticks"], result["counts"]["ignored_ticks"]
 
 
-def one(x=20.0, y=0.0):
-    """A labeled car that is found, and a car without label at (x, y)."""
-    return scenario(agent("a", 30.0, 10.0), agent("ghost", x, y))
-
-
 TRUTH = scenario(agent("a", 30.0, 10.0))
 
 
@@ -86,7 +77,7 @@ def truth_with(*views, outside=False):
 
 def test_only_the_agent_in_a_region_is_ignored():
     ours = scenario(agent("a", 30.0, 10.0), agent("in", 20.0), agent("out", 20.0, -6.0))
-    truth = truth_with(view([grown(front_face_px(20.0))]))
+    truth = truth_with(view([front_face_px(20.0) + 2.0 * np.array([-1, -1, 1, 1])]))
     plain, false, ignored = counts(ours, TRUTH)
     assert (false, ignored, plain["precision"]) == (42, 0, pytest.approx(1 / 3, abs=1e-6))
     result, false, ignored = counts(ours, truth)
@@ -116,7 +107,8 @@ def test_only_the_agent_in_a_region_is_ignored():
 )
 def test_half_of_the_outline_must_lie_in_the_union_of_the_regions(parts, ignored):
     box = front_face_px(20.0)
-    _, false, left_out = counts(one(), truth_with(view([part(box, *p) for p in parts])))
+    ours = scenario(agent("a", 30.0, 10.0), agent("ghost", 20.0))  # which has no label
+    _, false, left_out = counts(ours, truth_with(view([part(box, *p) for p in parts])))
     assert (false, left_out) == ((0, 21) if ignored else (21, 0))
 
 
@@ -151,17 +143,10 @@ def test_a_truth_file_keeps_its_views(tmp_path):
     assert "unlabeled" not in json.loads((tmp_path / "plain.json").read_text())
 
 
-def labeled_by_camera(log, t_ns, boxes, cameras=("front",)):
-    return replace(
-        log,
-        labels=replace(log.labels, cameras=cameras),
-        ignored_regions={"front": ImageRegions(np.asarray(t_ns, dtype=np.int64), np.asarray(boxes, dtype=float))},
-    )
-
-
 def test_a_native_log_keeps_its_regions_and_names_what_is_wrong(tmp_path):
     log, _ = tiny_log(duration_s=0.2)
-    log = labeled_by_camera(log, log.streams["front"].t_ns[[0, 1]], [[0.5, 1, 20, 30], [4, 5, 60, 70]])
+    regions = ImageRegions(log.streams["front"].t_ns[:2], np.array([[0.5, 1, 20, 30], [4, 5, 60, 70]]))
+    log = replace(log, labels=replace(log.labels, cameras=("front",)), ignored_regions={"front": regions})
     write_log(log, tmp_path / "log")
     again = open_log(tmp_path / "log")
     assert again.labels.cameras == ("front",)

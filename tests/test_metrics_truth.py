@@ -69,15 +69,12 @@ def make_log(centers, points_per_box, *, frame="lidar", broken=(), visible=None,
     return log
 
 
-def share_visible(truth):
-    return {a.id: float(a.waypoints.visible.mean()) for a in truth.others}
-
-
 @pytest.mark.parametrize("frame", ["lidar", "map"])
 def test_visible_needs_points_and_the_camera(frame):
     # Ahead with points, ahead with one point too few, behind the camera.
     log = make_log([[60, 0, 0.75], [60, 8, 0.75], [-20, 0, 0.75]], [20, 19, 200], frame=frame)
-    assert share_visible(truth_from_log(log)) == {"car0": 1.0, "car1": 0.0, "car2": 0.0}
+    visible = {a.id: float(a.waypoints.visible.mean()) for a in truth_from_log(log).others}
+    assert visible == {"car0": 1.0, "car1": 0.0, "car2": 0.0}
 
 
 def test_visibility_that_the_log_states_is_taken_and_no_sweep_read():

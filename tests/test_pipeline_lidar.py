@@ -31,10 +31,6 @@ def world() -> tuple[Log, Scenario]:
     return tiny_log([CAR, PARKED, WALKER, BEHIND], lidar=ALL_AROUND)
 
 
-def run(log: Log, detector: str, *settings: str) -> Result:
-    return reconstruct(log, Config.load(settings=[f"detect.name={detector}", *settings], **AGENTS_ALONE))
-
-
 def nearest(result: Result, xy: Any) -> Agent | None:
     """The agent that is within 1 m of a place at some time."""
     for agent in result.scenario.others:
@@ -46,7 +42,7 @@ def nearest(result: Result, xy: Any) -> Agent | None:
 def test_a_log_without_cameras_is_reconstructed(world: tuple[Log, Scenario]) -> None:
     log, truth = world
     blind = replace(log, cameras={}, streams={"top": log.streams["top"]}, reference_camera=None)
-    result = run(blind, "lidar:labels")
+    result = reconstruct(blind, Config.load(settings=["detect.name=lidar:labels"], **AGENTS_ALONE))
     assert len(result.scenario.others) == 4
     table = evaluate(result.scenario, truth)
     assert table["recall"] == table["precision"] == 1.0

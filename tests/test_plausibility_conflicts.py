@@ -20,10 +20,6 @@ def passing(y_m):
     return agent(-10.0, y_m, speed=2.5)
 
 
-def backward(built):
-    return replace(built, waypoints=replace(built.waypoints, x_m=built.waypoints.x_m[::-1]))
-
-
 def judged(*built, ego=None):
     """What is left of agents with their confidence, with doubts."""
     named = name_agents(resolve_conflicts([candidate(a, e) for a, e in built], ego, T))
@@ -48,7 +44,9 @@ def test_a_way_that_ends_in_the_ego_is_cut_where_it_enters() -> None:
     assert cut.waypoints.t_s.tolist() == [0.0, 1.0, 2.0]
     assert cut.waypoints.x_m.tolist() == [-10.0, -7.5, -5.0]
     assert doubts == []
-    ((late, _),) = judged((backward(passing(0.3)), 0.9), ego=ego)
+    way = passing(0.3).waypoints
+    backward = replace(passing(0.3), waypoints=replace(way, x_m=way.x_m[::-1]))
+    ((late, _),) = judged((backward, 0.9), ego=ego)
     assert late.waypoints.t_s.tolist() == [2.0, 3.0, 4.0]
 
 

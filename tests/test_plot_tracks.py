@@ -147,17 +147,14 @@ def reckless() -> tuple[Scenario, Replay]:
     return scenario, replay(scenario, ego=lambda seen: Controls(2.0, 0.0002))
 
 
-def chart_axes(layout: FigureLayout) -> list:
-    return [ax for ax in layout.figure.axes if ax.get_legend() is not None]
-
-
 @pytest.mark.slow
 def test_the_charts_show_commands_response_and_errors() -> None:
     scenario, result = reckless()
     ego = result.agent("ego")
     by_label = {
         (ax.get_legend().get_title().get_text().split(" (")[0], k): line
-        for ax in chart_axes(draw(scenario, replay=result))
+        for ax in draw(scenario, replay=result).figure.axes
+        if ax.get_legend() is not None
         for k, line in enumerate([a for a in ax.lines if len(a.get_xdata()) > 2])
     }
     assert ego.commands is not None

@@ -27,10 +27,6 @@ BROWN = {"distortion_model": "brown", "distortion": (-0.3, 0.1, 0.001, -0.002, -
 FISHEYE = {"distortion_model": "fisheye", "distortion": (0.02, -0.01, 0.003, 0.0)}
 
 
-def some_points(count=4000, seed=0):
-    return np.random.default_rng(seed).uniform([-60, -60, -3], [60, 60, 6], (count, 3)).astype(np.float32)
-
-
 def view_of(**changes):
     camera = replace(camera_ahead(mount="map", at=(1.5, 0.2, 1.6)), **changes)
     turn = transform(rotation_from_rpy(0.02, -0.05, 0.7), [0.0, 0.0, 0.0])
@@ -40,7 +36,8 @@ def view_of(**changes):
 @pytest.mark.parametrize("lens", [{}, BROWN, FISHEYE], ids=["pinhole", "brown", "fisheye"])
 @pytest.mark.parametrize("far", [(0.0, 0.0, 0.0), (5e5, 5e6, 300.0)])
 def test_a_camera_sees_what_projection_puts_into_its_image(lens, far):
-    view, points = view_of(**lens), some_points()
+    view = view_of(**lens)
+    points = np.random.default_rng(0).uniform([-60, -60, -3], [60, 60, 6], (4000, 3)).astype(np.float32)
     moved = View(view.camera, 0, transform(np.eye(3), far) @ view.map_T_cam)
     seen = project_points(moved, np.array(far), np.ascontiguousarray(points.T))
     in_cam = apply(inverse(view.map_T_cam), points.astype(np.float64))

@@ -85,12 +85,9 @@ def test_after_a_leap_of_the_log_the_vehicle_goes_on_where_the_log_does(later_s)
 
 def controls_at(*, x=0.0, y=0.0, yaw=0.0, speed=10.0, row=(0, 0, 0, 10, 0, 0, 1, 0), dt_s=0.01):
     """Controls and memory of a car that has just begun to follow one row of a table."""
-    state = replace_columns(VehicleState, x_m=x, y_m=y, yaw_rad=yaw, speed_mps=speed)
+    known = {"x_m": x, "y_m": y, "yaw_rad": yaw, "speed_mps": speed}
+    state = VehicleState(*(np.array([known.get(f.name, 0.0)]) for f in fields(VehicleState)))
     return follow_vehicles(np.array(row, float)[:, None], state, ControllerMemory.fresh(1), CAR, dt_s)
-
-
-def replace_columns(kind, **values):
-    return kind(*(np.array([values.get(f.name, 0.0)]) for f in fields(kind)))
 
 
 def test_the_integral_grows_with_the_error_but_not_at_the_limit_of_an_actuator():

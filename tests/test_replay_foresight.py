@@ -8,14 +8,9 @@ from replay_maneuvers import agent_from, scenario_of
 from replay_scenes import Speed, line
 from test_prediction import circle
 
-from log2sim.datatypes import Scenario
 from log2sim.simulation.corridors import HORIZON_S, PathTable
 from log2sim.simulation.reactive import MotionForesight
-from log2sim.simulation.runner import replay as run
-
-
-def replay(scene: Scenario, **options):
-    return run(scene, **{"model": "kinematic", "agents": "reactive", "dt_s": 0.1, **options})
+from log2sim.simulation.runner import replay
 
 
 def turns_off(id: str) -> object:
@@ -39,7 +34,8 @@ def first_brake_s(result, id: str) -> float:
 def test_who_does_not_turn_off_as_in_the_scenario_is_braked_for_earlier_by_those_who_see_its_motion() -> None:
     """The ego goes on into the street; by its way in the scenario it turns off before, until it has left that."""
     scene = scenario_of(turns_off("ego"), line("f", -85.0, speed=10.0, duration_s=12.0))
-    results = {f: replay(scene, ego=Speed(lambda t: 8.0), foresight=f) for f in ("path", "motion")}
+    options = {"model": "kinematic", "agents": "reactive", "dt_s": 0.1, "ego": Speed(lambda t: 8.0)}
+    results = {f: replay(scene, foresight=f, **options) for f in ("path", "motion")}
     at = {f: first_brake_s(result, "f") for f, result in results.items()}
     assert at["motion"] < at["path"] - 0.1
     assert at["motion"] > 4.0  # the ego is within 3 s of the street from then on

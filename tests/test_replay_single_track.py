@@ -241,15 +241,12 @@ def some_states(rng, count):
     return VehicleState(**columns)
 
 
-def some_controls(rng, count):
-    return VehicleControls(rng.normal(0, 5, count), rng.normal(0, 0.5, count), rng.random(count) < 0.3)
-
-
 @ALL
 def test_turned_and_shifted_and_mirrored_vehicles_move_turned_and_shifted_and_mirrored(name):
     step, one = ALL_STEPS[name]
     rng = np.random.default_rng(3)
-    state, controls, p = some_states(rng, 40), some_controls(rng, 40), one.take(np.zeros(40, int))
+    state, p = some_states(rng, 40), one.take(np.zeros(40, int))
+    controls = VehicleControls(rng.normal(0, 5, 40), rng.normal(0, 0.5, 40), rng.random(40) < 0.3)
     x, y, yaw, speed, steer, pedal, lateral, rate = stack(step(state, controls, p, 0.05))
     angle, cos, sin = 2.0, math.cos(2.0), math.sin(2.0)
     turned = replace(

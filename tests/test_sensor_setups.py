@@ -101,7 +101,7 @@ def test_the_scenario_is_drawn_replayed_changed_and_exported(
 
 
 def test_sensors_at_the_road_stand_in_the_scenario_with_where_they_look(
-    made: Callable[[str], tuple[Path, Path]], tmp_path: Path
+    made: Callable[[str], tuple[Path, Path]],
 ) -> None:
     scenario = Scenario.load(made("roadside")[1])
     eye, pole = scenario.sensors

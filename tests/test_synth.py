@@ -119,12 +119,8 @@ def test_a_wrong_entry_is_named(changes: dict[str, Any], message: str) -> None:
 TURN = [[0.0, 0.0, 5.0], [30.0, 0.0, 4.0], [30.0, 30.0, 6.0]]
 
 
-def turning(**changes: object) -> TimedPath:
-    return TimedPath(TURN, rounding_m=26.0, where="agent 'a'", **changes)  # type: ignore[arg-type]
-
-
 def test_speed_at_each_waypoint_is_the_one_asked_for() -> None:
-    trajectory = turning()
+    trajectory = TimedPath(TURN, rounding_m=26.0, where="agent 'a'")
     t = np.linspace(0, 20, 20001)
     way = trajectory.at(t).distance_m
     at_turn = np.argmin(np.abs(way - trajectory.path.at_waypoint_m[1]))

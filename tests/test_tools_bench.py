@@ -123,7 +123,7 @@ def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread
 
 
 @pytest.mark.slow
-def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path):
+def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs():
     log, scene, true = confidence_logs.make_log(1, 0)
     detector = confidence_logs.SimulatedDetector(log, scene, true, 3)
     camera, stamp = log.cameras["camera"], int(log.streams["camera"].t_ns[3])
