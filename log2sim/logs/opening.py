@@ -203,8 +203,9 @@ def _find_reader(root: Path, readers: Mapping[str, Reader], defects: list[str]) 
         suffixes = ", ".join(f"*{suffix}" for reader in readers.values() for suffix in reader.suffixes)
         expected = f"give the folder of a log{', or a file ' * bool(suffixes)}{suffixes}"
         raise LogError(f"{root}: is a file of no known log format; {expected}{above}{broken}")
-    if not any(root.iterdir()):
-        raise LogError(f"{root}: is an empty folder, not a log")
+    with suppress(OSError):
+        if not any(root.iterdir()):
+            raise LogError(f"{root}: is an empty folder, not a log")
     known = "; ".join(f"{name} ({reader.looks_for})" for name, reader in readers.items())
     raise LogError(f"{root}: no known log format{above}; a log is one of: {known}. Force one with --format{broken}")
 
