@@ -296,8 +296,8 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _starts_before_it_stops(self) -> Self:
-        if self.start_s is not None and self.stop_s is not None and self.stop_s <= self.start_s:
-            raise ValueError(f"stop_s is {self.stop_s:g}, expected more than start_s, {self.start_s:g}")
+        if self.start_s is not None and self.stop_s is not None and self.stop_s < self.start_s:
+            raise ValueError(f"stop_s is {self.stop_s:g}, expected start_s, {self.start_s:g}, or more")
         return self
 
     def __init__(self, **settings: Any) -> None:

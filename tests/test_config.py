@@ -163,7 +163,7 @@ def test_a_column_is_judged_as_by_the_plain_validator(
         assert str(caught.value).startswith("values")
 
 
-def test_a_part_of_a_log_ends_after_it_begins() -> None:
-    with pytest.raises(ConfigError, match="stop_s is 2, expected more than start_s, 2"):
-        Config(start_s=2.0, stop_s=2.0)
-    assert Config(stop_s=2.0).start_s is None
+def test_a_part_of_a_log_does_not_end_before_it_begins() -> None:
+    with pytest.raises(ConfigError, match="stop_s is 2, expected start_s, 3, or more"):
+        Config(start_s=3.0, stop_s=2.0)
+    assert Config(start_s=2.0, stop_s=2.0).stop_s == Config(stop_s=2.0).stop_s  # a single frame
