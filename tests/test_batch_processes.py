@@ -84,9 +84,10 @@ def start(site: Path, interruptible: None) -> Iterator[Start]:
 
     def begin(root: Path, out: Path) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "log2sim", "batch", str(root), "--out", str(out), "--jobs", "2", *FAST]
+        (out.parent / "temporary").mkdir()
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-            env={**os.environ, "PYTHONPATH": path},
+            env={**os.environ, "PYTHONPATH": path, "TMPDIR": str(out.parent / "temporary")},
         )  # fmt: skip
         started.append(process)
         return process
@@ -142,6 +143,7 @@ def test_after_ctrl_c_a_table_is_there_and_the_same_command_goes_on(
     assert errors.rstrip().splitlines()[-1].startswith("log2sim: interrupted")
     assert sorted(p.name for p in out.iterdir()) == ["batch.json", "logs", "table.html", "table.parquet"]
     assert [p for p in (out / "logs").iterdir() if p.name.startswith(".")] == []
+    assert list((tmp_path / "temporary").iterdir()) == []
     first = {path: path.stat().st_mtime_ns for path in out.glob("logs/*/row.json")}
     assert len(first) == 3
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -128,7 +129,8 @@ def local_workers(count: int) -> Iterator[Workers]:
 
     environment = {**thread_limits(max(1, usable_threads() // count)), "DASK_LOGGING__DISTRIBUTED": "critical"}
     with (
-        dask.config.set(SETTINGS),
+        TemporaryDirectory(prefix="log2sim-") as scratch,  # where Dask leaves its lock files
+        dask.config.set(SETTINGS | {"temporary-directory": scratch}),
         distributed.LocalCluster(
             n_workers=count,
             threads_per_worker=1,
