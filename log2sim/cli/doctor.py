@@ -282,6 +282,8 @@ def help(
         opt.say("\n".join(f"{name:<11} {text.partition(chr(10))[0].lstrip('# ')}" for name, text in known.items()))
         return
     if topic not in known:
-        raise ConfigError(f"no page '{topic}'{nearest(topic, list(known))}; log2sim help lists them")
+        raise ConfigError(
+            f"no page '{topic}'{nearest(topic, list(known))}; log2sim help lists them, log2sim COMMAND --help the options of a command"
+        )
     text = re.sub(r"^!\[.*\n\n?", "", known[topic].rstrip(), flags=re.MULTILINE)
     opt.say(re.sub(r"\[([^\]]+)\]\([^)\s]+\)", r"\1", text))
