@@ -263,7 +263,7 @@ def _closest(connection: Any, condition: Condition, parts: list[ast.expr]) -> li
         )
     if sentences:
         return sentences
-    alone = [f"'{_source(condition, part)}' {count([part])}" for part in condition.parts]
+    alone = [f"'{_source(condition, part)}' {count([part])}" for part in parts]
     return [f"each alone: {', '.join(alone)}"]
 
 
