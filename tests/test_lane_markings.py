@@ -150,6 +150,16 @@ def test_crosswalk_stop_line_and_arrow_are_told_from_lane_lines() -> None:
     assert abs(cv2.contourArea(other.points_m[:, :2].astype(np.float32)) - 1.0) < 0.25
 
 
+def test_what_a_shadow_leaves_of_a_bar_is_no_dash_of_the_line_behind_the_crosswalk() -> None:
+    painter = Painter(EXTENT)
+    painter.lines([np.array([[34.0, y], [38.0, y]]) for y in (*range(-7, 0), *range(1, 8))], 0.5)
+    painter.lines([np.array([[36.3, -0.15], [38.0, -0.1]])], 0.25)
+    painter.lines(dashes_of(line_of(lambda x: 0 * x, 41, 58), 3.0, 3.0))
+    markings = {m.kind: m for m in find_markings(painter.ground())[0]}
+    assert set(markings) == {"dashed", "crosswalk"}
+    assert markings["dashed"].points_m[:, 0].min() == pytest.approx(41, abs=0.3)
+
+
 def test_rings_that_return_what_the_road_does_are_no_paint() -> None:
     """Without a camera: rings between darker ones stand out as much as paint beside the road."""
     each = {"reflected": 0.6, "reflected_sigma": 0.05, "width_m": 0.5, "color": np.nan}

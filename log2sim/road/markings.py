@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_matrix
@@ -100,7 +101,11 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         hull = cv2.approxPolyDP(cv2.convexHull((np.array(corners) - origin).astype(np.float32)), HULL_ERROR_M, True)
         outline = np.asarray(hull, np.float64).reshape(-1, 2) + origin
         areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, odds))
-    return areas, [chain for k, chain in enumerate(chains) if k not in used]
+    # What is left of a bar, as where a shadow parts it, is no line.
+    inside = np.zeros(len(pieces), dtype=bool)
+    for area in (area for area in areas if area.log_odds > 0):
+        inside |= shapely.contains_xy(shapely.Polygon(area.outline), *pieces.xy.T)
+    return areas, [chain for k, chain in enumerate(chains) if k not in used and not inside[chain.members].all()]
 
 
 def _bar_of(ground: GroundMap, pieces: Pieces, chain: Chain) -> _Bar | None:
