@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 from log2sim.files.version import __version__
+
+# Builds of ONNX Runtime collect events in the home folder from their import on, unless this is set before.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from log2sim.batch.run import reconstruct_all

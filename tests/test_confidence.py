@@ -97,7 +97,7 @@ def test_doubts_and_scattered_positions_lower_a_confidence_and_a_hidden_length_w
     assert rated(part).agent.waypoints.sigma_xy_m[0] > rated(candidate).agent.waypoints.sigma_xy_m[0]
 
 
-def test_reasons_are_told_of_what_is_rather_wrong_alone():
+def test_reasons_are_given_for_what_is_rather_wrong_alone():
     candidate = parked()
     longest = replace(candidate.agent, size_m=(MAX_SIZE_M["car"][0], *candidate.agent.size_m[1:]))
     sure, vague = (

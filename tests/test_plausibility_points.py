@@ -109,7 +109,7 @@ def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
     assert (missing_nats(shown, np.zeros(5)) == 0).all()
 
 
-def test_what_is_likely_there_is_kept_and_a_strong_reason_is_told():
+def test_what_is_likely_there_is_kept_and_a_strong_reason_is_a_doubt():
     assert suffices(MIN_THERE[True], confirmed=True, lidar=True)
     assert not suffices(MIN_THERE[True] - 0.01, confirmed=True, lidar=True)
     assert suffices(MIN_TENTATIVE_THERE, confirmed=False, lidar=True)

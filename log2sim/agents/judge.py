@@ -248,7 +248,7 @@ def _ticks_of(agent: Agent, t_s: Array) -> NDArray[np.intp]:
     return np.flatnonzero((t_s >= first_s - MARGIN_S) & (t_s <= last_s + MARGIN_S))
 
 
-# A reason that makes an agent e times less likely is told.
+# A reason that makes an agent e times less likely becomes a doubt.
 DOUBT_NATS = 1.0
 SAME_M = 0.005  # rounding
 
@@ -272,7 +272,7 @@ def judge(
         row = {name: float(column[k]) for name, column in table.items()}
         if not suffices(there[k], confirmed=bool(row["confirmed"]), lidar=lidar):
             continue
-        # Reasons explain a low confidence. Told of all agents, they were of right ones at six of seven ticks (80 simulated logs).
+        # Reasons explain a low confidence: given for all agents, they were against right ones at six of seven ticks (80 simulated logs).
         doubts = doubts_by_evidence(candidate.agent, row, lidar=lidar) if right[k] < MIN_TRUSTED_CONFIDENCE else []
         kept.append(_rated(candidate.doubted(doubts), float(right[k]), recording.timeline))
     apart = resolve_conflicts(suppress_duplicates(kept, ego), ego, t_s)
@@ -313,13 +313,13 @@ def doubts_by_evidence(agent: Agent, evidence: Mapping[str, float], *, lidar: bo
         "through": Finding("empty", values={"through_share": 1 - float(np.exp(-evidence["through"]))}),
         "missing": Finding("hardly_observed", case="images", values=counts),
     }
-    told = [found for name, found in reasons.items() if -weights.get(name, 0.0) * evidence[name] > DOUBT_NATS]
-    told += [Finding("hardly_observed", case="no_points")] if evidence["pointless"] else []
+    doubts = [doubt for name, doubt in reasons.items() if -weights.get(name, 0.0) * evidence[name] > DOUBT_NATS]
+    doubts += [Finding("hardly_observed", case="no_points")] if evidence["pointless"] else []
     # As long as sizes go: they are limited to those of the category, so a vehicle at the greatest length was observed to be longer.
     length_m, longest_m = agent.size_m[0], MAX_SIZE_M[agent.category][0]
     if GROUP_OF[agent.category] == "vehicle" and length_m >= longest_m - SAME_M:
-        told.append(Finding("unlikely_size", values={"limit_m": longest_m}, other=agent.category))
-    return told
+        doubts.append(Finding("unlikely_size", values={"limit_m": longest_m}, other=agent.category))
+    return doubts
 
 
 # Two agents whose overlap exceeds this share of the smaller box for most of the time are duplicates. Pedestrians are compared

@@ -108,11 +108,10 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
     """Fit the yaw of the points (n, 2) of a static track and find the ends (one view) of all its views together."""
     m = track.measurements
     axis = mean_box_axis(m)
-    yaw = (
-        boxes.fit_yaw(xy)[0]
-        if axis is None
-        else float(boxes.correct_yaws(xy, np.array([len(xy)]), np.array([axis]))[0])
-    )
+    if axis is None:
+        yaw = boxes.fit_yaw(xy)[0]
+    else:
+        yaw = float(boxes.correct_yaws(xy, np.array([len(xy)]), np.array([axis]))[0])
     low, high = boxes.extents(xy, yaw)
     rows = np.flatnonzero(m.kept_points >= MIN_CLUSTER_POINTS)
     if track.category in BOXES and len(rows):
@@ -122,11 +121,11 @@ def static_ends(track: Track, xy: Array, origin: Array) -> tuple[float, Ends]:
         lows, highs = (np.sort(np.array(e), axis=0) for e in zip(*each))
         enough = min(max(math.ceil(MIN_PERSISTENT_SHARE * len(rows)), 2), len(rows))
         low, high = np.minimum(low, lows[enough - 1]), np.maximum(high, highs[-enough])
-    seen = [view for _, view in m.views_of(rows)]
-    sensor = boxes.rotate(np.array([v.sensor_m[:2] for v in seen]).reshape(-1, 2) - origin, -yaw)
-    visible = np.array([v.ends_visible for v in seen], dtype=bool).reshape(-1, 2)
+    every = [view for _, view in m.views_of(rows)]
+    sensor = boxes.rotate(np.array([v.sensor_m[:2] for v in every]).reshape(-1, 2) - origin, -yaw)
+    visible = np.array([v.ends_visible for v in every], dtype=bool).reshape(-1, 2)
     views = boxes.real_ends(low, high, sensor, visible, min_sine=_min_sine(track.category))
-    shown = [v.cluster[:, :2] - v.sensor_m[:2] for v in seen]
+    shown = [v.cluster[:, :2] - v.sensor_m[:2] for v in every]
     steps = boxes.azimuth_steps(np.concatenate(shown), np.array([len(xy) for xy in shown])) if shown else np.zeros(0)
     gaps = boxes.end_gaps(steps, low - sensor, high - sensor, views)
     # An end that is real from one viewpoint is real, and known as well as from the best one.

@@ -131,7 +131,6 @@ def _examine_package(requirement: Requirement) -> dict[str, Any]:
     """Import a package that is needed, and compare its version with what is required."""
     name, wanted = requirement.name, f"pip install '{requirement.name}{requirement.specifier}'"
     version, state, problem = version_of(name), "ok", ""
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # ONNX Runtime collects events from its import on
     try:
         module = importlib.import_module(MODULES.get(name, name.replace("-", "_")))
     except Exception as error:  # whatever a broken package raises

@@ -100,7 +100,7 @@ def evaluate(
             result = evaluate_boxes(detected, labeled, options, progress=partial(report_progress, "count points"))
         table = boxes_verdict(result) + (f"\n\n{boxes_table(result)}" if verbose else "")
     else:
-        select_categories(wanted)  # an unknown one is told before a log is read
+        select_categories(wanted)  # reports an unknown one before a log is read
         for name in (name for name, value in only_boxes.items() if value is not None):
             raise ConfigError(f"{name}: is for boxes of `log2sim detect`; {path} is no boxes file, so leave it out")
         scenario = Scenario.load(path)

@@ -93,50 +93,50 @@ def with_rig(log: Log, rig: str) -> Log:
     return replace(log, cameras={}, streams=streams, reference_camera=None, image_labels={})
 
 
-# A line stands out where the means along 8 m of it are brighter than beside it by five sigmas of the same means around and by a least
+# A line stands out where the means along 8 m of it are brighter than the road on both sides by five sigmas of the same means around and by a least
 # logarithm, of color or of LiDAR intensity, and by more than anything else across 1.5 m, such as a curb.
 ALONG_M, STEP_M, REACH_M = 8.0, 0.05, 1.5
 MIN_SIGMAS, MIN_COLOR, MIN_INTENSITY, MORE_THAN_AROUND = 5.0, 0.05, 0.1, 1.2
-LINE_M, AROUND_M, MIN_NOISE, MIN_KNOWN = 0.2, 0.4, 0.01, 0.25
+LINE_M, AROUND_M, MIN_NOISE, MIN_OBSERVED = 0.2, 0.4, 0.01, 0.25
 
 
 def stands_out(ground: GroundMap, line: RoadSamples) -> np.ndarray:
     """Say at which points (S, 2) of a true line it stands out of a map (S,)."""
     across = np.arange(-REACH_M, REACH_M + STEP_M / 2, STEP_M)
     xy, normal = line.xy_m, np.stack([-np.sin(line.heading_rad), np.cos(line.heading_rad)])
-    seen = sample(ground, *(xy[:, k, None] + normal[k][:, None] * across for k in range(2)))
+    profile = sample(ground, *(xy[:, k, None] + normal[k][:, None] * across for k in range(2)))
     inside, around = np.abs(across) <= LINE_M, np.abs(across) > AROUND_M
     out, window = np.zeros(len(xy), dtype=bool), max(round(ALONG_M / line.length_m.max(initial=STEP_M)), 3)
-    for values, least in ((seen.paint, MIN_COLOR), (seen.intensity, MIN_INTENSITY)):
-        known = np.isfinite(values).astype(np.float64)
-        count, total = (uniform_filter1d(a, window, axis=0) for a in (known, np.nan_to_num(values)))
-        mean = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > MIN_KNOWN)
+    for values, least in ((profile.paint, MIN_COLOR), (profile.intensity, MIN_INTENSITY)):
+        observed = np.isfinite(values).astype(np.float64)
+        count, total = (uniform_filter1d(a, window, axis=0) for a in (observed, np.nan_to_num(values)))
+        mean = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > MIN_OBSERVED)
         middle = (mean[:, 5:-5] + mean[:, 4:-6] + mean[:, 6:-4]) / 3
         left, right = (mean[:, :-10] + mean[:, 1:-9]) / 2, (mean[:, 9:-1] + mean[:, 10:]) / 2  # 0.2 and 0.25 m away
         contrast = np.pad(middle - np.fmax(left, right), ((0, 0), (5, 5)), constant_values=np.nan)
         with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # where nothing is known
-            beside = contrast[:, around]
-            noise = np.nanmedian(np.abs(beside - np.nanmedian(beside, axis=1, keepdims=True)), axis=1) / 0.6745
-            own, most = np.nanmax(contrast[:, inside], axis=1), np.nanmax(beside, axis=1)
+            warnings.simplefilter("ignore", RuntimeWarning)  # where nothing is observed
+            outside = contrast[:, around]
+            noise = np.nanmedian(np.abs(outside - np.nanmedian(outside, axis=1, keepdims=True)), axis=1) / 0.6745
+            own, most = np.nanmax(contrast[:, inside], axis=1), np.nanmax(outside, axis=1)
             out |= (own > least) & (own > MIN_SIGMAS * np.maximum(noise, MIN_NOISE)) & (own > MORE_THAN_AROUND * most)
     return out
 
 
 def lengths_that_stand_out(ground: GroundMap, scenario: Scenario, truth: Scenario) -> tuple[float, float]:
-    """Return the length of true lane lines that stand out of a map, and how much of it is found, m."""
+    """Return the length of true lane lines that stand out of a map, and of those of them that are matched, m."""
     moved = truth.aligned_to(scenario)
     area = Area.of(scenario, moved, truth.shift_to(scenario))
     ours, true = (
         [m for m in s.map_features.markings if m.is_lane_line] if s.map_features else [] for s in (scenario, moved)
     )
-    shown_m = found_m = 0.0
+    shown_m = matched_m = 0.0
     for line in true:
         whole = RoadSamples.of([line], lambda xy_m: np.ones(len(xy_m), dtype=bool))
         shown = area.expects(whole.xy_m) & stands_out(ground, whole)
         near = nearest_road(whole, ours)[1] <= MATCH_M
-        shown_m, found_m = shown_m + float(whole.length_m @ shown), found_m + float(whole.length_m @ (shown & near))
-    return shown_m, found_m
+        shown_m, matched_m = shown_m + float(whole.length_m @ shown), matched_m + float(whole.length_m @ (shown & near))
+    return shown_m, matched_m
 
 
 def measure(case: Case, rig: Rig, folder: Path) -> dict[str, Any]:
@@ -153,31 +153,24 @@ def measure(case: Case, rig: Rig, folder: Path) -> dict[str, Any]:
     return figures | {"standing_out_m": lengths_that_stand_out(map_ground(log, scenario), scenario, truth)}
 
 
-def share(found: dict[str, Any]) -> float | None:
-    """Of the length of true lines that stand out, that which is found."""
-    shown_m, found_m = found["standing_out_m"]
-    return found_m / shown_m if shown_m else None
-
-
 def summary(all_found: list[dict[str, Any]]) -> str:
     """Precision and recall of the lane lines of all cases by their length."""
-    lines, shown = (
-        [f["lane_lines"] for f in all_found if f.get("lane_lines")],
-        np.sum([f["standing_out_m"] for f in all_found], axis=0),
-    )
+    lines = [f["lane_lines"] for f in all_found if f.get("lane_lines")]
+    shown_m, matched_m = np.sum([f["standing_out_m"] for f in all_found], axis=0)
 
     def mean(name: str, length: str) -> float:
         return sum((line[name] or 0.0) * line[length] for line in lines) / max(
             sum(line[length] for line in lines), 1e-9
         )
 
-    by_length = mean("precision", "found_m"), mean("recall", "true_m"), shown[1] / max(shown[0], 1e-9)
+    by_length = mean("precision", "found_m"), mean("recall", "true_m"), matched_m / max(shown_m, 1e-9)
     return "All lane lines: precision {:.3f}, recall {:.3f}, where they stand out {:.3f}.".format(*by_length)
 
 
 def row(case: Case, found: dict[str, Any]) -> list[str]:
     """A row of the table."""
     lines, borders, lanes = (found.get(name) or {} for name in ("lane_lines", "borders", "lanes"))
+    shown_m, matched_m = found["standing_out_m"]
 
     def count(kind: str) -> str:
         n = found.get(kind) or {}
@@ -185,7 +178,7 @@ def row(case: Case, found: dict[str, Any]) -> list[str]:
         return f"{n['found']} of {n['true']}{false}" if n.get("true") or false else "-"
 
     return [
-        Path(case.scene).stem, case.condition, *(cell(lines.get(k)) for k in ("precision", "recall", "recall_20_m")), cell(share(found)),
+        Path(case.scene).stem, case.condition, *(cell(lines.get(k)) for k in ("precision", "recall", "recall_20_m")), cell(matched_m / shown_m if shown_m else None),
         *(cell(lines.get(k), 3, " m") for k in ("lateral_median_m", "lateral_p95_m")), cell(lines.get("kind_accuracy")),
         cell(lines.get("false_m_per_100_m"), 1, " m"), count("stop_lines"), count("crosswalks"),
         *(cell(of.get(k)) for of in (borders, lanes) for k in ("precision", "recall")), cell(lanes.get("center_median_m"), 2, " m"), cell(lanes.get("inside")),

@@ -19,7 +19,7 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import calibration, operating_point, precision_recall
 from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, open_network
-from log2sim.perception.detect3d.network import METADATA_KEY, import_onnxruntime
+from log2sim.perception.detect3d.network import METADATA_KEY
 from training.clouds import Example
 from training.network import GROUPS, IN_CHANNELS, BevNetwork, Widths, widths_of
 
@@ -70,6 +70,7 @@ def export_checked(
     Raises `RuntimeError` when it computes something else of the inputs, by more than that share of the greatest output.
     """
     import onnx
+    import onnxruntime
 
     with warnings.catch_warnings():
         # The old exporter is to go one day; it needs no further package, and the check below holds for any.
@@ -88,7 +89,7 @@ def export_checked(
     onnx.save(model, path)
     with torch.no_grad():
         expected = network(*inputs.values())
-    session = import_onnxruntime().InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     found = session.run(list(outputs), {name: value.numpy() for name, value in inputs.items()})
     for one, other in zip(found, [expected] if isinstance(expected, Tensor) else expected, strict=True):
         error, size = float(np.abs(one - other.numpy()).max()), float(other.abs().max())

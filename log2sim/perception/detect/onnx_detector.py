@@ -31,7 +31,7 @@ from log2sim.perception.detect.layouts import (
     groups_of,
     single_output_shape,
 )
-from log2sim.perception.detect3d.network import first_line, import_onnxruntime, open_session
+from log2sim.perception.detect3d.network import first_line, open_session
 
 MAX_FILE_BYTES = 2 * 1024**3
 MAX_INPUT_SIDE_PX = 8192
@@ -279,9 +279,11 @@ class OnnxDetector:
     @property
     def cache_key(self) -> str | None:
         """All that the boxes depend on besides the picture; None where the weights are not all in the model's file."""
+        import onnxruntime
+
         digest = self.model.digest()
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("name", "model", "together")}
-        return None if digest is None else f"{digest} onnxruntime {import_onnxruntime().__version__} {settings!r}"
+        return None if digest is None else f"{digest} onnxruntime {onnxruntime.__version__} {settings!r}"
 
     def tiles_of(self, width_px: int, height_px: int) -> list[Tile]:
         """Return the tiles of an image that are searched, the whole image first."""

@@ -10,7 +10,6 @@ by a JSON document, see `NetworkInfo`. `log2sim/README.md` lists the channels fo
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,22 +28,15 @@ from log2sim.perception.detect3d.box_points import PointsOfBoxes
 from log2sim.perception.lidar.cloud import Cloud
 
 
-def import_onnxruntime() -> Any:
-    """Import ONNX Runtime without its telemetry, which builds of Microsoft collect in the home folder from the import on."""
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    import onnxruntime
-
-    onnxruntime.disable_telemetry_events()
-    return onnxruntime
-
-
 def open_session(path: Path, max_bytes: int, kind: str) -> Any:
     """Load an ONNX file of a kind into an `onnxruntime.InferenceSession` on one core of the CPU.
 
     Raises `ConfigError` for a missing, oversized or broken file.
     """
-    onnxruntime = import_onnxruntime()
+    import onnxruntime
+
     require_readable(path, max_bytes, ConfigError, f"an ONNX {kind}")
+    onnxruntime.disable_telemetry_events()
     options = onnxruntime.SessionOptions()
     # Threads that share a run wait for each other; runs side by side, and the stages beside, do not.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -58,8 +50,10 @@ def open_session(path: Path, max_bytes: int, kind: str) -> Any:
 
 def digest_of(path: Path) -> str:
     """Return a digest of the content of a network's file, with the version of what runs it."""
+    import onnxruntime
+
     content = read_file(path, MAX_FILE_BYTES, ConfigError)
-    return f"{hashlib.sha256(content).hexdigest()} onnxruntime {import_onnxruntime().__version__}"
+    return f"{hashlib.sha256(content).hexdigest()} onnxruntime {onnxruntime.__version__}"
 
 
 def first_line(error: Exception) -> str:

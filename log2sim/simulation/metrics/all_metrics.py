@@ -382,8 +382,10 @@ def summarize(replay: Replay, *, limit: int | None = MAX_LISTED) -> str:
     lines = []
     if "ego" in m:
         ego, gap, brake = m["ego"], m["ego"]["min_gap"], m["ego"]["max_brake"]
-        share = f" ({ego['progress_m'] / ego['path_m']:.0%})" if ego["path_m"] > 0 else ""
-        share = ", and straight on beyond its end" if ego["progress_m"] > ego["path_m"] > 0 else share
+        share = ""
+        if ego["path_m"] > 0:
+            beyond = ego["progress_m"] > ego["path_m"]
+            share = ", and straight on beyond its end" if beyond else f" ({ego['progress_m'] / ego['path_m']:.0%})"
         own_events = [(next(id for id in e["agents"] if id != EGO), e) for e in m["collisions"] if EGO in e["agents"]]
         hits = [f"{id} at {e['t_s']:.2f} s ({e['relative_speed_mps']:.1f} m/s)" for id, e in own_events]
         lines = [
