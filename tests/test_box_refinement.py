@@ -55,9 +55,11 @@ def test_inputs_do_not_depend_on_where_a_box_is_and_where_north_is(turn: float, 
 
 
 def test_corrections_are_applied_to_the_boxes_of_the_first_stage(tmp_path: Path) -> None:
-    """A car of the first stage is moved along its own axes, sized, turned and reversed; its score is that of the second stage."""
+    """A car of the first stage is moved along its own axes, sized, turned and reversed, and becomes a cyclist; its score is that of the second stage."""
     first = taller_is_hotter(tmp_path, name="first")
-    corrections = [2.0, 0.4, -0.2, 0.1, *np.log([1.2, 0.8, 0.9]), np.sin(0.4), np.cos(0.4), -3.0, 1.0]
+    # One in nine each for the car, the motorcycle and nothing, two for the truck, four for the cyclist.
+    logits = [0.0, np.log(2.0), -40.0, 0.0, np.log(4.0), -40.0]
+    corrections = [*logits, 0.4, -0.2, 0.1, *np.log([1.2, 0.8, 0.9]), np.sin(0.4), np.cos(0.4), -3.0, 1.0]
     cloud = cloud_of(solid(10, 6, 2.0, 2.0, 1.9))
     before = create_lidar_detector(f"lidar:{first}", LOG, LidarConfig()).detect(cloud)
     write_refinement(tmp_path / "taller.boxes.onnx", corrections)
@@ -70,14 +72,15 @@ def test_corrections_are_applied_to_the_boxes_of_the_first_stage(tmp_path: Path)
     np.testing.assert_allclose(after.size_m, np.tile([2.9 * 1.2, 2.9 * 0.8, 1.8], (len(after), 1)), rtol=1e-4)
     np.testing.assert_allclose(wrap_angle(after.yaw_rad - 0.2 - np.pi), 0, atol=1e-5)
     np.testing.assert_allclose(after.heading_score, 1 / (1 + np.exp(-3.0)), rtol=1e-5)
-    np.testing.assert_allclose(after.score, 1 / (1 + np.exp(-2.0)), rtol=1e-5)
+    np.testing.assert_allclose(after.score, 5 / 9, rtol=1e-5)
+    assert set(after.category) == {"cyclist"}
     # Results are kept by what they depend on, the second file included.
     assert detector.cache_key != replace(detector, refinement=None).cache_key  # type: ignore[attr-defined, type-var]
 
 
 def test_boxes_without_points_are_left_out_and_none_are_fine(tmp_path: Path) -> None:
     first = taller_is_hotter(tmp_path)
-    write_refinement(tmp_path / "taller.boxes.onnx", [2.0, *np.zeros(7), 1.0, 1.0, 1.0])
+    write_refinement(tmp_path / "taller.boxes.onnx", [2.0, *np.zeros(12), 1.0, 1.0, 1.0])
     detector: Any = open_network(first, LidarConfig(), name="x")
     assert len(detector.detect(cloud_of(np.zeros((0, 3))))) == 0
     assert len(detector.detect(cloud_of(np.full((5, 3), np.nan)))) == 0
@@ -99,7 +102,7 @@ def test_boxes_without_points_are_left_out_and_none_are_fine(tmp_path: Path) -> 
     ],
 )
 def test_a_file_that_is_no_second_stage_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    first, arguments = taller_is_hotter(tmp_path), {"corrections": np.zeros(11), **changes}
+    first, arguments = taller_is_hotter(tmp_path), {"corrections": np.zeros(16), **changes}
     write_refinement(tmp_path / "taller.boxes.onnx", **arguments)
     with pytest.raises(ConfigError, match=message) as caught:
         create_lidar_detector(f"lidar:{first}", LOG, LidarConfig())

@@ -86,9 +86,11 @@ def test_poses_are_compared_by_surfaces_and_parked_vehicles(tmp_path: Path, caps
     assert found["4 parked, median scatter, m"][0] == 0.0  # synthetic labels are exact
 
 
-def test_a_logistic_regression_has_the_weights_of_a_minimizer() -> None:
+@pytest.mark.parametrize("off", [0.0, 6.0])
+def test_a_logistic_regression_has_the_weights_of_a_minimizer(off: float) -> None:
+    """Also where whole steps of Newton's method from the prior lead farther away."""
     rng = np.random.default_rng(0)
-    x, prior, precision = np.column_stack([np.ones(200), rng.normal(size=(200, 2))]), [0.0, 1.0, 0.5], [0.1, 4.0, 1.0]
+    x, prior, precision = np.column_stack([np.ones(200), rng.normal(size=(200, 2))]), [off, 1.0, 0.5], [0.1, 4.0, 1.0]
     right = rng.random(200) < 1 / (1 + np.exp(-x @ [0.3, -2.0, 1.0]))
 
     def cost(w: np.ndarray) -> float:

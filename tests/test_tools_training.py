@@ -58,7 +58,8 @@ def test_targets_of_the_second_stage_make_boxes_the_true_ones() -> None:
     found[::2, 6] += np.pi
     boxes = boxes_at(found.tolist())
     target = targets_of(boxes, truth)
-    again = corrected(boxes, np.column_stack([np.ones(50), target[:, :8], 4 * target[:, 8] - 2, np.zeros(50)]))
+    out = np.column_stack([np.ones(50), target[:, :8], 4 * target[:, 8] - 2, np.zeros(50)])
+    again = corrected(boxes, out, {"vehicle": ["car"]})
     np.testing.assert_allclose(np.column_stack([again.center_m, again.size_m]), truth[:, :6], atol=1e-9)
     np.testing.assert_allclose(wrap_angle(again.yaw_rad - truth[:, 6]), 0, atol=1e-9)
 
@@ -122,7 +123,7 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
     network: Any = open_network(tmp_path / "roadside.onnx", LidarConfig(), name="x").refinement
     found = torch.from_numpy(network.run(points.numpy(), box.numpy()).astype(np.float32))
     nothing = torch.zeros_like(found)
-    nothing[:, 8] = 1.0
+    nothing[:, -3] = 1.0
     errors, none = (refinement.loss_of(out, *targets)[1] for out in (found, nothing))
     assert errors["object"] < 0.6 * none["object"]
 

@@ -18,10 +18,18 @@ def logistic_regression(x: Array, right: ArrayLike, precision: ArrayLike, prior:
     """
     wanted, least = np.broadcast_to(prior, x.shape[1]), np.broadcast_to(precision, x.shape[1])
     w = wanted.astype(np.float64)
+
+    def loss(w: Array) -> float:
+        logits = x @ w
+        return float(np.sum(np.logaddexp(0.0, logits) - right * logits) + least @ (w - wanted) ** 2 / 2)
+
     for _ in range(ITERATIONS):
         p = probability_of(x @ w)
         hessian = (x * (p * (1 - p))[:, None]).T @ x + np.diag(least)
         step = np.linalg.solve(hessian, x.T @ (right - p) - least * (w - wanted))
+        # Whole steps from far away may lead farther away.
+        while np.abs(step).max() > 1e-9 and loss(w + step) > loss(w):
+            step /= 2
         w = w + step
         if np.abs(step).max() < 1e-9:
             break

@@ -18,6 +18,7 @@ from log2sim.datatypes import GROUP_OF, Boxes3D
 from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.evaluation import calibration, operating_point, precision_recall
 from log2sim.evaluation.detection.protocols import Criterion, Matches, match_detections
+from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector, open_network
 from log2sim.perception.detect3d.network import METADATA_KEY
 from training.clouds import Example
@@ -230,7 +231,9 @@ def _raw_boxes(detector: NetworkDetector, example: Example) -> tuple[SceneBoxes,
     boxes, points = found.boxes, found.inside.count
     rows = np.column_stack([boxes.center_m, boxes.size_m, boxes.yaw_rad])
     names = np.array(detector.network.info.groups)[boxes.group]
-    some = np.flatnonzero(points > 0)
+    # Boxes of two groups may have become of one.
+    apart = suppress(boxes.rectangles, boxes.heat, boxes.group, across=False)
+    some = np.sort(apart[points[apart] > 0])
     table = SceneBoxes.of(rows, names, 1 / (1 + np.exp(-boxes.heat)), points=points)
     return table.take(some), found.terms.T[some]
 

@@ -1,7 +1,7 @@
 """Train the second stage of a LiDAR detector, a network on the points of boxes, on simulated clouds.
 
-    python tools/train.py refinement vehicle DIR --seed 43                 # that which ships: 20 minutes of two cores
-    python tools/train.py refinement roadside DIR --seed 43 --steps 6000   # likewise
+    python tools/train.py refinement vehicle DIR                           # that which ships: 40 minutes of two cores
+    python tools/train.py refinement roadside DIR                          # likewise
     python tools/train.py refinement vehicle DIR --scenes 200 --steps 300  # a toy
 
 It learns from the boxes that the first stage, the shipped network or that of --first, finds in scenes of its own seed. Generating resumes,
@@ -35,6 +35,7 @@ from log2sim.perception.detect3d.network import VERSION, level_points, viewpoint
 from log2sim.perception.detect3d.refinement import (
     BOX_VALUES,
     MARGIN_M,
+    MAX_LOG_SIZE,
     METADATA_KEY,
     MOST_POINTS,
     OUTPUTS,
@@ -51,13 +52,14 @@ from training.clouds import CALIBRATED_KINDS, REPORTED_KINDS, STEP_M, Example, d
 from training.export import CATEGORIES, RAW_CALIBRATION, calibrate, describe, export_checked, report
 from training.fitting import FitPlan, fit, wait_for
 
+KINDS = [category for group in CATEGORIES.values() for category in group]
 PER_SHARD = 100
 STEPS_PER_SHARD = 50
 BATCH = 512
 RATE = 2e-3
 POINTS = 64
 WIDTHS = (48, 96, 128, 96)  # channels of three layers for each point, and of two for each box
-# What a box is of has its center within this part of its longer side, or this far: a neighbor is another.
+# What a box is of has its center within this part of its longer side, or this far, m: a neighbor is another.
 SAME_SIDES, SAME_M = 0.25, 1.0
 # Points are stored this much farther out than the network looks, m, for boxes that are shifted.
 STORED_M = 0.5
@@ -83,11 +85,17 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
     groups = detector.network.info.groups
     names = [GROUP_OF.get(c) for c in truth.category.tolist()]
     group = np.array([groups.index(g) if g in groups else -1 for g in names], np.intp)
+    kind = np.array([KINDS.index(c) if c in KINDS else -1 for c in truth.category.tolist()], np.int8)
     distance = np.hypot(*(center[:, None, :2] - truth.box[:, :2]).T).T
     reach = np.maximum(SAME_M, SAME_SIDES * truth.box[:, 3:5].max(axis=1, initial=0.0))
-    own = np.where((group == boxes.group[:, None]) & (distance <= reach), distance, np.inf)
-    of = own.argmin(axis=1) if len(truth) else np.zeros(len(some), np.intp)
-    matched = np.isfinite(own.min(axis=1, initial=np.inf))
+    # People and riders are taken for each other: one of the other group too, of a size within reach, if none of the same is there.
+    changed = np.abs(np.log(truth.box[:, 3:5] / boxes.size_m[:, None, :2])).max(axis=2, initial=0.0)
+    same, slim = group == boxes.group[:, None], [k for k, name in enumerate(groups) if name != "vehicle"]
+    swapped = np.isin(group, slim) & np.isin(boxes.group, slim)[:, None] & (changed < MAX_LOG_SIZE)
+    near = (distance <= reach) & (same | swapped)
+    away = np.where(near, distance + np.where(same, 0.0, 2 * reach), np.inf)
+    of = away.argmin(axis=1) if len(truth) else np.zeros(len(some), np.intp)
+    matched = np.isfinite(away.min(axis=1, initial=np.inf))
     # What is too small a part of an object, or of no group, is neither right nor wrong.
     unclear = ((distance <= 2 * reach) & truth.ignored).any(axis=1)
     if len(truth):
@@ -104,6 +112,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
         "counts": around.count.astype(np.int32),
         "box": np.column_stack([center[:, 2], boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.heat, boxes.quality]).astype(np.float32),
         "group": boxes.group.astype(np.int8),
+        "kind": np.where(matched, kind[of], -1).astype(np.int8) if len(truth) else np.full(len(some), -1, np.int8),
         "toward": toward_sensor(boxes, viewpoints_xy(example.cloud)).astype(np.float32),
         "truth": target.astype(np.float32),
         "matched": matched,
@@ -136,8 +145,8 @@ def generate(mount: Mount, first: Path, out: Path, scenes: int, seed: int) -> No
 def drawn(shard: dict[str, NDArray[Any]], rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[Tensor, ...]:
     """Draw inputs and targets of some boxes of a shard, mirrored, in other proportions, partly hidden and shifted at random.
 
-    Returns points (B, n, 7) and box (B, 15) as `box_inputs`, target (B, 9) as `targets_of`; size (B, 2), m, of the truth; matched (B,) and
-    weight (B,), 0 or 1.
+    Returns points (B, n, 7) and box (B, 15) as `box_inputs`, target (B, 9) as `targets_of`; size (B, 2), m, of the truth; kind (B,): number of
+    its category, from 1 on, 0 for no road user; weight (B,), 0 or 1.
     """
     count, n = len(rows), shard["stored"][rows]
     pair = np.repeat(np.arange(count), n)
@@ -179,7 +188,7 @@ def drawn(shard: dict[str, NDArray[Any]], rows: NDArray[np.intp], rng: np.random
     pairs = PointsOfBoxes(pair[order], order, count)
     counts = np.maximum(np.rint(shard["counts"][rows] * pairs.count / n), 1).astype(np.int64)
     values, of_box = box_inputs(xyz, pairs, counts, boxes, toward - center[:, :2], POINTS)
-    arrays = (values, of_box, targets_of(boxes, truth), truth[:, 3:5], matched, weight)
+    arrays = (values, of_box, targets_of(boxes, truth), truth[:, 3:5], shard["kind"][rows] + 1, weight)
     return tuple(torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in arrays)
 
 
@@ -247,37 +256,36 @@ class RefinementNetwork(nn.Module):
         )  # fmt: skip
         self.boxes = nn.Sequential(
             nn.Linear(c + BOX_VALUES, d, bias=False), nn.BatchNorm1d(d), nn.ReLU(),
-            nn.Linear(d, d, bias=False), nn.BatchNorm1d(d), nn.ReLU(), nn.Linear(d, OUTPUTS),
+            nn.Linear(d, d, bias=False), nn.BatchNorm1d(d), nn.ReLU(), nn.Linear(d, len(KINDS) + OUTPUTS),
         )  # fmt: skip
 
     def forward(self, points: Tensor, box: Tensor) -> Tensor:
-        """Map points (B, n, 7) and values of boxes (B, 15) to corrections (B, 11)."""
+        """Map points (B, n, 7) and values of boxes (B, 15) to logits of categories and corrections (B, 6 + 10)."""
         x = self.first(points) + self.of_box(box)[:, None]
         x = self.points(x.flatten(0, 1)).unflatten(0, points.shape[:2]).amax(dim=1)
         return self.boxes(torch.cat([x, box], dim=1))
 
 
-def loss_of(
-    out: Tensor, target: Tensor, size: Tensor, matched: Tensor, weight: Tensor
-) -> tuple[Tensor, dict[str, float]]:
-    """Return the loss of corrections (B, 11) and its parts."""
-    right = matched * weight
+def loss_of(out: Tensor, target: Tensor, size: Tensor, kind: Tensor, weight: Tensor) -> tuple[Tensor, dict[str, float]]:
+    """Return the loss of logits and corrections (B, 16) and its parts."""
+    logits, out = out[:, : len(KINDS)], out[:, len(KINDS) :]
+    right = (kind > 0) * weight
 
     def mean(loss: Tensor, over: Tensor = right) -> Tensor:
         return (loss * over).sum() / over.sum().clamp(min=1)
 
-    off = (out[:, 1:9] - target[:, :8]).abs()
+    off = (out[:, :8] - target[:, :8]).abs()
     with torch.no_grad():
         overlap = overlap_of(out, target, size)
     entropy = F.binary_cross_entropy_with_logits
     parts = {
-        "object": 2 * mean(entropy(out[:, 0], matched, reduction="none"), weight),
+        "object": 2 * mean(F.cross_entropy(F.pad(logits, (1, 0)), kind.long(), reduction="none"), weight),
         "place": mean(off[:, :2].sum(1) / size[:, 1].clamp(min=0.3)),
         "height": mean(off[:, 2]),
         "size": mean(off[:, 3:6].sum(1)),
         "axis": 0.5 * mean(off[:, 6:8].sum(1)),
-        "direction": 0.3 * mean(entropy(out[:, 9], target[:, 8], reduction="none")),
-        "quality": 0.5 * mean(entropy(out[:, 10], overlap, reduction="none")),
+        "direction": 0.3 * mean(entropy(out[:, 8], target[:, 8], reduction="none")),
+        "quality": 0.5 * mean(entropy(out[:, 9], overlap, reduction="none")),
     }
     return torch.stack(list(parts.values())).sum(), {name: float(value.detach()) for name, value in parts.items()}
 
@@ -286,13 +294,13 @@ def overlap_of(out: Tensor, target: Tensor, size: Tensor) -> Tensor:
     """Return the IoU (B,) of the corrected and the true rectangle, as if both had the true heading, times how well that is met."""
     shared, area = torch.ones_like(out[:, 0]), torch.ones_like(out[:, 0])
     for axis in range(2):
-        true, away = size[:, axis], (out[:, 1 + axis] - target[:, axis]).abs()
-        own = true * (out[:, 4 + axis] - target[:, 3 + axis]).clamp(-2, 2).exp()
+        true, away = size[:, axis], (out[:, axis] - target[:, axis]).abs()
+        own = true * (out[:, 3 + axis] - target[:, 3 + axis]).clamp(-2, 2).exp()
         shared = shared * (torch.minimum(true / 2, away + own / 2) - torch.maximum(-true / 2, away - own / 2)).clamp(
             min=0
         )
         area = area * own
-    aligned = (out[:, 7:9] * target[:, 6:8]).sum(1) / out[:, 7:9].norm(dim=1).clamp(min=1e-3)
+    aligned = (out[:, 6:8] * target[:, 6:8]).sum(1) / out[:, 6:8].norm(dim=1).clamp(min=1e-3)
     return shared / (area + size.prod(1) - shared).clamp(min=1e-3) * aligned.clamp(0, 1)
 
 
@@ -358,7 +366,7 @@ def finish(
 
 
 def main(
-    mount: Mount, out: Path, scenes: int = 6000, steps: int = 7000, seed: int = 41, first: Path | None = None, examples: int = 150,
+    mount: Mount, out: Path, scenes: int = 8000, steps: int = 14_000, seed: int = 47, first: Path | None = None, examples: int = 150,
     only_generate: bool = False,
 ) -> None:  # fmt: skip
     """Generate, fit and export."""

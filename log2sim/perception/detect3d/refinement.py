@@ -8,6 +8,7 @@ sides (Li, Wang and Wang, "LiDAR R-CNN", CVPR 2021).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,10 @@ MARGIN_M = 0.5
 # Points of a box from which those of the network are drawn.
 MOST_POINTS = 256
 MAX_GROUPS = 3
-POINT_VALUES, BOX_VALUES, OUTPUTS = 7, 12 + MAX_GROUPS, 11
-# A box that has to be changed by more than this is of another object.
-MAX_SHIFT_M, MAX_LOG_SIZE = 2.0, 0.7
+POINT_VALUES, BOX_VALUES = 7, 12 + MAX_GROUPS
+OUTPUTS = 10  # after the logits of the categories
+# A box that has to be moved by more is of another object; a rider is three times as long as the person that the first stage may take it for.
+MAX_SHIFT_M, MAX_LOG_SIZE = 2.0, 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,7 @@ class Refinement:
 
     path: Path
     info: ScoreInfo  # its groups are those of the first stage
+    categories: Mapping[str, Sequence[str]]  # of each group, those of the first stage
     session: Any  # onnxruntime.InferenceSession
     points: int  # number of points of a box that the network takes
 
@@ -57,7 +60,7 @@ class Refinement:
 
         `xyz`: (N, 3), m: level frame. `sensors`: (V, 2), m: where they were measured from.
 
-        Returns the boxes, whose heat is the logit of holding an object of their group, and their points above the ground.
+        Returns the boxes, each of the group that its points are likeliest of, whose heat is the logit of that, and their points above the ground.
         """
         around = points_around(xyz, boxes)
         inside = points_within(around, xyz, boxes)
@@ -67,17 +70,18 @@ class Refinement:
         boxes, around = boxes.take(some), around.take(some)
         toward = toward_sensor(boxes, sensors)
         values = box_inputs(xyz, around.sample(MOST_POINTS), around.count, boxes, toward, self.points)
-        boxes = corrected(boxes, self.run(*values))
+        boxes = corrected(boxes, self.run(*values), self.categories)
         return boxes, points_within(around, xyz, boxes)
 
     def run(self, points: NDArray[np.float32], of_box: NDArray[np.float32]) -> Array:
-        """Compute the corrections (M, 11) from the inputs of M boxes; `ConfigError` when it fails."""
+        """Compute logits of C categories and corrections (M, C + 10) from the inputs of M boxes; `ConfigError` when it fails."""
         try:
             (out,) = self.session.run(["corrections"], {"points": points, "box": of_box})
         except Exception as error:  # ONNX Runtime has many exceptions and no base of its own
             raise ConfigError(f"{self.path}: the network fails on {len(of_box)} boxes: {first_line(error)}") from None
-        if out.shape != (len(of_box), OUTPUTS):
-            raise ConfigError(f"{self.path}: output 'corrections' is {out.shape}, expected ({len(of_box)}, {OUTPUTS})")
+        expected = len(of_box), sum(map(len, self.categories.values())) + OUTPUTS
+        if out.shape != expected:
+            raise ConfigError(f"{self.path}: output 'corrections' is {out.shape}, expected {expected}")
         return np.nan_to_num(np.asarray(out, np.float64))
 
 
@@ -143,28 +147,37 @@ def box_inputs(
     return values.astype(np.float32), of_box.astype(np.float32)
 
 
-def corrected(boxes: LevelBoxes, out: Array) -> LevelBoxes:
-    """Apply the corrections (M, 11) of the network to boxes.
+def corrected(boxes: LevelBoxes, out: Array, categories: Mapping[str, Sequence[str]]) -> LevelBoxes:
+    """Apply the outputs (M, C + 10) of the network to boxes.
 
-    They are the logit of an object of the box's group, the shift along the axes of the box, m, logarithms of the factors of
-    its size, sine and cosine of twice the turn, the logit that front and back are not swapped, and that of the expected IoU.
+    They are the logits of the C categories of all groups against no road user, the shift along the axes of the box, m, logarithms of the
+    factors of its size, sine and cosine of twice the turn, the logit that front and back are not swapped, and that of the expected IoU.
     """
+    names = np.array([name for group in categories.values() for name in group])
+    logits, out = out[:, : len(names)], out[:, len(names) :]
+    of_group = np.repeat(np.arange(len(categories)), [len(group) for group in categories.values()])
+    each = np.stack([np.logaddexp.reduce(logits[:, of_group == k], axis=1) for k in range(len(categories))], axis=1)
+    group = each.argmax(axis=1)
+    likeliest = np.where(of_group == group[:, None], logits, -np.inf).argmax(axis=1)
+    others = np.where(np.arange(len(categories)) == group[:, None], -np.inf, each)
     c, s = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
-    x, y, z = np.clip(out[:, 1:4].T, -MAX_SHIFT_M, MAX_SHIFT_M)
-    yaw = boxes.yaw_rad + np.arctan2(out[:, 7], out[:, 8]) / 2 + np.where(out[:, 9] < 0, np.pi, 0.0)
+    x, y, z = np.clip(out[:, :3].T, -MAX_SHIFT_M, MAX_SHIFT_M)
+    yaw = boxes.yaw_rad + np.arctan2(out[:, 6], out[:, 7]) / 2 + np.where(out[:, 8] < 0, np.pi, 0.0)
     return replace(
         boxes,
         center_m=boxes.center_m + np.stack([x * c - y * s, x * s + y * c, z], axis=1),
-        size_m=boxes.size_m * np.exp(np.clip(out[:, 4:7], -MAX_LOG_SIZE, MAX_LOG_SIZE)),
+        size_m=boxes.size_m * np.exp(np.clip(out[:, 3:6], -MAX_LOG_SIZE, MAX_LOG_SIZE)),
         yaw_rad=np.asarray(wrap_angle(yaw)),
-        heading_score=sigmoid(np.abs(out[:, 9])),
-        heat=out[:, 0],
-        quality=out[:, 10],
+        heading_score=sigmoid(np.abs(out[:, 8])),
+        group=group,
+        category=names[likeliest],
+        heat=each.max(axis=1) - np.logaddexp(0.0, np.logaddexp.reduce(others, axis=1)),
+        quality=out[:, 9],
     )
 
 
-def load_refinement(path: Path, groups: tuple[str, ...]) -> Refinement:
-    """Load the second stage of a detector of some groups; `ConfigError` for a file that is none."""
+def load_refinement(path: Path, categories: Mapping[str, Sequence[str]]) -> Refinement:
+    """Load the second stage of a detector of some groups of categories; `ConfigError` for a file that is none."""
     session = open_session(path, MAX_FILE_BYTES, "network for the points of boxes")
     shapes = {i.name: i.shape for i in session.get_inputs() if i.type == "tensor(float)"}
     of_points = shapes.get("points", ())
@@ -179,10 +192,11 @@ def load_refinement(path: Path, groups: tuple[str, ...]) -> Refinement:
         info = ScoreInfo.model_validate_json(text[:METADATA_LIMIT_CHARS])
     except ValidationError as error:
         raise ConfigError(f"{where}: {first_problem(error, ScoreInfo)}") from None
+    groups = tuple(categories)
     if info.groups != groups or len(groups) > MAX_GROUPS:
         raise ConfigError(
             f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(groups)}; expected the same, at most {MAX_GROUPS}"
         )
-    network = Refinement(path, info, session, of_points[1])
+    network = Refinement(path, info, categories, session, of_points[1])
     network.run(np.zeros((1, network.points, POINT_VALUES), np.float32), np.zeros((1, BOX_VALUES), np.float32))
     return network
