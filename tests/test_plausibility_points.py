@@ -143,15 +143,20 @@ def person(score: float, in_sweeps: bool, way_m: float = 0.0) -> Track:
 def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(
     way_m, score, in_sweeps, may, may_in_clutter, confirmed
 ):
-    track = person(score, in_sweeps)
+    track = person(score, in_sweeps, way_m)
     walking = agent(20.0, category="pedestrian", size=(0.6, 0.6, 1.7), speed=way_m / 4)
     seen = replace(candidate(walking), track=track, geometry=static_geometry(track))
     recording = Recording(
         Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
     )
     assert gather([seen], recording)["confirmed"] == [confirmed]
-    on = person(score, in_sweeps, way_m)
-    assert [may_suffice(on, static=way_m == 0, clutter=nats) for nats in (0.0, 3.0)] == [may, may_in_clutter]
+    # What keeps its place before the sensor moves no more than what stays.
+    m = track.measurements
+    carried = replace(m, sensor_m=m.center_m - [20.0, 0.0, 0.0])
+    alike = replace(seen, track=replace(track, measurements=carried))
+    assert gather([alike], recording)["confirmed"] == [confirmed and (way_m == 0 or not in_sweeps)]
+    assert gather([alike], recording)["travel"] == [0.0]
+    assert [may_suffice(track, static=way_m == 0, clutter=nats) for nats in (0.0, 3.0)] == [may, may_in_clutter]
 
 
 def test_where_most_is_detected_weakly_the_weak_ones_are_clutter_and_the_sure_ones_stay_what_they_are():
