@@ -52,7 +52,7 @@ from training.clouds import CALIBRATED_KINDS, REPORTED_KINDS, STEP_M, Example, d
 from training.export import CATEGORIES, RAW_CALIBRATION, calibrate, describe, export_checked, report
 from training.fitting import FitPlan, fit, wait_for
 
-KINDS = [category for group in CATEGORIES.values() for category in group]
+NAMES = [category for group in CATEGORIES.values() for category in group]
 PER_SHARD = 100
 STEPS_PER_SHARD = 50
 BATCH = 512
@@ -85,7 +85,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
     groups = detector.network.info.groups
     names = [GROUP_OF.get(c) for c in truth.category.tolist()]
     group = np.array([groups.index(g) if g in groups else -1 for g in names], np.intp)
-    kind = np.array([KINDS.index(c) if c in KINDS else -1 for c in truth.category.tolist()], np.int8)
+    category = np.array([NAMES.index(c) if c in NAMES else -1 for c in (*truth.category.tolist(), "")], np.int8)
     distance = np.hypot(*(center[:, None, :2] - truth.box[:, :2]).T).T
     reach = np.maximum(SAME_M, SAME_SIDES * truth.box[:, 3:5].max(axis=1, initial=0.0))
     # People and riders are taken for each other: one of the other group too, of a size within reach, if none of the same is there.
@@ -112,7 +112,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
         "counts": around.count.astype(np.int32),
         "box": np.column_stack([center[:, 2], boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.heat, boxes.quality]).astype(np.float32),
         "group": boxes.group.astype(np.int8),
-        "kind": np.where(matched, kind[of], -1).astype(np.int8) if len(truth) else np.full(len(some), -1, np.int8),
+        "category": category[np.where(matched, of, -1)],  # -1 for none
         "toward": toward_sensor(boxes, viewpoints_xy(example.cloud)).astype(np.float32),
         "truth": target.astype(np.float32),
         "matched": matched,
@@ -145,7 +145,7 @@ def generate(mount: Mount, first: Path, out: Path, scenes: int, seed: int) -> No
 def drawn(shard: dict[str, NDArray[Any]], rows: NDArray[np.intp], rng: np.random.Generator) -> tuple[Tensor, ...]:
     """Draw inputs and targets of some boxes of a shard, mirrored, in other proportions, partly hidden and shifted at random.
 
-    Returns points (B, n, 7) and box (B, 15) as `box_inputs`, target (B, 9) as `targets_of`; size (B, 2), m, of the truth; kind (B,): number of
+    Returns points (B, n, 7) and box (B, 15) as `box_inputs`, target (B, 9) as `targets_of`; size (B, 2), m, of the truth; category (B,): number of
     its category, from 1 on, 0 for no road user; weight (B,), 0 or 1.
     """
     count, n = len(rows), shard["stored"][rows]
@@ -188,7 +188,7 @@ def drawn(shard: dict[str, NDArray[Any]], rows: NDArray[np.intp], rng: np.random
     pairs = PointsOfBoxes(pair[order], order, count)
     counts = np.maximum(np.rint(shard["counts"][rows] * pairs.count / n), 1).astype(np.int64)
     values, of_box = box_inputs(xyz, pairs, counts, boxes, toward - center[:, :2], POINTS)
-    arrays = (values, of_box, targets_of(boxes, truth), truth[:, 3:5], shard["kind"][rows] + 1, weight)
+    arrays = (values, of_box, targets_of(boxes, truth), truth[:, 3:5], shard["category"][rows] + 1, weight)
     return tuple(torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in arrays)
 
 
@@ -256,7 +256,7 @@ class RefinementNetwork(nn.Module):
         )  # fmt: skip
         self.boxes = nn.Sequential(
             nn.Linear(c + BOX_VALUES, d, bias=False), nn.BatchNorm1d(d), nn.ReLU(),
-            nn.Linear(d, d, bias=False), nn.BatchNorm1d(d), nn.ReLU(), nn.Linear(d, len(KINDS) + OUTPUTS),
+            nn.Linear(d, d, bias=False), nn.BatchNorm1d(d), nn.ReLU(), nn.Linear(d, len(NAMES) + OUTPUTS),
         )  # fmt: skip
 
     def forward(self, points: Tensor, box: Tensor) -> Tensor:
@@ -266,10 +266,12 @@ class RefinementNetwork(nn.Module):
         return self.boxes(torch.cat([x, box], dim=1))
 
 
-def loss_of(out: Tensor, target: Tensor, size: Tensor, kind: Tensor, weight: Tensor) -> tuple[Tensor, dict[str, float]]:
+def loss_of(
+    out: Tensor, target: Tensor, size: Tensor, category: Tensor, weight: Tensor
+) -> tuple[Tensor, dict[str, float]]:
     """Return the loss of logits and corrections (B, 16) and its parts."""
-    logits, out = out[:, : len(KINDS)], out[:, len(KINDS) :]
-    right = (kind > 0) * weight
+    logits, out = out[:, : len(NAMES)], out[:, len(NAMES) :]
+    right = (category > 0) * weight
 
     def mean(loss: Tensor, over: Tensor = right) -> Tensor:
         return (loss * over).sum() / over.sum().clamp(min=1)
@@ -279,7 +281,7 @@ def loss_of(out: Tensor, target: Tensor, size: Tensor, kind: Tensor, weight: Ten
         overlap = overlap_of(out, target, size)
     entropy = F.binary_cross_entropy_with_logits
     parts = {
-        "object": 2 * mean(F.cross_entropy(F.pad(logits, (1, 0)), kind.long(), reduction="none"), weight),
+        "object": 2 * mean(F.cross_entropy(F.pad(logits, (1, 0)), category.long(), reduction="none"), weight),
         "place": mean(off[:, :2].sum(1) / size[:, 1].clamp(min=0.3)),
         "height": mean(off[:, 2]),
         "size": mean(off[:, 3:6].sum(1)),
