@@ -150,12 +150,13 @@ def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(
         Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
     )
     assert gather([seen], recording)["confirmed"] == [confirmed]
-    # What keeps its place before the sensor moves no more than what stays.
+    # Of few points what keeps its place before the sensor moves no more than what stays; more would stay behind if it did not move.
     m = track.measurements
-    carried = replace(m, sensor_m=m.center_m - [20.0, 0.0, 0.0])
-    alike = replace(seen, track=replace(track, measurements=carried))
-    assert gather([alike], recording)["confirmed"] == [confirmed and (way_m == 0 or not in_sweeps)]
-    assert gather([alike], recording)["travel"] == [0.0]
+    for points, moves in ((3, False), (40, way_m > 0)):
+        carried = replace(m, sensor_m=m.center_m - [20.0, 0.0, 0.0], points=np.full(5, points))
+        table = gather([replace(seen, track=replace(track, measurements=carried))], recording)
+        assert table["confirmed"] == [confirmed and (moves or way_m == 0 or not in_sweeps)]
+        assert (table["travel"] > 0) == [moves]
     assert [may_suffice(track, static=way_m == 0, clutter=nats) for nats in (0.0, 3.0)] == [may, may_in_clutter]
 
 

@@ -117,9 +117,11 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_sweep, in_image = np.isfinite(m.box_yaw_rad), m.camera != ""
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
-    # What moves as the sensor does may be its artifact, such as rings that it draws on a wall along the road.
-    ways = (np.stack([w.x_m, w.y_m], axis=1), m.center_m[:, :2] - m.sensor_m[:, :2])
-    way_m = min(float(np.hypot(*np.ptp(xy, axis=0))) for xy in ways) if moving else 0.0
+    way_m = float(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))) if moving else 0.0
+    # Of so few points it is not known whether they stay behind (`remaining`): what moves as the sensor does may be its artifact, such as
+    # rings that it draws on a wall along the road.
+    if np.median(m.points) < MIN_SIDE_POINTS:
+        way_m = min(way_m, float(np.hypot(*np.ptp((m.center_m - m.sensor_m)[:, :2], axis=0))))
     sweep = sweep_log_odds(track) if in_sweep.any() else 0.0
     if group == "vehicle" and in_sweep.any():
         sweep = min(sweep + MATCH_NATS * candidate.followed, MAX_LOG_ODDS)
