@@ -50,7 +50,8 @@ SIGNS = {
 - sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
   where negative; and of its detections in images. 0 without any.
 - no_image: 1 without any detection in an image, where others have some.
-- travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is.
+- travel: logarithm of the way of what moves, in units of its length, plus 1: what is mistaken for a road user stays where it is, or, of
+few points, where it is before the sensor.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
 - scatter: logarithm of the median squared distance of its measurements from the trajectory in standard deviations, plus 1.
 - sigma: logarithm of the standard deviation of its position, in units of 0.1 m.
@@ -118,8 +119,8 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
     way_m = float(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))) if moving else 0.0
-    # Of so few points it is not known whether they stay behind (`remaining`): what moves as the sensor does may be its artifact, such as
-    # rings that it draws on a wall along the road.
+    # So few points do not show whether they stay behind (`remaining`): what moves as the sensor does may be its artifact, such as rings
+    # on a wall along the road.
     if np.median(m.points) < MIN_SIDE_POINTS:
         way_m = min(way_m, float(np.hypot(*np.ptp((m.center_m - m.sensor_m)[:, :2], axis=0))))
     sweep = sweep_log_odds(track) if in_sweep.any() else 0.0

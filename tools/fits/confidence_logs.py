@@ -64,8 +64,6 @@ from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, log_of
 # Ticks a second, and how long a log of that rate lasts, s.
 RATES = ((10.0, 2.5), (10.0, 4.5), (5.0, 6.0), (2.0, 9.0))
 ROADSIDE_EVERY = 6
-# Every so many logs are of so few ticks at most: single frames and short parts of logs.
-SHORT_EVERY, SHORT_TICKS = 5, 4
 # Random traffic drives at up to 18 m/s; so many times as fast it is that of a motorway, on roads as straight as one.
 FAST_EVERY, FAST, MAX_FAST_CURVATURE_PM = 3, 2.0, 0.003
 # Poses wander by so much, from the best receivers to the worst, m and rad, correlated over so long, s.
@@ -325,8 +323,6 @@ def make_log(seed: int, index: int) -> tuple[Log, TrafficScene, PoseTrack | None
     if index % FAST_EVERY == 0 and abs(scene.roads[0].curvature_per_m) < MAX_FAST_CURVATURE_PM:
         scene = _sped_up(scene)
     name, own_seed = f"{mount}-{index}", int(rng.integers(2**31))
-    if index % SHORT_EVERY == SHORT_EVERY - 1:
-        duration_s = (int(rng.integers(SHORT_TICKS)) + 0.5) / rate_hz
     log = log_of(scene, environment, name, duration_s, own_seed, camera_rate_hz=rate_hz, image_labels=False)
     camera, lidar = log.streams["camera"], log.streams["lidar"]
     nearest = np.unique(nearest_index(lidar.t_ns, camera.t_ns))

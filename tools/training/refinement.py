@@ -83,12 +83,13 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
     sampled, center = around.sample(MOST_POINTS), boxes.center_m
     truth = example.truth
     groups = detector.network.info.groups
-    names = [GROUP_OF.get(c) for c in truth.category.tolist()]
-    group = np.array([groups.index(g) if g in groups else -1 for g in names], np.intp)
+    of_group = [GROUP_OF.get(c) for c in truth.category.tolist()]
+    group = np.array([groups.index(g) if g in groups else -1 for g in of_group], np.intp)
+    # The last is that of a box without an object.
     category = np.array([NAMES.index(c) if c in NAMES else -1 for c in (*truth.category.tolist(), "")], np.int8)
     distance = np.hypot(*(center[:, None, :2] - truth.box[:, :2]).T).T
     reach = np.maximum(SAME_M, SAME_SIDES * truth.box[:, 3:5].max(axis=1, initial=0.0))
-    # People and riders are taken for each other: one of the other group too, of a size within reach, if none of the same is there.
+    # People and riders are confused: a box is of an object of the other group, too, of a size within reach, if none of its own is there.
     changed = np.abs(np.log(truth.box[:, 3:5] / boxes.size_m[:, None, :2])).max(axis=2, initial=0.0)
     same, slim = group == boxes.group[:, None], [k for k, name in enumerate(groups) if name != "vehicle"]
     swapped = np.isin(group, slim) & np.isin(boxes.group, slim)[:, None] & (changed < MAX_LOG_SIZE)
@@ -112,7 +113,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
         "counts": around.count.astype(np.int32),
         "box": np.column_stack([center[:, 2], boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.heat, boxes.quality]).astype(np.float32),
         "group": boxes.group.astype(np.int8),
-        "category": category[np.where(matched, of, -1)],  # -1 for none
+        "category": category[np.where(matched, of, -1)],
         "toward": toward_sensor(boxes, viewpoints_xy(example.cloud)).astype(np.float32),
         "truth": target.astype(np.float32),
         "matched": matched,

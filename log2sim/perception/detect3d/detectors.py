@@ -226,8 +226,7 @@ def open_network(path: Path, settings: LidarConfig, *, name: str) -> NetworkDete
         )
     range_m, second = settings.range_m or network.info.range_m, path.with_suffix(SUFFIX)
     refines = settings.decode == "centers" and second.is_file()
-    categories = {group: network.info.categories[group] for group in network.info.groups}
-    refinement = load_refinement(second, categories) if refines else None
+    refinement = load_refinement(second, network.info) if refines else None
     return NetworkDetector(name, network, settings.decode, range_m, settings.min_score or None, refinement)
 
 

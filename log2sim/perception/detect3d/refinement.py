@@ -1,7 +1,7 @@
 """Second stage of a LiDAR detector: a network on the points in and around each box.
 
-Cells of a grid are as wide as a person is deep. The points themselves show more: whether the box holds a road user of its
-group, where the sides are, and which end is the front. Such networks follow PointNet (Qi et al., CVPR 2017) and PointRCNN
+Cells of a grid are as wide as a person is deep. The points themselves show more: which road user the box
+holds, if any, where the sides are, and which end is the front. Such networks follow PointNet (Qi et al., CVPR 2017) and PointRCNN
 (Shi et al., CVPR 2019). The size of the box is among the inputs, since points alone do not show how far they are from its
 sides (Li, Wang and Wang, "LiDAR R-CNN", CVPR 2021).
 """
@@ -21,10 +21,11 @@ from log2sim.errors import ConfigError
 from log2sim.files.documents import first_problem
 from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.detect3d.box_points import PointsOfBoxes, points_of_boxes
-from log2sim.perception.detect3d.boxes import LevelBoxes, sigmoid
+from log2sim.perception.detect3d.boxes import MAX_LOGIT, LevelBoxes, sigmoid
 from log2sim.perception.detect3d.network import (
     MAX_HEIGHT_M,
     METADATA_LIMIT_CHARS,
+    NetworkInfo,
     ScoreInfo,
     first_line,
     open_session,
@@ -41,7 +42,7 @@ MOST_POINTS = 256
 MAX_GROUPS = 3
 POINT_VALUES, BOX_VALUES = 7, 12 + MAX_GROUPS
 OUTPUTS = 10  # after the logits of the categories
-# A box that has to be moved by more is of another object; a rider is three times as long as the person that the first stage may take it for.
+# A box that has to be moved by more is of another object; riders are three times as long as people, for whom the first stage may take them.
 MAX_SHIFT_M, MAX_LOG_SIZE = 2.0, 1.2
 
 
@@ -60,7 +61,7 @@ class Refinement:
 
         `xyz`: (N, 3), m: level frame. `sensors`: (V, 2), m: where they were measured from.
 
-        Returns the boxes, each of the group that its points are likeliest of, whose heat is the logit of that, and their points above the ground.
+        Returns the boxes, each of its most probable group, whose heat is the logit of that, and their points above the ground.
         """
         around = points_around(xyz, boxes)
         inside = points_within(around, xyz, boxes)
@@ -154,12 +155,10 @@ def corrected(boxes: LevelBoxes, out: Array, categories: Mapping[str, Sequence[s
     factors of its size, sine and cosine of twice the turn, the logit that front and back are not swapped, and that of the expected IoU.
     """
     names = np.array([name for group in categories.values() for name in group])
-    logits, out = out[:, : len(names)], out[:, len(names) :]
     of_group = np.repeat(np.arange(len(categories)), [len(group) for group in categories.values()])
-    each = np.stack([np.logaddexp.reduce(logits[:, of_group == k], axis=1) for k in range(len(categories))], axis=1)
-    group = each.argmax(axis=1)
-    likeliest = np.where(of_group == group[:, None], logits, -np.inf).argmax(axis=1)
-    others = np.where(np.arange(len(categories)) == group[:, None], -np.inf, each)
+    odds, out = np.exp(np.clip(out[:, : len(names)], -MAX_LOGIT, MAX_LOGIT)), out[:, len(names) :]
+    group = (odds @ (of_group[:, None] == np.arange(len(categories)))).argmax(axis=1)
+    own = odds * (of_group == group[:, None])
     c, s = np.cos(boxes.yaw_rad), np.sin(boxes.yaw_rad)
     x, y, z = np.clip(out[:, :3].T, -MAX_SHIFT_M, MAX_SHIFT_M)
     yaw = boxes.yaw_rad + np.arctan2(out[:, 6], out[:, 7]) / 2 + np.where(out[:, 8] < 0, np.pi, 0.0)
@@ -170,14 +169,14 @@ def corrected(boxes: LevelBoxes, out: Array, categories: Mapping[str, Sequence[s
         yaw_rad=np.asarray(wrap_angle(yaw)),
         heading_score=sigmoid(np.abs(out[:, 8])),
         group=group,
-        category=names[likeliest],
-        heat=each.max(axis=1) - np.logaddexp(0.0, np.logaddexp.reduce(others, axis=1)),
+        category=names[own.argmax(axis=1)],
+        heat=np.log(own.sum(axis=1) / (1.0 + (odds - own).sum(axis=1))),
         quality=out[:, 9],
     )
 
 
-def load_refinement(path: Path, categories: Mapping[str, Sequence[str]]) -> Refinement:
-    """Load the second stage of a detector of some groups of categories; `ConfigError` for a file that is none."""
+def load_refinement(path: Path, first: NetworkInfo) -> Refinement:
+    """Load the second stage of a detector whose first one describes itself; `ConfigError` for a file that is none."""
     session = open_session(path, MAX_FILE_BYTES, "network for the points of boxes")
     shapes = {i.name: i.shape for i in session.get_inputs() if i.type == "tensor(float)"}
     of_points = shapes.get("points", ())
@@ -192,11 +191,11 @@ def load_refinement(path: Path, categories: Mapping[str, Sequence[str]]) -> Refi
         info = ScoreInfo.model_validate_json(text[:METADATA_LIMIT_CHARS])
     except ValidationError as error:
         raise ConfigError(f"{where}: {first_problem(error, ScoreInfo)}") from None
-    groups = tuple(categories)
-    if info.groups != groups or len(groups) > MAX_GROUPS:
+    if info.groups != first.groups or len(info.groups) > MAX_GROUPS:
         raise ConfigError(
-            f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(groups)}; expected the same, at most {MAX_GROUPS}"
+            f"{where}: 'groups' are {list(info.groups)}, those of the detector {list(first.groups)}; expected the same, at most {MAX_GROUPS}"
         )
+    categories = {group: first.categories[group] for group in first.groups}
     network = Refinement(path, info, categories, session, of_points[1])
     network.run(np.zeros((1, network.points, POINT_VALUES), np.float32), np.zeros((1, BOX_VALUES), np.float32))
     return network
