@@ -82,6 +82,11 @@ def test_the_figures_of_a_braking_ego_are_those_of_the_closed_form() -> None:
     assert "collisions none" in said
 
 
+def test_a_replay_in_which_the_ego_hardly_brakes_is_written(tmp_path: Path) -> None:
+    braked_at(40.0, decel=3e-4).save(tmp_path / "replay.json")
+    assert json.loads((tmp_path / "replay.json").read_text())["metrics"]["ego"]["max_brake"] is None
+
+
 def test_doctor_lists_extras_that_are_missing_with_the_line_that_adds_them(monkeypatch: pytest.MonkeyPatch) -> None:
     known = installation.version_of
     monkeypatch.setattr(installation, "version_of", lambda name: None if name == "small-gicp" else known(name))

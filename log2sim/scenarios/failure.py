@@ -61,7 +61,7 @@ def search(margins: Margins, dimensions: int, runs: int, rng: np.random.Generato
     mean = np.zeros(dimensions)
     each = max(runs // (2 * ROUNDS), 10)
     all_z, all_m = [], []
-    for _ in range(ROUNDS):
+    for _ in range(runs // 2 // each):
         z = mean + rng.standard_normal((each, dimensions))
         m = margins(z)
         all_z.append(z)
@@ -74,7 +74,7 @@ def search(margins: Margins, dimensions: int, runs: int, rng: np.random.Generato
         mean = weight @ elite / weight.sum()
         if level <= 0.0 and len(all_m) > 1:
             break
-    last = max(runs - sum(map(len, all_m)), 20)
+    last = runs - sum(map(len, all_m))
     given = rng.random(last) < DEFENSIVE
     z = rng.standard_normal((last, dimensions)) + np.where(given[:, None], 0.0, mean)
     m = margins(z)
@@ -200,6 +200,7 @@ STYLE = """
 h2 { font-size: 14px; } small { color: var(--muted); } pre { overflow-x: auto; }
 td, th { padding: 3px 12px 3px 0; text-align: right; border-bottom: 1px solid var(--grid); }
 svg { width: 320px; margin: 8px; background: var(--grid); border-radius: 4px; }
+svg path { fill: none; stroke: var(--ink); }
 circle { fill: #1565C0; fill-opacity: .5; } circle.failed { fill: #C62828; fill-opacity: 1; } text { fill: var(--ink); font-size: 9px; }
 """
 
@@ -254,8 +255,15 @@ def _scatter(names: Sequence[str], values: Array, failed: Array, i: int, j: int)
         f'<circle{" class=failed" if bad else ""} cx="{20 + 270 * (a - x0) / (x1 - x0):.1f}" cy="{190 - 170 * (b - y0) / (y1 - y0):.1f}" r="2"/>'
         for a, b, bad in zip(x.tolist(), y.tolist(), failed.tolist())
     )
-    label = f"{html.escape(names[j])} {x0:.3g} to {x1:.3g}; {html.escape(names[i])} {y0:.3g} to {y1:.3g}"
-    return f'<svg viewBox="0 0 310 215" role="img">{dots}<text x="10" y="208">{label}</text></svg>'
+    axes = "".join(
+        f'<g transform="{place}"><text>{low:.3g}</text><text x="{end / 2}" text-anchor="middle">{html.escape(name)}</text>'
+        f'<text x="{end}" text-anchor="end">{high:.3g}</text></g>'
+        for place, end, name, low, high in (
+            ("translate(20 207)", 270, names[j], x0, x1),
+            ("translate(13 190) rotate(-90)", 170, names[i], y0, y1),
+        )
+    )
+    return f'<svg viewBox="0 0 310 215" role="img"><path d="M17 15V194H295"/>{dots}{axes}</svg>'
 
 
 def describe(
