@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -31,7 +32,7 @@ from log2sim.synth.terrain import Surface
 from log2sim.synth.traffic import TrafficScene, draw_scene, rig_of
 from log2sim.synth.traffic_data import TrafficSettings, draw_traffic, write_traffic
 from log2sim.synth.traffic_picture import TrafficPainter
-from log2sim.synth.traffic_shapes import KINDS
+from log2sim.synth.traffic_shapes import KINDS, building
 
 FLAT = Surface(np.zeros(5), np.zeros((0, 4)), (), 0.0)
 EXACT = ReturnModel(noise_m=0.0, dropout=0.0, mixed=0.0)
@@ -235,6 +236,38 @@ def test_boxes_in_space_project_into_boxes_in_the_picture(
         fills += (area[0] / area[1])[vehicle].tolist()
     assert len(fills) >= 4
     assert np.median(fills) > 0.5
+
+
+def test_scenes_are_the_same_by_any_number_of_processes(tmp_path: Path) -> None:
+    settings = TrafficSettings("roadside", 3, 5, layout="log2sim", duration_s=0.5, pictures=False)
+    for jobs in (1, 2):
+        write_traffic(settings, tmp_path / str(jobs), jobs=jobs)
+    one, two = (
+        {p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in sorted(tmp_path.iterdir())
+    )
+    assert one == two
+    assert len(json.loads((tmp_path / "1" / "traffic.json").read_text())["scenes"]) == 3
+
+
+def test_rays_meet_what_is_in_the_recess_of_an_entrance() -> None:
+    """Beside the entrance the front is whole; in it rays go on to what fills it and to the wall behind, no farther."""
+    places, depths = [], []
+    for seed in range(12):
+        house = Solid(
+            building(8.0, [0.0], np.random.default_rng(seed)),
+            np.array([0.0, 10.0, 0.0]),
+            0.0,
+            np.zeros(2),
+            glass_passes=1.0,
+        )
+        cloud = cast_polytopes(FINE, sensor(), [house], FLAT, np.random.default_rng(0), EXACT)
+        x, y, z = cloud.xyz_m[cloud.hit == 0].T
+        places.append(np.abs(x[(z > 0.8) & (z < 1.8)]))
+        depths.append(y[(z > 0.8) & (z < 1.8)] - 10.0)
+    place, depth = np.concatenate(places), np.concatenate(depths)
+    assert depth[place > 2.0].max() < 0.1
+    assert 0.1 < np.median(depth[place < 0.4]) < 2.5
+    assert depth.max() < 2.6
 
 
 def test_a_body_behind_another_is_hidden_and_a_net_is_seen_through() -> None:

@@ -110,6 +110,8 @@ def synth(
     no_pictures: Annotated[bool, opt.option(
         "Write no cameras: LiDAR sweeps, poses and labels alone.", None, "--no-pictures")] = False,
     seed: Annotated[int, opt.option("Seed of all random numbers.", min=0)] = 0,
+    jobs: Annotated[int | None, opt.option(
+        "Processes that write random scenes.", "N", min=1, default="one for each core")] = None,
     overwrite: opt.Overwrite = False,
 ) -> None:  # fmt: skip
     """Generate a synthetic log with exact ground truth, or random traffic for training and tests.
@@ -125,7 +127,7 @@ def synth(
 
     if (scene is None) == (traffic is None):
         raise ConfigError("give either a scene file or --traffic vehicle or --traffic roadside")
-    random = {"--scenes": scenes, "--sensor": sensor, "--layout": layout, "--duration": duration}
+    random = {"--scenes": scenes, "--sensor": sensor, "--layout": layout, "--duration": duration, "--jobs": jobs}
     given = [name for name, value in random.items() if value is not None]
     if scene is not None and given:
         raise ConfigError(f"{', '.join(given)}: for random scenes of --traffic; the file of a scene says what is in it")
@@ -145,11 +147,13 @@ def synth(
                 progress=partial(report_progress, "synthesize"),
             )
         elif traffic is not None:
+            from log2sim.files.processes import default_jobs
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic
 
             chosen = layout or ("log2sim" if no_pictures else "kitti")
             settings = TrafficSettings(
                 traffic, scenes or 10, seed, sensor, chosen, duration or 5.0, light, weather, pictures=not no_pictures
             )  # fmt: skip
-            write_traffic(settings, out, overwrite=overwrite, progress=partial(report_progress, "scenes"))
+            report = partial(report_progress, "scenes")
+            write_traffic(settings, out, overwrite=overwrite, progress=report, jobs=jobs or default_jobs())
     opt.report_written(out)

@@ -387,7 +387,11 @@ def _fronts(out: _Layout, road: Road) -> None:
             clear = out.is_free(_covering(xy, direction, (length, 2.0, 1.0)), 0.3)
             if clear and not out.on_road(xy):
                 if style < 0.5 and rng.random() < 0.85:
-                    out.add_thing("building", xy, yaw, clutter.building(length, rng))
+                    entrances = rng.uniform(-0.45, 0.45, rng.choice(4, p=[0.5, 0.25, 0.15, 0.1])) * length
+                    out.add_thing("building", xy, yaw, clutter.building(length, entrances.tolist(), rng))
+                    for x in entrances[rng.random(len(entrances)) < 0.2]:
+                        place = xy + rotation_from_rpy(0.0, 0.0, yaw)[:2, :2] @ [x, rng.uniform(-0.8, 0.2)]
+                        out.add_user("pedestrian", place, yaw - np.pi / 2 + rng.normal(0, 1.0), margin=0.0)
                 elif style < 0.85 and rng.random() < 0.75:
                     out.add_thing("fence", xy, yaw, clutter.fence(length, rng))
                 for _ in range(rng.poisson(1.0) if at_walls else 0):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from log2sim.datatypes import EgoVehicle, ImageLabels, Labels, Lidar, Log, Strea
 from log2sim.errors import ConfigError
 from log2sim.files.documents import check_folder, refuse_folder
 from log2sim.files.outputs import replaced_folder
+from log2sim.files.processes import map_in_processes
 from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, apply, inverse, rotation_from_rpy, transform
 from log2sim.synth import traffic
 from log2sim.synth.light import light_of
@@ -361,15 +362,13 @@ class TrafficSettings:
 
 
 def write_traffic(
-    settings: TrafficSettings, out: Path, *, overwrite: bool = False, progress: Progress | None = None
+    settings: TrafficSettings, out: Path, *, overwrite: bool = False, progress: Progress | None = None, jobs: int = 1
 ) -> None:
-    """Write random scenes below a folder, whole or not at all; the same settings write the same bytes.
+    """Write random scenes below a folder, whole or not at all, by so many processes; the same settings write the same bytes.
 
     Raises `ConfigError` for an unknown sensor, KITTI's layout without pictures, or when the folder may not be replaced
     or cannot be written.
     """
-    from log2sim.logs.native.writer import write_log
-
     if settings.layout == "kitti" and not settings.pictures:
         raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")
     traffic.sensor_named(settings.sensor, settings.mount)
@@ -377,24 +376,10 @@ def write_traffic(
     check_folder(out, overwrite=overwrite)
     with replaced_folder(out, overwrite=overwrite) as folder:
         scenes = []
-        for index in range(settings.scenes):
-            scene, environment = draw_traffic(settings, index)
-            seed = int(np.random.default_rng([settings.seed, index, 2]).integers(2**31))
-            if settings.layout == "kitti":
-                write_frame(folder / "training", index, scene, environment, seed)
-            else:
-                name, pictures = f"scene_{index:06d}", settings.pictures
-                log = log_of(scene, environment, name, settings.duration_s, seed, image_labels=pictures)
-                if not pictures:
-                    sweeps = {lidar: log.streams[lidar] for lidar in log.lidars}
-                    log = log.changed(cameras={}, streams=sweeps, image_labels={}, reference_camera=None)
-                write_log(log, folder / name)
-            users = [o.category for o in scene.objects if o.category]
-            counts = {category: users.count(category) for category in sorted(set(users))}
-            about = {"environment": environment.model_dump(), "lidar": scene.lidar.name, "road_users": counts}
-            scenes.append({"name": f"{index:06d}", **about})
+        for scene in map_in_processes(partial(_write_scene, settings, folder), range(settings.scenes), jobs):
+            scenes.append(scene)
             if progress is not None:
-                progress(index + 1, settings.scenes)
+                progress(len(scenes), settings.scenes)
         if settings.layout == "kitti":
             # Lists of frames that readers of this layout look for: a random half for training, the other to validate.
             order = np.random.default_rng([settings.seed, 3]).permutation(settings.scenes)
@@ -406,6 +391,27 @@ def write_traffic(
         manifest = {"format": FORMAT, "version": VERSION, "mount": settings.mount, "layout": settings.layout}
         manifest |= {"seed": settings.seed, "sensor": settings.sensor, "scenes": scenes}
         (folder / MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_scene(settings: TrafficSettings, folder: Path, index: int) -> dict[str, Any]:
+    """Write one scene, and return its entry in the manifest."""
+    from log2sim.logs.native.writer import write_log
+
+    scene, environment = draw_traffic(settings, index)
+    seed = int(np.random.default_rng([settings.seed, index, 2]).integers(2**31))
+    if settings.layout == "kitti":
+        write_frame(folder / "training", index, scene, environment, seed)
+    else:
+        name, pictures = f"scene_{index:06d}", settings.pictures
+        log = log_of(scene, environment, name, settings.duration_s, seed, image_labels=pictures)
+        if not pictures:
+            sweeps = {lidar: log.streams[lidar] for lidar in log.lidars}
+            log = log.changed(cameras={}, streams=sweeps, image_labels={}, reference_camera=None)
+        write_log(log, folder / name)
+    users = [o.category for o in scene.objects if o.category]
+    counts = {category: users.count(category) for category in sorted(set(users))}
+    about = {"environment": environment.model_dump(), "lidar": scene.lidar.name, "road_users": counts}
+    return {"name": f"{index:06d}", **about}
 
 
 def draw_traffic(settings: TrafficSettings, index: int) -> tuple[traffic.TrafficScene, Environment]:

@@ -6,7 +6,7 @@ Directive 96/53/EC.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -443,23 +443,43 @@ def fence(length: float, rng: Rng) -> Parts:
             box((-half, -0.04, 0.5), (half, 0.04, 0.8), METAL),
             *(box((x - 0.05, -0.08, 0), (x + 0.05, 0.0, 0.75), METAL) for x in np.arange(-half + 0.5, half, 2.0)),
         )
-    posts = tuple(column(0.04, (0, height), METAL, at=(x, 0.0)) for x in np.arange(-half, half + 0.1, 2.5))
+    posts = [column(0.04, (0, height), METAL, at=(x, 0.0)) for x in np.arange(-half, half + 0.1, 2.5)]
+    if rng.random() < 0.3:
+        # A gate between pillars, one with a letterbox or a bell.
+        wide, thick = min(rng.uniform(0.9, 4.0), length) / 2, rng.uniform(0.04, 0.25)
+        posts += [block(x, 0.0, thick, thick, (0, height + rng.uniform(-0.2, 0.3)), WALL) for x in (-wide, wide)]
+        posts.append(
+            block(wide, -thick, rng.uniform(0.1, 0.25), rng.uniform(0.05, 0.2), (0.7, rng.uniform(1.0, 1.6)), METAL)
+        )
     return (box((-half, -0.02, 0.1), (half, 0.02, height), MESH), *posts)
 
 
-def building(length: float, rng: Rng) -> Parts:
-    """Draw a house front along x that faces -y, with windows, a bay or an entrance, pilasters or downpipes."""
+def building(length: float, entrances: Sequence[float], rng: Rng) -> Parts:
+    """Draw a house front along x that faces -y, with windows, bays, pilasters or downpipes, and recesses about the x of entrances."""
     # Garages and sheds are as high as trucks and buses.
     half, height, depth = length / 2, rng.uniform(3.5, 16.0) if rng.random() < 0.75 else rng.uniform(2.0, 3.8), 6.0
-    parts = [box((-half, 0, 0), (half, depth, height), WALL)]
-    if rng.random() < 0.5:
-        x = rng.uniform(-half * 0.6, half * 0.6)
-        parts.append(box((x - 0.8, -rng.uniform(0.2, 1.2), 0), (x + 0.8, 0.1, rng.uniform(1.0, 3.2)), WALL))
+    recess = rng.uniform(0.15, 0.8) if rng.random() < 0.7 else rng.uniform(0.8, 2.5)
+    parts, edge = [box((-half, recess if len(entrances) else 0, 0), (half, depth, height), WALL)], -half
+    for x in sorted(entrances):
+        wide = rng.uniform(0.4, 0.7) if rng.random() < 0.6 else rng.uniform(0.6, 1.6)
+        low, high, top = max(x - wide, edge), min(x + wide, half), min(rng.uniform(1.9, 3.2), height - 0.1)
+        if high - low > 0.5:
+            parts += [box((edge, 0, 0), (low, recess, height), WALL)] if low > edge else []
+            parts += [box((low, 0, top), (high, recess, height), WALL), *_entrance(low, high, recess, top, rng)]
+            edge = high
+    if len(entrances) and edge < half:
+        parts.append(box((edge, 0, 0), (half, recess, height), WALL))
     # Wings, bays and porches, as wide and as far out as a side or a rear of a vehicle.
     for x in rng.uniform(-half, half, rng.choice(4, p=[0.5, 0.25, 0.15, 0.1])):
         wide, tall = min(rng.uniform(0.8, 6.0), length) / 2, rng.uniform(1.8, 4.0) if rng.random() < 0.5 else height
         parts.append(box((x - wide, -rng.uniform(0.3, 2.5), 0), (x + wide, 0.1, tall), WALL))
-    parts += [box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)][:2]
+    if not len(entrances):
+        parts += [
+            box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)
+        ][:2]
+        if rng.random() < 0.5:
+            x = rng.uniform(-half * 0.6, half * 0.6)
+            parts.append(box((x - 0.8, -rng.uniform(0.2, 1.2), 0), (x + 0.8, 0.1, rng.uniform(1.0, 3.2)), WALL))
     if rng.random() < 0.3:
         parts.append(box((-half, -1.5, 2.8), (half, 0.1, 3.0), WALL))
     if rng.random() < 0.4:
@@ -467,6 +487,27 @@ def building(length: float, rng: Rng) -> Parts:
         for x in rng.uniform(-half, half, rng.integers(1, 5)):
             parts.append(box((x - width / 2, -out, 0), (x + width / 2, 0.1, height), WALL))
     return tuple(parts)
+
+
+def _entrance(low: float, high: float, recess: float, top: float, rng: Rng) -> list[Polytope]:
+    """Draw what fills an opening of a front: steps and a leaf that is ajar, or a window with goods and mannequins behind it."""
+    middle, half = (low + high) / 2, (high - low) / 2
+    parts: list[Polytope] = []
+    if rng.random() < 0.55:
+        steps = range(rng.integers(0, 4))
+        parts += [box((low - 0.1, -0.3 * (k + 1), 0), (high + 0.1, recess, 0.5 - 0.16 * k), WALL) for k in steps]
+        if rng.random() < 0.4:
+            at = rng.uniform(0.0, recess)
+            parts.append(box((low, at, 0), (middle if rng.random() < 0.5 else high, at + 0.05, top), WOOD))
+    else:
+        sill = rng.uniform(0.05, 0.9)
+        parts += [box((low, 0, 0), (high, recess, sill), WALL), box((low, 0.02, sill), (high, 0.06, top), GLASS)]
+    for x in rng.uniform(middle - 0.8 * half, middle + 0.8 * half, rng.integers(0, 4)):
+        radius, tall, y = rng.uniform(0.05, 0.3), rng.uniform(0.3, 1.9), rng.uniform(0.3, 1.0) * recess
+        parts.append(column(radius, (0.0, tall), WOOD, at=(x, y)))
+        if rng.random() < 0.3:
+            parts.append(ellipsoid((0.1, 0.1, 0.13), (x, y, tall + 0.15), WOOD))
+    return parts
 
 
 def own_car(height: float, rng: Rng) -> Parts:

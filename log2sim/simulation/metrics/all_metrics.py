@@ -168,7 +168,9 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     # What the actuators do between two states shows in the speed at its end, so the larger of both speeds says if it moves.
     speed, before = np.abs(ego.speed_mps), np.r_[ego.speed_mps[:1], ego.speed_mps[:-1]]
     moves = np.maximum(speed, np.abs(before)) > MIN_SPEED_MPS
-    brake = np.where(moves, -ego.accel_mps2 * np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, before)), 0.0).round(3)
+    brake = np.where(
+        moves, -ego.accel_mps2 * np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, before)), 0.0
+    ).round(3)
     k, hardest = int(np.argmax(brake)) if len(brake) else 0, None
     if len(brake) and brake[k] > 0:
         hardest = {"mps2": float(brake[k]), "t_s": round(float(ego.t_s[k]), 6)}
