@@ -91,6 +91,15 @@ def test_the_calibration_error_of_two_bins_by_hand():
     assert [b["right"] for b in table["bins"]].count(None) == 8
 
 
+def test_right_confidences_have_the_calibration_error_that_is_said_to_be_by_chance():
+    rng = np.random.default_rng(0)
+    confidence = rng.uniform(0, 1, 240) ** 0.5
+    tables = [reliability(confidence, rng.random(240) < confidence) for _ in range(300)]
+    found = np.mean([t["expected_calibration_error"] for t in tables])
+    assert found == pytest.approx(tables[0]["error_by_chance"], rel=0.05)
+    assert found > 0.03
+
+
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
 def test_errors_drawn_from_their_sigma_have_a_nees_of_one(factor):
     rng = np.random.default_rng(1)

@@ -236,12 +236,13 @@ def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> No
         return say(f"{title}: none of {len(agents)} kept")
     right, p, ticks = np.array([a.right for a in of]), p[kept], ticks[kept]
     doubted = (p < 0.5) | [a.doubted for a in of]
-    error = reliability(p, right >= 1 - MAX_WRONG_SHARE)["expected_calibration_error"]
+    table = reliability(p, right >= 1 - MAX_WRONG_SHARE)
     wrong, good = ticks * (1 - right), ticks * right
     say(
         f"{title}: {len(of)} of {len(agents)} kept, {recall:.2f} of what is there, {invented:.3f} of these ticks invented, "
         f"{wrong.sum() / ticks.sum():.3f} wrong; doubted {wrong[doubted].sum() / max(wrong.sum(), 1):.2f} of wrong, "
-        f"{good[doubted].sum() / max(good.sum(), 1):.3f} of right ticks; calibration error of agents {error:.3f}"
+        f"{good[doubted].sum() / max(good.sum(), 1):.3f} of right ticks; calibration error of agents "
+        f"{table['expected_calibration_error']:.3f} (by chance {table['error_by_chance']:.3f})"
     )
 
 

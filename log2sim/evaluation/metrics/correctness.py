@@ -28,12 +28,13 @@ CHI2_95 = {1: 3.841, 2: CHI2_2DOF_95}
 def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
     """Compare confidences (N,) in [0, 1] with what is right (N,).
 
-    Returns "count", "expected_calibration_error" (None without any), and "bins" of equal width from 0 to 1 with "low",
-    "high", "count", "mean_confidence" and "right" (None in empty bins).
+    Returns "count", "expected_calibration_error" (None without any), "error_by_chance" (likewise), which right confidences of as
+    many that are independent would have on average, and "bins" of equal width from 0 to 1 with "low", "high", "count",
+    "mean_confidence" and "right" (None in empty bins).
 
     Expected calibration error (Naeini, Cooper, Hauskrecht, AAAI 2015; Guo et al., ICML 2017): the mean over all of the
     difference between the mean confidence and the share of right ones in their bin. What lies outside 0 to 1 is in the
-    outermost bins. Bins of few have an error by chance alone: sqrt(p (1 - p) / count) for a share p.
+    outermost bins. The number of right ones in a bin is nearly normal, whose mean absolute deviation is sqrt(2 / pi) sigma.
     """
     of_bin = np.clip((confidence * BINS).astype(np.int64), 0, BINS - 1)
     count = np.bincount(of_bin, minlength=BINS)
@@ -43,8 +44,12 @@ def reliability(confidence: Array, right: Mask) -> dict[str, Any]:
         mean, share = (float(column[k] / n) if n else None for column in (sums, rights))
         span = {"low": k / BINS, "high": (k + 1) / BINS}
         bins.append({**span, "count": n, "mean_confidence": mean, "right": share})
-    error = float(np.abs(sums - rights).sum() / len(right)) if len(right) else None
-    return {"count": len(right), "expected_calibration_error": error, "bins": bins}
+    variance = np.bincount(of_bin, weights=np.clip(confidence * (1 - confidence), 0, None), minlength=BINS)
+    error, chance = (
+        float(off.sum() / len(right)) if len(right) else None
+        for off in (np.abs(sums - rights), np.sqrt(2 / np.pi * variance))
+    )
+    return {"count": len(right), "expected_calibration_error": error, "error_by_chance": chance, "bins": bins}
 
 
 def normalized_errors(error: Array, sigma: Array) -> dict[str, Any]:

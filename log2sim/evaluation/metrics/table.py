@@ -58,9 +58,9 @@ def correctness_lines(found: Mapping[str, Any]) -> list[str]:
     confused = f"class: {', '.join(taken)}" if taken else ""
     # For each tenth of confidence how many ticks and agents are right.
     ticks, agents = found["calibration"]["ticks"], found["calibration"]["agents"]
-    error_of_ticks, error_of_agents = (table["expected_calibration_error"] for table in (ticks, agents))
     calibration = [
-        f"confidence: expected calibration error {error_of_ticks:.3f} of ticks, {error_of_agents:.3f} of agents",
+        f"confidence: expected calibration error {ticks['expected_calibration_error']:.3f} of ticks, "
+        f"{agents['expected_calibration_error']:.3f} of agents (by chance {agents['error_by_chance']:.3f})",
         *(
             f"  {a['low']:.1f}-{a['high']:.1f}: {cell(a['right'], 3)} of {a['count']} ticks right, "
             f"{cell(b['right'], 3)} of {_noun(b['count'], 'agent')}"
