@@ -22,7 +22,7 @@ from log2sim.synth.actors import MovingScene
 from log2sim.synth.backdrop import draw_terrain
 from log2sim.synth.light import FAR_M, NOON, RenderCamera
 from log2sim.synth.polytope_caster import SensorState, Solid, cast_polytopes
-from log2sim.synth.polytopes import Material, box, meshes_of
+from log2sim.synth.polytopes import Material, box, column, meshes_of
 from log2sim.synth.raster import nearest_of
 from log2sim.synth.raycast import BUILDING, cast_sweep
 from log2sim.synth.render import DEPTH_M, LENS_SPACING_M, WIDTH_M, Body, SceneInstant, samples_of, segment, signals_of
@@ -268,6 +268,25 @@ def test_rays_meet_what_is_in_the_recess_of_an_entrance() -> None:
     assert depth[place > 2.0].max() < 0.1
     assert 0.1 < np.median(depth[place < 0.4]) < 2.5
     assert depth.max() < 2.6
+
+
+def test_distances_err_where_an_outline_cuts_beams_and_hardly_on_a_wall() -> None:
+    """As in KITTI's sweeps: by 0.1 m on a post, by a few centimeters on a wall; never beyond what is behind."""
+    post = solid([column(0.05, (0, 1.2), Material.METAL)], (12.0, 0.0), 0.0)
+    wall = solid([box((0, -8, 0), (0.2, 8, 4), Material.WALL)], (12.5, 0.0), 0.0)
+    errs = ReturnModel(noise_m=0.02, dropout=0.0, mixed=0.0, line_m=0.03, walk_m=0.02, edge_m=0.1)
+    exact, found = (
+        cast_polytopes(lidar_model("hdl64e"), sensor(1.7), [post, wall], FLAT, np.random.default_rng(0), returns)
+        for returns in (EXACT, errs)
+    )
+    assert (found.hit == exact.hit).all()
+    error = np.linalg.norm(found.xyz_m - [0, 0, 1.7], axis=1) - np.linalg.norm(exact.xyz_m - [0, 0, 1.7], axis=1)
+    on_post, inside = found.hit == 0, (found.hit == 1) & (np.abs(np.abs(exact.xyz_m[:, 1]) - 3) < 2)
+    assert on_post.sum() > 30
+    assert 0.03 < error[inside].std() < 0.05
+    assert 0.06 < error[on_post].std() < 0.15
+    assert error[on_post].mean() > 0.02
+    assert error[on_post].max() < 0.5 + 4 * 0.036 + 0.05
 
 
 def test_a_body_behind_another_is_hidden_and_a_net_is_seen_through() -> None:

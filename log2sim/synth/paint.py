@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from log2sim.geometry import Array
 from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground, Surface
+from log2sim.synth.returns import BEAM_RAD
 from log2sim.synth.scene import AgentSpec
 from log2sim.synth.shapes import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line
 
@@ -254,7 +255,6 @@ AIR_REFLECTANCE = 0.02
 WET_SHARE, WET_BEADS = 0.5, 0.1  # of a wet road's return, and of what beads add to it
 SPECKLE = 0.15  # standard deviation of a return relative to its mean
 INCIDENCE_POWER = 0.7  # of rough surfaces, as in `log2sim.synth.returns`
-BEAM_RAD = 0.003  # divergence, as makers of spinning sensors state it
 MAX_LEVEL = 4
 
 

@@ -256,9 +256,11 @@ def cast_polytopes(
     signal = reflected(t, reflectance, rays.incidence[line, firing], weather)
     kept = detected(signal, returns, rng) | air
     line, firing, t, hit, reflectance = line[kept], firing[kept], t[kept], hit[kept], reflectance[kept]
-    intensity = np.clip(reflectance * rays.incidence[line, firing], 0.003, 1)
-    t = disturbed(t, returns, rng)
+    intensity = np.clip(reflectance * rays.incidence[line, firing], 0.003, 1).astype(np.float32)
+    ahead = np.minimum(hit_range, np.float32(model.range_m))
+    gap = np.maximum(np.roll(ahead, 1, axis=1), np.roll(ahead, -1, axis=1)) - ahead
+    t = disturbed(t, intensity, line, np.maximum(gap, 0)[line, firing], model, returns, rng)
     t_s = rays.column_s[firing]
     start = sensor.position_m.astype(np.float32) + t_s[:, None] * np.append(sensor.velocity_mps, 0).astype(np.float32)
     xyz = start + t[:, None] * rays.direction[line, firing]
-    return Returns(xyz, intensity.astype(np.float32), t_s, hit, line.astype(np.int32))
+    return Returns(xyz, intensity, t_s, hit, line.astype(np.int32))

@@ -459,21 +459,20 @@ def building(length: float, entrances: Sequence[float], rng: Rng) -> Parts:
     # Garages and sheds are as high as trucks and buses.
     half, height, depth = length / 2, rng.uniform(3.5, 16.0) if rng.random() < 0.75 else rng.uniform(2.0, 3.8), 6.0
     recess = rng.uniform(0.15, 0.8) if rng.random() < 0.7 else rng.uniform(0.8, 2.5)
-    parts, edge = [box((-half, recess if len(entrances) else 0, 0), (half, depth, height), WALL)], -half
+    parts, edge = [box((-half, recess, 0), (half, depth, height), WALL)], -half
     for x in sorted(entrances):
         wide = rng.uniform(0.4, 0.7) if rng.random() < 0.6 else rng.uniform(0.6, 1.6)
         low, high, top = max(x - wide, edge), min(x + wide, half), min(rng.uniform(1.9, 3.2), height - 0.1)
         if high - low > 0.5:
-            parts += [box((edge, 0, 0), (low, recess, height), WALL)] if low > edge else []
-            parts += [box((low, 0, top), (high, recess, height), WALL), *_entrance(low, high, recess, top, rng)]
+            parts += [box((edge, 0, 0), (low, recess, height), WALL), box((low, 0, top), (high, recess, height), WALL)]
+            parts += _entrance(low, high, recess, top, rng)
             edge = high
-    if len(entrances) and edge < half:
-        parts.append(box((edge, 0, 0), (half, recess, height), WALL))
+    parts.append(box((edge, 0, 0), (half, recess, height), WALL))
     # Wings, bays and porches, as wide and as far out as a side or a rear of a vehicle.
     for x in rng.uniform(-half, half, rng.choice(4, p=[0.5, 0.25, 0.15, 0.1])):
         wide, tall = min(rng.uniform(0.8, 6.0), length) / 2, rng.uniform(1.8, 4.0) if rng.random() < 0.5 else height
         parts.append(box((x - wide, -rng.uniform(0.3, 2.5), 0), (x + wide, 0.1, tall), WALL))
-    if not len(entrances):
+    if not entrances:
         parts += [
             box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)
         ][:2]
