@@ -103,6 +103,7 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
 ) -> None:
     """In a quarter of a minute, from a few scenes, on others: places take more steps."""
     from training import refinement
+    from training.fitting import FitPlan
 
     from log2sim.config import LidarConfig
     from log2sim.perception.detect3d.detectors import WEIGHTS, open_network
@@ -111,7 +112,12 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
     first.write_bytes((WEIGHTS / "roadside.onnx").read_bytes())
     monkeypatch.setattr(refinement, "PER_SHARD", 20)
     refinement.generate("roadside", first, tmp_path, 20, 5)
-    weights = refinement.train("roadside", tmp_path, 20, 150, 5, None)
+    plan = FitPlan(150, 5, refinement.RATE, tmp_path / "refinement.pt", 100)
+    weights = refinement.train("roadside", tmp_path, 20, plan, None, None)
+    # What goes on from these for a step at hardly any rate is the same.
+    still = FitPlan(1, 5, 1e-9, warm_up_steps=1)
+    again = refinement.train("roadside", tmp_path, 20, still, None, tmp_path / "refinement.pt")
+    torch.testing.assert_close(again["boxes.0.weight"], weights["boxes.0.weight"], atol=1e-3, rtol=0)
     refinement.finish("roadside", first, tmp_path, weights, {"seed": 5}, 4)
     card = json.loads((tmp_path / "roadside.boxes.json").read_text())
     assert card["simulated"]["scenes"] == 4

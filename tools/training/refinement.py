@@ -1,8 +1,8 @@
 """Train the second stage of a LiDAR detector, a network on the points of boxes, on simulated clouds.
 
-    python tools/train.py refinement vehicle DIR                           # that which ships: 40 minutes of two cores
-    python tools/train.py refinement roadside DIR                          # likewise
-    python tools/train.py refinement vehicle DIR --scenes 200 --steps 300  # a toy
+    python tools/train.py refinement vehicle DIR --steps 20000                         # an hour of two cores
+    python tools/train.py refinement vehicle DIR --steps 20000 --start OTHER/refinement.pt   # goes on from another run
+    python tools/train.py refinement vehicle DIR --scenes 200 --steps 300              # a toy
 
 It learns from the boxes that the first stage, the shipped network or that of --first, finds in scenes of its own seed. Generating resumes,
 beside the fit in a process of its own, as does the fit. The network is left in DIR with its first stage.
@@ -56,7 +56,7 @@ NAMES = [category for group in CATEGORIES.values() for category in group]
 PER_SHARD = 100
 STEPS_PER_SHARD = 50
 BATCH = 512
-RATE = 2e-3
+RATE, START_RATE = 2e-3, 1e-3
 POINTS = 64
 WIDTHS = (48, 96, 128, 96)  # channels of three layers for each point, and of two for each box
 # What a box is of has its center within this part of its longer side, or this far, m: a neighbor is another.
@@ -308,15 +308,21 @@ def overlap_of(out: Tensor, target: Tensor, size: Tensor) -> Tensor:
 
 
 def train(
-    mount: str, out: Path, scenes: int, steps: int, seed: int, generator: Popen[bytes] | None
+    mount: str, out: Path, scenes: int, plan: FitPlan, generator: Popen[bytes] | None, start: Path | None
 ) -> dict[str, Tensor]:
-    """Fit the network to the shards, of which each step may use as many as its number allows; waits for those that are being made."""
-    torch.manual_seed(seed)
+    """Fit the network to the shards, of which each step may use as many as its number allows; waits for those that are being made.
+
+    It goes on from the means of the checkpoint `start`, if one is given.
+    """
+    torch.manual_seed(plan.seed)
+    network = RefinementNetwork()
+    if start is not None:
+        network.load_state_dict(torch.load(start, weights_only=True)["mean"])
     shards: list[dict[str, NDArray[Any]]] = []
 
     def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         while len(shards) < min(math.ceil(scenes / PER_SHARD), 4 + step // STEPS_PER_SHARD):
-            with np.load(wait_for(shard_path(out, mount, seed, len(shards)), generator)) as data:
+            with np.load(wait_for(shard_path(out, mount, plan.seed, len(shards)), generator)) as data:
                 shards.append({name: data[name] for name in data.files})
         shard = shards[rng.integers(len(shards))]
         # Objects twice as often as what is none.
@@ -325,7 +331,7 @@ def train(
         points, box, *targets = drawn(shard, rows, rng)
         return loss_of(network(points, box), *targets)
 
-    return fit(RefinementNetwork(), step_loss, FitPlan(steps, seed, RATE, out / "refinement.pt", 100))
+    return fit(network, step_loss, plan)
 
 
 def finish(
@@ -369,21 +375,21 @@ def finish(
 
 
 def main(
-    mount: Mount, out: Path, scenes: int = 8000, steps: int = 14_000, seed: int = 47, first: Path | None = None, examples: int = 150,
-    only_generate: bool = False,
+    mount: Mount, out: Path, scenes: int = 8000, steps: int = 20_000, seed: int = 47, first: Path | None = None,
+    start: Path | None = None, examples: int = 150, only_generate: bool = False,
 ) -> None:  # fmt: skip
     """Generate, fit and export."""
     out.mkdir(parents=True, exist_ok=True)
-    start = first or WEIGHTS / f"{mount}.onnx"
     # Without the second stage that may be there already.
     bare = out / "first.onnx"
     if not bare.exists():
-        shutil.copyfile(start, bare)
+        shutil.copyfile(first or WEIGHTS / f"{mount}.onnx", bare)
     if only_generate:
         return generate(mount, bare, out, scenes, seed)
     generator = Popen([sys.executable, *sys.argv, "--only-generate"])
     try:
-        weights = train(mount, out, scenes, steps, seed, generator)
+        plan = FitPlan(steps, seed, RATE if start is None else START_RATE, out / "refinement.pt", 100)
+        weights = train(mount, out, scenes, plan, generator, start)
     finally:
         generator.terminate()
     card = {
@@ -391,10 +397,13 @@ def main(
         "seed": seed,
         "scenes": scenes,
         "steps": steps,
-        "rate": RATE,
+        "rate": plan.peak_rate,
         "batch": BATCH,
         "widths": WIDTHS,
         "torch": torch.__version__,
     }
+    if start is not None:
+        before = json.loads((start.parent / f"{mount}.boxes.json").read_text())
+        card["start"] = {key: value for key, value in before.items() if key != "simulated"}
     finish(mount, bare, out, weights, card, examples)
     return None
