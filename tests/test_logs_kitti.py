@@ -69,7 +69,7 @@ def test_labels_become_boxes_in_the_map(tracking: Path) -> None:
     assert labels.category.tolist() == ["car", "pedestrian"]
     assert labels.kind.tolist() == ["Van", "Person_sitting"]
     assert labels.occlusion.tolist() == [1, 2]
-    assert labels.never_labeled == ("bicycle",)
+    assert labels.never_labeled == ("bicycle", "motorcycle")
     assert labels.t_ns.tolist() == [100_000_000, 200_000_000]
     np.testing.assert_allclose(labels.size_m[0], [4.4, 1.8, 2.0])
     map_T_cam, _ = log.map_T_sensor("image_02", labels.t_ns[:1])

@@ -199,8 +199,8 @@ CATEGORY_OF = {
     "Person_sitting": "pedestrian", "Cyclist": "cyclist", "Tram": "other", "Misc": "other",
 }  # fmt: skip
 NOT_LABELED = "DontCare"
-NEVER_LABELED = ("bicycle",)
-"""No class is for bicycles without riders (Geiger et al., "Vision meets robotics", 2013, section III)."""
+NEVER_LABELED = ("bicycle", "motorcycle")
+"""No class is for bicycles without riders, nor for motorcycles (Geiger et al., "Vision meets robotics", 2013, section III)."""
 
 LABEL_FIELDS = 17
 RESULT_FIELDS = 18
