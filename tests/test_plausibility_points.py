@@ -151,8 +151,8 @@ def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(
     )
     assert gather([seen], recording)["confirmed"] == [confirmed]
     # Of few points what keeps its place before the sensor moves no more than what stays; more would stay behind if it did not move.
+    # Poses drift by 1.5 m in 4 s.
     m = track.measurements
-    # 1.5 m in 4 s are what poses drift by.
     for points, moves in ((3, False), (40, way_m > 1.5)):
         carried = replace(m, sensor_m=m.center_m - [20.0, 0.0, 0.0], points=np.full(5, points))
         table = gather([replace(seen, track=replace(track, measurements=carried))], recording)

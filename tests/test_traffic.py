@@ -271,7 +271,7 @@ def test_rays_meet_what_is_in_the_recess_of_an_entrance() -> None:
 
 
 def test_distances_err_where_an_outline_cuts_beams_and_hardly_on_a_wall() -> None:
-    """As in KITTI's sweeps: by 0.1 m on a post, by a few centimeters on a wall; never beyond what is behind."""
+    """By 0.1 m on a post, as in KITTI's sweeps, by the noise and the lines on a wall; never beyond what is behind."""
     post = solid([column(0.05, (0, 1.2), Material.METAL)], (12.0, 0.0), 0.0)
     wall = solid([box((0, -8, 0), (0.2, 8, 4), Material.WALL)], (12.5, 0.0), 0.0)
     errs = ReturnModel(noise_m=0.02, dropout=0.0, mixed=0.0, line_m=0.03, walk_m=0.02, edge_m=0.1)

@@ -455,11 +455,10 @@ def draw_scene(
         elif kind < 0.1:
             weather = Environment(weather="rain", rain_mm_h=float(rng.uniform(2, 30)))
     noise = model.noise_m if lidar else float(rng.uniform(0.008, 0.03))
-    # Errors from those of a recent sensor up to one and a half times those of KITTI's, by posts in its sweeps.
+    # Up to one and a half times the errors by which posts spread in depth as in KITTI's sweeps.
     line_m, walk_m, edge_m = rng.uniform(0, (0.045, 0.03, 0.15)).tolist()
-    returns = ReturnModel(
-        noise, float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 0.006)), weather, line_m, walk_m, edge_m
-    )
+    lost, mixed = rng.uniform(0, (0.12, 0.006)).tolist()
+    returns = ReturnModel(noise, lost, mixed, weather, line_m=line_m, walk_m=walk_m, edge_m=edge_m)
     two = mount == "vehicle" and not lidar and rng.random() < 0.2
     second = _draw_second(sensor, sensor_forward, rng) if two else None
     return TrafficScene(mount, roads, surface, tuple(objects), model, sensor, returns, second)
