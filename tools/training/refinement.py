@@ -1,7 +1,7 @@
 """Train the second stage of a LiDAR detector, a network on the points of boxes, on simulated clouds.
 
     python tools/train.py refinement roadside DIR --steps 14000                        # that which ships: half an hour of two cores
-    python tools/train.py refinement vehicle A                                         # 40 minutes; what ships, at commit e1dcbe65
+    python tools/train.py refinement vehicle A --steps 20000                           # 40 minutes; for what ships at commit e1dcbe65
     python tools/train.py refinement vehicle B --steps 6000 --start A/refinement.pt    # and goes on from there
     python tools/train.py refinement vehicle DIR --scenes 200 --steps 300              # a toy
 
