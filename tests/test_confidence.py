@@ -119,6 +119,19 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     assert judge([], None, RECORDING) == []
 
 
+def test_a_few_detections_in_images_say_no_less_than_none_where_others_are_detected():
+    candidate = parked()
+
+    def detected(count: int) -> AgentCandidate:
+        m = candidate.track.measurements
+        m = replace(m, box_yaw_rad=m.yaw_rad, camera=np.where(np.arange(8) < count, "front", ""))
+        return replace(candidate, track=replace(candidate.track, measurements=m))
+
+    none, few, all_ = gather([detected(0), detected(1), detected(8)], RECORDING)["image"]
+    assert none <= few < 0 < all_
+    assert gather([detected(0)], RECORDING)["image"] == 0
+
+
 @given(st.floats(1e-6, 1 - 1e-6))
 def test_one_undoes_the_other_and_a_complement_has_the_opposite_sign(p: float) -> None:
     assert probability_of(log_odds_of(p)) == pytest.approx(p, rel=1e-9)

@@ -41,15 +41,14 @@ class Recording:
 
 
 SIGNS = {
-    "sweep": 1, "weak_sweep": 1, "image": 1, "no_image": -1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
+    "sweep": 1, "weak_sweep": 1, "image": 1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
     "through_gaps": -1, "continued": -1, "remains": -1, "thin": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
 - sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
-  where negative; and of its detections in images. 0 without any.
-- no_image: 1 without any detection in an image, where others have some.
+  where negative; and of its detections in images. 0 without any; in sweeps, few detections in images say no less than none.
 - travel: logarithm of the way of what moves beyond the drift of poses, in units of its length, plus 1: what is mistaken for a road user
   stays where it is, or, of few points, where it is before the sensor.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
@@ -93,7 +92,8 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
         own = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         parts.append(own | _sensed_columns(share, recording))
     table = {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}
-    table["no_image"] *= table["no_image"].min() == 0
+    undetected = np.isnan(table["image"])
+    table["image"] = np.where(undetected, 0.0 if undetected.all() else UNDETECTED, table["image"])
     return table | {
         "missing": missing_nats(table["shown_ticks"], table["image_ticks"]),
         "bias": np.ones(len(candidates)),
@@ -104,6 +104,9 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
 # of ten of clutter. A box of one size that is moved on by its velocity alone seldom does by chance.
 MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), float(log_odds_of(MAX_PROBABILITY))
 
+
+# Log-odds by images of what is in none of them where others are: the ratio of the two weights, as they were fitted.
+UNDETECTED = -1.5
 
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -150,8 +153,9 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
-        "image": float(logit(np.array(shown))) if in_image.any() else 0.0,
-        "no_image": float(not in_image.any()),
+        "image": float(max(logit(np.array(shown)), UNDETECTED if in_sweep.any() else -MAX_LOG_ODDS))
+        if in_image.any()
+        else np.nan,
         "travel": float(np.log1p(way_m / agent.size_m[0])),
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),

@@ -14,7 +14,6 @@ THERE = {
         "sweep": 0.446,
         "weak_sweep": 0.637,
         "image": 0.167,
-        "no_image": -0.248,
         "travel": 0.4,
         "few": -2.44,
         "scatter": -0.142,
