@@ -149,13 +149,11 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     ordinary = geometry.is_likely and group != "pedestrian"
     shown = image_confidence(track)
     sure = shown >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
-    speed_sigma = w.sigma_speed_mps if moving else None
+    least, speed_sigma = UNDETECTED if in_sweep.any() else -MAX_LOG_ODDS, w.sigma_speed_mps if moving else None
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
-        "image": float(max(logit(np.array(shown)), UNDETECTED if in_sweep.any() else -MAX_LOG_ODDS))
-        if in_image.any()
-        else np.nan,
+        "image": max(float(logit(np.array(shown))), least) if in_image.any() else np.nan,
         "travel": float(np.log1p(way_m / agent.size_m[0])),
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
