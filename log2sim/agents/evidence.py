@@ -48,7 +48,8 @@ SIGNS = {
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
 - sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
-  where negative; and of its detections in images. 0 without any; in sweeps, few detections in images say no less than none.
+  where negative; and of its detections in images, for what is in sweeps where positive, since `missing` says what speaks against it.
+  0 without any.
 - travel: logarithm of the way of what moves beyond the drift of poses, in units of its length, plus 1: what is mistaken for a road user
   stays where it is, or, of few points, where it is before the sensor.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
@@ -57,7 +58,7 @@ SIGNS = {
 - unlikely_size: 1 where the observed size is none of its category.
 - odd_size: by how many standard deviations of the category length and width differ from the typical ones.
 - odd_height: root mean square logarithm of the height that its image boxes span where a homography places it, in units of the
-  typical one: at the wrong distance, or on other ground than was thought, it is too high or too low. 0 without any.
+  typical one: at the wrong distance, or on other ground than was thought, it is too high or too low. 0 with few.
 - heading: log-odds that the front is the front; 0 where nothing was decided.
 - other_category: share of its measurements of another category.
 - impossible: 1 where its motion is doubted.
@@ -92,8 +93,6 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
         own = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         parts.append(own | _sensed_columns(share, recording))
     table = {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}
-    undetected = np.isnan(table["image"])
-    table["image"] = np.where(undetected, 0.0 if undetected.all() else UNDETECTED, table["image"])
     return table | {
         "missing": missing_nats(table["shown_ticks"], table["image_ticks"]),
         "bias": np.ones(len(candidates)),
@@ -104,9 +103,6 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
 # of ten of clutter. A box of one size that is moved on by its velocity alone seldom does by chance.
 MATCH_NATS, MAX_LOG_ODDS = float(np.log(0.8 / 0.1)), float(log_odds_of(MAX_PROBABILITY))
 
-
-# Log-odds by images of what is in none of them where others are: the ratio of the two weights, as they were fitted.
-UNDETECTED = -1.5
 
 # Beyond these, more evidence adds nothing: logarithms, standard deviations of sizes, twice or half the typical height, log-odds.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -149,11 +145,12 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     ordinary = geometry.is_likely and group != "pedestrian"
     shown = image_confidence(track)
     sure = shown >= (MIN_IMAGE_CONFIDENCE if ordinary else MIN_SURE_IMAGE_CONFIDENCE)
-    least, speed_sigma = UNDETECTED if in_sweep.any() else -MAX_LOG_ODDS, w.sigma_speed_mps if moving else None
+    by_images = float(logit(np.array(shown))) if in_image.any() else 0.0
+    speed_sigma = w.sigma_speed_mps if moving else None
     columns: dict[str, float] = {
         "sweep": max(sweep, 0.0),
         "weak_sweep": min(sweep, 0.0),
-        "image": max(float(logit(np.array(shown))), least) if in_image.any() else np.nan,
+        "image": max(by_images, 0.0) if in_sweep.any() else by_images,
         "travel": float(np.log1p(way_m / agent.size_m[0])),
         "few": 1.0 / len(m),
         "brief": 1.0 / (1.0 + float(w.t_s[-1] - w.t_s[0])),
@@ -161,7 +158,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
         "sigma": np.log(np.median(w.sigma_xy_m) / 0.1 + 1e-3),
         "unlikely_size": float(not geometry.is_likely),
         "odd_size": float(np.hypot(*odd)),
-        "odd_height": float(np.sqrt(np.mean(high**2))) if placed.any() else 0.0,
+        "odd_height": float(np.sqrt(np.mean(high**2))) if placed.mean() >= MIN_PLACED_SHARE else 0.0,
         "thin": max(thin, 0.0) if group == "pedestrian" else 0.0,
         "heading": float(
             log_odds_of(np.clip(agent.quality.get("heading_confidence", 0.5), MIN_PROBABILITY, MAX_PROBABILITY))
@@ -177,6 +174,8 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     return columns | {name: float(np.clip(columns[name], low, high)) for name, (low, high) in LIMITS.items()}
 
 
+# A smaller share of measurements that a homography placed are boxes of something else; 0.1 to 0.4 give the same (57 simulated logs).
+MIN_PLACED_SHARE = 0.2
 # Fewer points may lie on one side of a person; by so much extents of points err, m.
 MIN_WIDE_POINTS, EXTENT_ERROR_M = 5, 0.05
 
