@@ -17,7 +17,7 @@ from log2sim.agents.hypotheses import Part
 from log2sim.agents.judge import judge, probabilities
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
-from log2sim.agents.weights import RIGHT, THERE, VARIANCES
+from log2sim.agents.weights import CONFIDENCE, RIGHT, THERE, VARIANCES
 from log2sim.datatypes import MAX_SIZE_M, Finding, Log, Track
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
 from log2sim.perception.sync import Schedule
@@ -56,6 +56,7 @@ def test_every_weight_has_the_sign_of_its_reason():
         assert set(table) <= {"bias", *SIGNS}
         assert [name for name, weight in table.items() if SIGNS.get(name, 0) * weight < 0] == []
     assert min(weight for table in VARIANCES.values() for weight in table.values()) >= 0
+    assert min(slope for row in CONFIDENCE.values() for _, slope in row.values()) > 0
 
 
 @settings(deadline=None)

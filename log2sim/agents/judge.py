@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.agents.candidate import AgentCandidate, Timeline, name_agents, spans_of
 from log2sim.agents.evidence import MIN_TENTATIVE_THERE, MIN_THERE, MIN_TICK_RAYS, Recording, Table, gather
 from log2sim.agents.rays import count_at
-from log2sim.agents.weights import RIGHT, THERE, VARIANCES
+from log2sim.agents.weights import CONFIDENCE, RIGHT, THERE, VARIANCES
 from log2sim.datatypes import (
     GROUP_OF,
     MARGIN_S,
@@ -26,7 +26,7 @@ from log2sim.datatypes import (
     Finding,
     Obstacles,
 )
-from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
 from log2sim.geometry import Array, overlap_of_smaller, separating_axes
 
 # Of a long log, so that the memory does not grow with agents times ticks.
@@ -288,14 +288,19 @@ def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[A
 
     Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
     speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
-    is right where it is. Each weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points
-    is rather wrong; without one, nothing has points, and what images say of the distance counts instead: each case has its weights.
+    is right where it is; its log-odds are scaled by group (Platt, "Probabilistic Outputs for Support Vector Machines", 1999). Each
+    weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points is rather wrong; without one,
+    nothing has points, and what images say of the distance counts instead: each case has its weights.
     """
     there, state = (
         np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0) for weights in (THERE, RIGHT)
     )
     there, state = probability_of(there - clutter * (table["confirmed"] == 0)), probability_of(state)
-    return there, np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY)
+    scales = [CONFIDENCE[lidar][group] for group in ("vehicle", "two_wheeler", "pedestrian")]
+    group = np.where(table["pedestrian"] > 0, 2, np.where(table["two_wheeler"] > 0, 1, 0))
+    offset, slope = np.array(scales)[group].T
+    odds = offset + slope * log_odds_of(np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY))
+    return there, np.clip(probability_of(odds), MIN_PROBABILITY, MAX_PROBABILITY)
 
 
 def suffices(there: float, *, confirmed: bool, lidar: bool) -> bool:

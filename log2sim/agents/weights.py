@@ -5,7 +5,8 @@ simulated logs; those without a LiDAR on those of `--logs 110 --seed 12`, after 
 What is `RIGHT` with a LiDAR is of 150 logs, `--logs 80 --seed 13` and `--logs 70 --seed 14`, whose sweeps both stages of the LiDAR detectors had
 searched; what is `THERE` on these, too, gives up logs of a single tick.
 `THERE` tells whether something is where a candidate is, `RIGHT` whether a candidate is right
-where something is; `VARIANCES` weigh the terms of variances.
+where something is; `VARIANCES` weigh the terms of variances. `CONFIDENCE`, offset and slope of the log-odds of agents by group, makes
+their confidences those with which they are right: `tools/fit.py confidence FOLDER --scales` on 150 logs of seeds 21 and 22.
 """
 
 THERE = {
@@ -83,4 +84,9 @@ VARIANCES = {
     "sigma_xy_m": {"given": 3.38, "given_moving": 0.776, "hidden": 0.000732, "range": 0.00563, "wrong": 0.0427},
     "sigma_yaw_rad": {"given": 0.25, "wrong": 0.244},
     "sigma_speed_mps": {"given": 10.1, "standing": 1.57, "moving": 0.27},
+}
+
+CONFIDENCE = {
+    True: {"vehicle": (-0.153, 1.05), "two_wheeler": (-0.258, 1.2), "pedestrian": (0.288, 1.18)},
+    False: {"vehicle": (-0.467, 0.75), "two_wheeler": (0.146, 0.869), "pedestrian": (0.202, 1.0)},
 }

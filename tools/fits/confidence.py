@@ -2,6 +2,7 @@
 
     python tools/fit.py confidence_logs FOLDER --logs 60 --seed 2
     python tools/fit.py confidence FOLDER ... > log2sim/agents/weights.py
+    python tools/fit.py confidence FOLDER ... --scales       # with the weights as they are, `CONFIDENCE` alone
 
 Goes on from the first passes that the former made, judges every candidate as `evaluate` does, also those that are dropped, and
 prints the module. Tables go to stderr: each fifth of the logs is rated by weights that fit the others; and each kind of content
@@ -28,12 +29,13 @@ from log2sim.agents import judge as judging
 from log2sim.agents.candidate import Timeline
 from log2sim.agents.evidence import SIGNS, Table, gather
 from log2sim.agents.judge import MIN_THERE, suffices, variance_terms
+from log2sim.agents.weights import CONFIDENCE
 from log2sim.datatypes import CATEGORIES, GROUP_OF
-from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, probability_of
+from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
 from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.metrics.comparison import Selection
 from log2sim.evaluation.metrics.correctness import reliability
-from log2sim.evaluation.metrics.evaluator import compare_scenarios
+from log2sim.evaluation.metrics.evaluator import compare_scenarios, evaluate
 from log2sim.evaluation.metrics.verdicts import MAX_WRONG_SHARE, judge_against_truth
 from log2sim.geometry import Array
 
@@ -223,6 +225,84 @@ def say(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+@dataclass(frozen=True)
+class Judged:
+    """An agent of a scenario, and whether it is right."""
+
+    log: str
+    kind: str  # mount, what is searched, rate
+    lidar: bool
+    group: str
+    log_odds: float  # of its confidence before it is scaled
+    right: bool
+
+
+def judged_agents(case: Case, log: str) -> list[Judged]:
+    """Reconstruct a case without scales of confidences, and judge its agents; none where nothing was detected."""
+    same = {lidar: dict.fromkeys(row, (0.0, 1.0)) for lidar, row in CONFIDENCE.items()}
+    with patch.object(judging, "CONFIDENCE", same):
+        try:
+            scenario = case.second().scenario
+        except NothingToReconstruct:
+            return []
+    hz = round(1e9 / float(np.median(np.diff(case.run.schedule.t_ns))))
+    kind, lidar = kind_of(case.name, hz), bool(case.run.log.lidars)
+    rows = evaluate(scenario, case.truth)["correctness"]["judged_agents"]
+    return [
+        Judged(
+            log, kind, lidar, GROUP_OF[row["category"]], float(log_odds_of(row["confidence"])),
+            row["wrong_ticks"] <= MAX_WRONG_SHARE * row["ticks"],
+        )
+        for row in rows
+        if GROUP_OF[row["category"]] in CONFIDENCE[lidar]
+    ]  # fmt: skip
+
+
+def kind_of(case: str, hz: float) -> str:
+    """Name a kind of content: mount, what is searched, rate."""
+    return f"{case.split('-')[0]}, {case.split('(')[-1].rstrip(')').split(',')[0]}, {hz:.0f} Hz"
+
+
+Scales = dict[bool, dict[str, tuple[float, ...]]]
+
+
+def fit_scales(agents: Sequence[Judged]) -> Scales:
+    """Fit offset and slope of the log-odds of the agents of each group, with and without a LiDAR (Platt 1999)."""
+    out: Scales = {}
+    for lidar, row in CONFIDENCE.items():
+        out[lidar] = {}
+        for group in row:
+            own = [a for a in agents if (a.lidar, a.group) == (lidar, group)]
+            x, right = np.array([[a.log_odds] for a in own]), np.array([a.right for a in own], dtype=np.float64)
+            bias, slope = fit_weights(x, right, np.ones(len(own)), [1])
+            out[lidar][group] = (float(f"{bias:.3g}"), *(float(f"{v:.3g}") for v in slope))
+    return out
+
+
+def report_scales(agents: Sequence[Judged]) -> None:
+    """Print calibration errors of agents whose scales fit other logs, and other kinds of content."""
+    folds = np.unique([a.log for a in agents], return_inverse=True)[1] % FOLDS
+    for title, groups in (("other logs", folds), ("other kinds of content", np.array([a.kind for a in agents]))):
+        odds = np.zeros(len(agents))
+        for value in np.unique(groups):
+            scales = fit_scales([a for a, g in zip(agents, groups) if g != value])
+            for k in np.flatnonzero(groups == value).tolist():
+                offset, slope = scales[agents[k].lidar][agents[k].group]
+                odds[k] = offset + slope * agents[k].log_odds
+        for lidar, group in [(lidar, group) for lidar, row in CONFIDENCE.items() for group in row]:
+            rows = [k for k, a in enumerate(agents) if (a.lidar, a.group) == (lidar, group)]
+            right = np.array([agents[k].right for k in rows], dtype=bool)
+            before, after = (
+                reliability(probability_of(x), right)
+                for x in (np.array([a.log_odds for a in agents])[rows], odds[rows])
+            )
+            say(
+                f"{title}, {group}, {'LiDAR' if lidar else 'no LiDAR'}: {len(rows)} agents, calibration error "
+                f"{before['expected_calibration_error']:.3f} -> {after['expected_calibration_error']:.3f} "
+                f"(by chance {after['error_by_chance']:.3f})"
+            )
+
+
 def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
     """Print what is kept, and of this reliability and what is doubted: by a probability below one half, or by a doubt."""
     kept = np.array(
@@ -249,9 +329,7 @@ def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> No
 def report(agents: Sequence[Rated]) -> None:
     """Print tables of agents rated by what fits other logs, and other kinds of content."""
     logs = np.unique([a.log for a in agents], return_inverse=True)[1] % FOLDS
-    kinds = np.array(
-        [f"{a.case.split('-')[0]}, {a.case.split('(')[-1].rstrip(')').split(',')[0]}, {a.hz:.0f} Hz" for a in agents]
-    )
+    kinds = np.array([kind_of(a.case, a.hz) for a in agents])
     for title, group in (("other logs", logs), ("other kinds of content", kinds)):
         there, p, variance = np.zeros(len(agents)), np.zeros(len(agents)), {}
         for fold in np.unique(group):
@@ -305,14 +383,20 @@ def module_text(command: str, agents: Sequence[Rated]) -> str:
     return "\n".join(lines).replace("'", '"')
 
 
-def main(folders: list[Path]) -> None:
-    """Print the module that fits the logs of `confidence_logs` in some folders."""
-    agents: list[Rated] = []
+def main(folders: list[Path], scales: bool = False) -> None:
+    """Print the module that fits the logs of `confidence_logs` in some folders, or its scales of confidences alone."""
     paths = [path for folder in folders for path in sorted(folder.glob("*.pkl"))]
+    if scales:
+        judged = [
+            a for path in paths for case in pickle.loads(path.read_bytes()) for a in judged_agents(case, path.stem)
+        ]
+        report_scales(judged)
+        return print(f"CONFIDENCE = {fit_scales(judged)}".replace("'", '"'))
+    agents: list[Rated] = []
     for path in paths:
         agents += [agent for case in pickle.loads(path.read_bytes()) for agent in agents_of(case, path.stem)]
         say(f"{path.stem}: {len(agents)} candidates")
     report(agents)
     seeds = ", ".join(sorted({path.stem.split("-")[0] for path in paths}))
     command = f"tools/fit.py confidence` on the logs of `tools/fit.py confidence_logs FOLDER --logs {len(paths)} --seed {seeds}"
-    print(module_text(command, agents))
+    return print(module_text(command, agents))
