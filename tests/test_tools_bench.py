@@ -28,6 +28,7 @@ from scipy.optimize import minimize
 from worlds import tiny_toml
 
 from log2sim.datatypes import Frame
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.logs.native.writer import write_log
 
 pytestmark = pytest.mark.slow
@@ -124,6 +125,18 @@ def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread
     assert "| detect | 100.0 | 100.0 |" in stages
 
 
+def test_scales_that_make_confidences_right_are_found_for_each_group():
+    rng, true = np.random.default_rng(3), {"vehicle": (-0.5, 1.4), "two_wheeler": (0.0, 1.0), "pedestrian": (0.6, 0.7)}
+    agents = [
+        fit_confidence.Judged("one", "any", group, odds, bool(rng.random() < probability_of(offset + slope * odds)))
+        for group, (offset, slope) in true.items()
+        for odds in rng.normal(0.5, 1.5, 4000).tolist()
+    ]
+    found = fit_confidence.fit_scales(agents)
+    for group, scales in true.items():
+        assert found[group] == pytest.approx(scales, abs=0.15)
+
+
 @pytest.mark.slow
 def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs():
     log, scene, true = confidence_logs.make_log(1, 0)
@@ -139,6 +152,9 @@ def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs():
     assert [sum(a.lidar == lidar for a in agents) > 3 for lidar in (True, False)] == [True, True]
     assert all(0 <= a.right <= a.there <= 1 and a.ticks > 0 for a in agents)
     assert np.isfinite([list(a.evidence.values()) for a in agents]).all()
+    judged = [a for case in cases for a in fit_confidence.judged_agents(case, "one")]
+    assert len(judged) > 3
+    assert {a.group for a in judged} <= {"vehicle", "two_wheeler", "pedestrian"}
     there, p = fit_confidence.probabilities(agents, fit_confidence.fit_there_and_right(agents))
     assert ((p > 0) & (p < 1) & (there < 1)).all()
     assert set(fit_confidence.fit_all_variances(agents, p)) == {"sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"}

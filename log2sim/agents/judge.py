@@ -288,7 +288,7 @@ def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[A
 
     Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
     speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
-    is right where it is; its log-odds are scaled by group (Platt, "Probabilistic Outputs for Support Vector Machines", 1999). Each
+    is right where it is; with a LiDAR its log-odds are scaled by group (Platt, "Probabilistic Outputs for Support Vector Machines", 1999). Each
     weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points is rather wrong; without one,
     nothing has points, and what images say of the distance counts instead: each case has its weights.
     """
@@ -296,10 +296,11 @@ def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[A
         np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0) for weights in (THERE, RIGHT)
     )
     there, state = probability_of(there - clutter * (table["confirmed"] == 0)), probability_of(state)
-    scales = [CONFIDENCE[lidar][group] for group in ("vehicle", "two_wheeler", "pedestrian")]
-    group = np.where(table["pedestrian"] > 0, 2, np.where(table["two_wheeler"] > 0, 1, 0))
-    offset, slope = np.array(scales)[group].T
-    odds = offset + slope * log_odds_of(np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY))
+    odds = log_odds_of(np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY))
+    if lidar:
+        group = np.where(table["pedestrian"] > 0, 2, np.where(table["two_wheeler"] > 0, 1, 0))
+        offset, slope = np.array([CONFIDENCE[name] for name in ("vehicle", "two_wheeler", "pedestrian")])[group].T
+        odds = offset + slope * odds
     return there, np.clip(probability_of(odds), MIN_PROBABILITY, MAX_PROBABILITY)
 
 

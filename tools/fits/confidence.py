@@ -231,30 +231,28 @@ class Judged:
 
     log: str
     kind: str  # mount, what is searched, rate
-    lidar: bool
     group: str
     log_odds: float  # of its confidence before it is scaled
     right: bool
 
 
 def judged_agents(case: Case, log: str) -> list[Judged]:
-    """Reconstruct a case without scales of confidences, and judge its agents; none where nothing was detected."""
-    same = {lidar: dict.fromkeys(row, (0.0, 1.0)) for lidar, row in CONFIDENCE.items()}
-    with patch.object(judging, "CONFIDENCE", same):
+    """Reconstruct a case without scales of confidences, and judge its agents; none without a LiDAR or where nothing was detected."""
+    if not case.run.log.lidars:
+        return []
+    with patch.object(judging, "CONFIDENCE", dict.fromkeys(CONFIDENCE, (0.0, 1.0))):
         try:
             scenario = case.second().scenario
         except NothingToReconstruct:
             return []
     hz = round(1e9 / float(np.median(np.diff(case.run.schedule.t_ns))))
-    kind, lidar = kind_of(case.name, hz), bool(case.run.log.lidars)
-    rows = evaluate(scenario, case.truth)["correctness"]["judged_agents"]
     return [
         Judged(
-            log, kind, lidar, GROUP_OF[row["category"]], float(log_odds_of(row["confidence"])),
+            log, kind_of(case.name, hz), GROUP_OF[row["category"]], float(log_odds_of(row["confidence"])),
             row["wrong_ticks"] <= MAX_WRONG_SHARE * row["ticks"],
         )
-        for row in rows
-        if GROUP_OF[row["category"]] in CONFIDENCE[lidar]
+        for row in evaluate(scenario, case.truth)["correctness"]["judged_agents"]
+        if GROUP_OF[row["category"]] in CONFIDENCE
     ]  # fmt: skip
 
 
@@ -263,44 +261,35 @@ def kind_of(case: str, hz: float) -> str:
     return f"{case.split('-')[0]}, {case.split('(')[-1].rstrip(')').split(',')[0]}, {hz:.0f} Hz"
 
 
-Scales = dict[bool, dict[str, tuple[float, ...]]]
-
-
-def fit_scales(agents: Sequence[Judged]) -> Scales:
-    """Fit offset and slope of the log-odds of the agents of each group, with and without a LiDAR (Platt 1999)."""
-    out: Scales = {}
-    for lidar, row in CONFIDENCE.items():
-        out[lidar] = {}
-        for group in row:
-            own = [a for a in agents if (a.lidar, a.group) == (lidar, group)]
-            x, right = np.array([[a.log_odds] for a in own]), np.array([a.right for a in own], dtype=np.float64)
-            bias, slope = fit_weights(x, right, np.ones(len(own)), [1])
-            out[lidar][group] = (float(f"{bias:.3g}"), *(float(f"{v:.3g}") for v in slope))
-    return out
+def fit_scales(agents: Sequence[Judged]) -> dict[str, tuple[float, float]]:
+    """Fit offset and slope of the log-odds of the agents of each group (Platt 1999)."""
+    scales = {}
+    for group in CONFIDENCE:
+        own = [a for a in agents if a.group == group]
+        x, right = np.array([[a.log_odds] for a in own]), np.array([a.right for a in own], dtype=np.float64)
+        offset, (slope,) = fit_weights(x, right, np.ones(len(own)), [1])
+        scales[group] = float(f"{offset:.3g}"), float(f"{slope:.3g}")
+    return scales
 
 
 def report_scales(agents: Sequence[Judged]) -> None:
     """Print calibration errors of agents whose scales fit other logs, and other kinds of content."""
+    before = np.array([a.log_odds for a in agents])
     folds = np.unique([a.log for a in agents], return_inverse=True)[1] % FOLDS
-    for title, groups in (("other logs", folds), ("other kinds of content", np.array([a.kind for a in agents]))):
-        odds = np.zeros(len(agents))
-        for value in np.unique(groups):
-            scales = fit_scales([a for a, g in zip(agents, groups) if g != value])
-            for k in np.flatnonzero(groups == value).tolist():
-                offset, slope = scales[agents[k].lidar][agents[k].group]
-                odds[k] = offset + slope * agents[k].log_odds
-        for lidar, group in [(lidar, group) for lidar, row in CONFIDENCE.items() for group in row]:
-            rows = [k for k, a in enumerate(agents) if (a.lidar, a.group) == (lidar, group)]
-            right = np.array([agents[k].right for k in rows], dtype=bool)
-            before, after = (
-                reliability(probability_of(x), right)
-                for x in (np.array([a.log_odds for a in agents])[rows], odds[rows])
-            )
-            say(
-                f"{title}, {group}, {'LiDAR' if lidar else 'no LiDAR'}: {len(rows)} agents, calibration error "
-                f"{before['expected_calibration_error']:.3f} -> {after['expected_calibration_error']:.3f} "
-                f"(by chance {after['error_by_chance']:.3f})"
-            )
+    for title, of in (("other logs", folds), ("other kinds of content", np.array([a.kind for a in agents]))):
+        after = before.copy()
+        for value in np.unique(of):
+            scales = fit_scales([a for a, part in zip(agents, of) if part != value])
+            rows = np.flatnonzero(of == value)
+            offset, slope = np.array([scales[agents[k].group] for k in rows]).T
+            after[rows] = offset + slope * before[rows]
+        for group in CONFIDENCE:
+            rows = np.flatnonzero([a.group == group for a in agents])
+            right = np.array([agents[k].right for k in rows])
+            errors = [reliability(probability_of(odds[rows]), right) for odds in (before, after)]
+            was, now = (f"{error['expected_calibration_error']:.3f}" for error in errors)
+            chance = f"{errors[1]['error_by_chance']:.3f}"
+            say(f"{title}, {group}: {len(rows)} agents, calibration error {was} -> {now} (by chance {chance})")
 
 
 def say_rated(title: str, agents: Sequence[Rated], there: Array, p: Array) -> None:
