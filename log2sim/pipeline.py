@@ -143,8 +143,7 @@ def infer_scenario(run: Run, observations: Observations) -> Result:
         candidates = decide_headings(candidates, estimate.ego_path(log, schedule), timeline)
         ego = estimate.ego_agent(log, timeline, run.poses.origin)
     with clock.stage("judge", run.progress):
-        searched = schedule.drop_frames(observations.unseen)
-        judged = judge(candidates, ego, Recording(log, searched, obstacles, timeline), clutter=clutter)
+        judged = judge(candidates, ego, Recording(bool(log.lidars), obstacles, timeline), clutter=clutter)
         agents = [
             estimate.with_observers(c, estimate.with_pose_errors(c.agent, log, timeline), timeline) for c in judged
         ]

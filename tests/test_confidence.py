@@ -18,17 +18,14 @@ from log2sim.agents.judge import judge, probabilities
 from log2sim.agents.moving import moving_candidate
 from log2sim.agents.static import static_candidates
 from log2sim.agents.weights import CONFIDENCE, RIGHT, THERE, VARIANCES
-from log2sim.datatypes import MAX_SIZE_M, Finding, Log, Track
+from log2sim.datatypes import MAX_SIZE_M, Finding, Track
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
-from log2sim.perception.sync import Schedule
 
 TIMELINE = Timeline(T0_NS + np.arange(60) * 100_000_000, T0_NS)
 DARK = [None] * len(TIMELINE.t_ns)
 
 
-RECORDING = Recording(
-    Log("one", "none", {}, {"top": None}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), DARK, TIMELINE
-)
+RECORDING = Recording(True, DARK, TIMELINE)
 
 
 @cache

@@ -19,16 +19,13 @@ from log2sim.agents.evidence import (
     continued,
     gather,
     may_suffice,
-    missing_nats,
-    remaining,
 )
 from log2sim.agents.judge import doubts_by_evidence, probabilities, suffices
 from log2sim.agents.rays import Ending, classify_rays, count_rays
 from log2sim.agents.size import static_geometry
-from log2sim.datatypes import AgentTable, Log, Obstacles, Rays, Track
+from log2sim.datatypes import AgentTable, Obstacles, Rays, Track
 from log2sim.datatypes.log_odds import log_odds_of
 from log2sim.geometry import NS_PER_S
-from log2sim.perception.sync import Schedule
 
 SENSOR = np.array([0.0, 0.0, 1.9])
 CAR = (4.4, 1.8, 1.5)
@@ -97,25 +94,13 @@ def test_rays_that_end_at_the_back_of_a_car_support_it() -> None:
     assert (through, before) == (0, 0)
 
 
-def test_the_evidence_of_missing_detections_is_a_ratio_of_likelihoods():
-    # Two are detected at all of 40 ticks, one at 10: 90 of 120. Forty ticks that err alike count as 40 / (1 + 39 / 2) independent ones.
-    shown, detected = np.full(5, 40.0), np.array([40.0, 40.0, 10.0, 0.0, 0.0])
-    shown[4] = 3
-    nats = missing_nats(shown, detected)
-    mean = 0.25 * np.log(0.05 / 0.75) + 0.75 * np.log(0.95 / 0.25)
-    assert nats == pytest.approx([0, 0, max(mean * 40 / 20.5, 0), np.log(0.95 / 0.25) * 40 / 20.5, 0])
-    # A detector that finds half of all misses more, so that missing says less; one that finds nothing says nothing.
-    assert 0 < missing_nats(np.full(2, 40.0), np.array([20.0, 0.0]))[1] < nats[3]
-    assert (missing_nats(shown, np.zeros(5)) == 0).all()
-
-
 def test_what_is_likely_there_is_kept_and_a_strong_reason_is_a_doubt():
     assert suffices(MIN_THERE[True], confirmed=True, lidar=True)
     assert not suffices(MIN_THERE[True] - 0.01, confirmed=True, lidar=True)
     assert suffices(MIN_TENTATIVE_THERE, confirmed=False, lidar=True)
     assert not suffices(MIN_TENTATIVE_THERE - 0.01, confirmed=False, lidar=True)
     assert not suffices(0.9, confirmed=False, lidar=False)
-    row = dict.fromkeys((*SIGNS, "pointless", "shown_ticks", "image_ticks"), 0.0)
+    row = dict.fromkeys((*SIGNS, "pointless"), 0.0)
     assert doubts_by_evidence(agent(5.0), row, lidar=True) == []
     (doubt,) = doubts_by_evidence(agent(5.0), row | {"through": np.log(10)}, lidar=True)
     assert (doubt.kind, doubt.values["through_share"]) == ("empty", pytest.approx(0.9))
@@ -146,9 +131,7 @@ def test_who_moves_on_is_confirmed_by_less_sure_boxes_of_sweeps(
     track = person(score, in_sweeps, way_m)
     walking = agent(20.0, category="pedestrian", size=(0.6, 0.6, 1.7), speed=way_m / 4)
     seen = replace(candidate(walking), track=track, geometry=static_geometry(track))
-    recording = Recording(
-        Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
-    )
+    recording = Recording(False, [None] * 5, TIMELINE)
     assert gather([seen], recording)["confirmed"] == [confirmed]
     # Of few points what keeps its place before the sensor moves no more than what stays; more would stay behind if it did not move.
     # Poses drift by 1.5 m in 4 s.
@@ -195,8 +178,7 @@ def test_where_the_lidar_looks_an_object_has_points(thing, points, pointless, th
     found = replace(found, t_ns=TIMELINE.t_ns, sensor_m=np.tile(ORIGIN + SENSOR, (5, 1)))
     track = Track("car", np.arange(5), found)
     seen = replace(candidate(over_map(agent(20.0))), track=track, geometry=static_geometry(track))
-    schedule = Schedule("front", TIMELINE.t_ns, {}, {}, {})
-    recording = Recording(Log("one", "none", {}, {}, {}), schedule, clouds(fan(40.0, things=[thing])), TIMELINE)
+    recording = Recording(False, clouds(fan(40.0, things=[thing])), TIMELINE)
     table = gather([seen], recording)
     assert set(SIGNS) <= set(table)
     assert np.isfinite(list(table.values())).all()
@@ -221,21 +203,6 @@ def test_walls_go_on_beyond_a_box_and_vehicles_end(low_m, high_m, share):
     assert continued(boxes, [cloud] * 5) == pytest.approx([share * 3 / 4], abs=0.05)
 
 
-@pytest.mark.parametrize(("wall", "speed", "share"), [(False, 1.0, 0.0), (True, 1.0, 1.0), (True, 0.2, 0.0)])
-def test_what_stays_where_an_agent_left_is_no_mover(wall, speed, share):
-    """A car of one side drives along x, or its box slides along a wall; as dense as a surface is at its distance."""
-    car = over_map(agent(20.0, y_m=6.0, speed=speed))
-    boxes, seen = AgentTable.of([car], TIMELINE.seconds(TIMELINE.t_ns)), []
-    for tick, x_m in enumerate(boxes.center_m[0, :, 0] - ORIGIN[0]):
-        low, high = (0.0, 60.0) if wall else (x_m - 2.2, x_m + 2.2)
-        x, z = (a.ravel() for a in np.meshgrid(np.arange(low, high, 0.05), np.arange(0.1, 1.5, 0.05)))
-        side = np.column_stack([x, np.full(len(x), 5.1), z]).astype(np.float32)
-        seen.append(Obstacles(tick, ORIGIN, side, np.zeros(len(x), np.float32), SENSOR.astype(np.float32)))
-    # At 0.2 m/s it stays within its place.
-    assert remaining(boxes, seen) == pytest.approx([share], abs=0.1)
-    assert remaining(boxes, [None] * 5) == [0.0]
-
-
 @pytest.mark.parametrize(("wide_m", "thin"), [(0.7, 0.0), (0.15, np.log(0.7 / 0.2)), (np.nan, 0.0)])
 def test_points_of_a_pole_are_thinner_than_a_person(wide_m, thin):
     half = np.full((5, 2), [wide_m / 2, wide_m / 4])
@@ -243,7 +210,5 @@ def test_points_of_a_pole_are_thinner_than_a_person(wide_m, thin):
     person = agent(20.0, category="pedestrian", size=(0.6, 0.6, 1.7))
     track = Track("pedestrian", np.arange(5), replace(found, t_ns=TIMELINE.t_ns))
     seen = replace(candidate(person), track=track, geometry=static_geometry(track))
-    recording = Recording(
-        Log("one", "none", {}, {}, {}), Schedule("front", TIMELINE.t_ns, {}, {}, {}), [None] * 5, TIMELINE
-    )
+    recording = Recording(False, [None] * 5, TIMELINE)
     assert gather([seen], recording)["thin"] == pytest.approx([thin], abs=0.05)

@@ -5,7 +5,7 @@ What the weights of `agents/weights.py` make of a column is a log-likelihood rat
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -17,20 +17,18 @@ from log2sim.agents.candidate import AgentCandidate, Timeline
 from log2sim.agents.rays import count_rays
 from log2sim.agents.size import independent
 from log2sim.agents.weights import THERE
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, AgentTable, Log, Obstacles, Track
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, MIN_SIZE_M, TYPICAL_SIZE_M, AgentTable, Obstacles, Track
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of
-from log2sim.geometry import NS_PER_S, Array, apply, inverse, median, project
+from log2sim.geometry import NS_PER_S, Array, median
 from log2sim.perception.boxes import LIMIT_SIGMAS, rotate
 from log2sim.perception.lidar.measure import logit
-from log2sim.perception.sync import Schedule
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What the sensors of a log recorded at the ticks of a run."""
+    """What the LiDARs of a log recorded at the ticks of a run."""
 
-    log: Log
-    schedule: Schedule  # its cameras are those that were searched
+    lidar: bool  # whether it has any
     clouds: Sequence[Obstacles | None]  # (T,): None at ticks without LiDAR
     timeline: Timeline
 
@@ -43,13 +41,13 @@ class Recording:
 SIGNS = {
     "sweep": 1, "weak_sweep": 1, "image": 1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "through_gaps": -1, "continued": -1, "remains": -1, "thin": -1, "missing": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "continued": -1, "thin": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
 - sweep, weak_sweep, image: log-odds of its detections in LiDAR sweeps, and of the points that its box met elsewhere, where positive and
-  where negative; and of its detections in images, for what is in sweeps where positive, since `missing` says what speaks against it.
-  0 without any.
+  where negative; and of its detections in images, for what is in sweeps where positive: detectors miss the same object in image after
+  image. 0 without any.
 - travel: logarithm of the way of what moves beyond the drift of poses, in units of its length, plus 1: what is mistaken for a road user
   stays where it is, or, of few points, where it is before the sensor.
 - few, brief: 1 by the number of its measurements, and by its duration in units of 1 s, plus 1.
@@ -67,22 +65,19 @@ SIGNS = {
   people and bicycles have: all others go on behind it; 0 with few.
 - continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
   fences go on there, vehicles end.
-- remains: mean share of the points of what moves that are also where it is not yet or no more: what stays is no mover.
 - thin: logarithm of the typical width of a person over the widest extent of its points, where positive: poles are thinner.
-- missing: nats against it by the images that show its place well and in which it is not detected.
 - moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
 """
 
 # Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, `confirmed`, 1
-# where the detections alone make it likely, `pointless`, 1 where the LiDAR looks toward it and none of its detections has a point, and
-# `shown_ticks` and `image_ticks`: the ticks at which a searched image shows a candidate well, and at which it is detected in one.
+# where the detections alone make it likely, and `pointless`, 1 where the LiDAR looks toward it and none of its detections has a point.
 Table = dict[str, Array]
 
 
 def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
     """Gather the evidence for and against each of C candidates."""
     if not candidates:
-        return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS, "shown_ticks", "image_ticks")}
+        return {name: np.zeros(0) for name in ("bias", "confirmed", "pointless", *SIGNS)}
     most = MAX_CELLS // max(len(recording.clouds), 1) or 1
     # Those that are there at the same time together, so that each cloud is looked at by few shares of a long log.
     order = sorted(range(len(candidates)), key=lambda k: float(candidates[k].agent.waypoints.t_s[0]))
@@ -93,10 +88,7 @@ def gather(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
         own = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         parts.append(own | _sensed_columns(share, recording))
     table = {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}
-    return table | {
-        "missing": missing_nats(table["shown_ticks"], table["image_ticks"]),
-        "bias": np.ones(len(candidates)),
-    }
+    return table | {"bias": np.ones(len(candidates))}
 
 
 # Evidence of a predicted box that fits the points of a new place, in nats: it does at four of five ticks of a vehicle, and at one
@@ -118,8 +110,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
     way_m = float(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))) if moving else 0.0
-    # So few points do not show whether they stay behind (`remaining`): what moves as the sensor does may be its artifact, such as rings
-    # on a wall along the road.
+    # Few points that move as the sensor does may be its artifact, such as rings on a wall along the road; more are a vehicle as fast.
     if np.median(m.points) < MIN_SIDE_POINTS:
         way_m = min(way_m, float(np.hypot(*np.ptp((m.center_m - m.sensor_m)[:, :2], axis=0))))
     way_m = max(way_m - DRIFT_MPS * float(w.t_s[-1] - w.t_s[0]), 0.0)
@@ -304,7 +295,7 @@ MIN_SEEN_TICKS = 3
 
 
 def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
-    """Return the columns that rays and images tell, of candidates of which there are not too many."""
+    """Return the columns that rays and points tell, of candidates of which there are not too many."""
     agents = [c.agent for c in candidates]
     inside, through, before = count_rays(agents, recording.clouds, recording.timeline)
     met = inside + through
@@ -313,7 +304,6 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
     sums = [np.where(seen, rays, 0).sum(axis=1) for rays in (met, through)]
     known = (sums[0] >= MIN_LOOKING_RAYS) & (seen.sum(axis=1) >= MIN_SEEN_TICKS)
     boxes = AgentTable.of(agents, recording.t_s)
-    shown = shown_in_images(boxes, recording) & seen & (met >= MIN_TICK_RAYS)
     of = [c.track.measurements for c in candidates]
     looking = (met + before).sum(axis=1) >= MIN_LOOKING_RAYS
     through_nats = np.where(known, np.log((sums[0] + 1) / (sums[0] - sums[1] + 1)), 0.0).clip(max=MAX_THROUGH_NATS)
@@ -322,10 +312,7 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
         "through": np.where(solid, through_nats, 0.0),
         "through_gaps": np.where(solid, 0.0, through_nats),
         "continued": continued(boxes, recording.clouds) * solid,
-        "remains": remaining(boxes, recording.clouds),
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
-        "shown_ticks": shown.sum(axis=1).astype(np.float64),
-        "image_ticks": np.array([s[c.track.tick[m.camera != ""]].sum() for s, c, m in zip(shown, candidates, of)], dtype=np.float64),
     }  # fmt: skip
 
 
@@ -340,141 +327,33 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     Only where the points inside are, which is where rays arrive: beyond a side of a vehicle whose end they show is nothing.
     """
     inside, beyond = np.zeros((len(boxes.present), 5)), np.zeros((len(boxes.present), 5))
-    visits = [(tick, k) for k, ticks in enumerate(_recorded(boxes, clouds)) for tick in _some(ticks, SIDE_TICKS)]
-    for cloud, tick, k in _with_clouds(visits, clouds):
-        half, points = boxes.size_m[k] / 2, _points_at(boxes, k, tick, cloud, SIDE_M)
-        local = np.vstack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]).T, points[:, 2]])
-        within = np.abs(local) < (half + SIDE_ERROR_M / 2)[:, None]
-        for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
-            depth, across = sign * local[axis] - half[axis], [a for a in range(3) if a != axis]
-            own = (
-                (depth > SIDE_ERROR_M / 2 - SIDE_M)
-                & (depth <= SIDE_ERROR_M / 2)
-                & within[across[0]]
-                & within[across[1]]
-            )
-            count = np.count_nonzero(own)
-            if count < MIN_SIDE_POINTS:
-                continue
-            level = np.ones(len(points), dtype=bool)
-            for column in local[across]:
-                ordered = np.sort(column[own])
-                low, high = ordered[count // 10], ordered[-1 - count // 10]  # but for stray points
-                level &= (column > low - SIDE_ERROR_M) & (column < high + SIDE_ERROR_M)
-            inside[k, side] += np.count_nonzero(own & level)
-            beyond[k, side] += np.count_nonzero((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level)
-    share = np.minimum(beyond / np.maximum(inside, 1), 1)
-    return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
-
-
-# An agent that moved so far, m, left its place by more than the errors of boxes. So many ticks of each agent suffice.
-MOVED_M, MOVED_TICKS = 1.5, 4
-
-
-def remaining(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
-    """Return the mean shares (A,) of the points of agents that are there also when these have left, or have not come yet.
-
-    Compared are pairs of ticks between which an agent moves by `MOVED_M`, in the part of its box at one that is outside of its box at
-    the other, by as many points as a surface shows at the other distance. 0 for what stands.
-    """
-    pairs = []
-    for k, ticks in enumerate(_recorded(boxes, clouds)):
-        way = boxes.center_m[k, ticks, :2]
-        for first in _some(np.arange(len(ticks)), MOVED_TICKS):
-            moved = np.flatnonzero(np.hypot(*(way[first:] - way[first]).T) >= MOVED_M)
-            for last in moved[:1].tolist():
-                pair = int(ticks[first]), int(ticks[first + last])
-                pairs += [(k, *pair), (k, *pair[::-1])]
-    points, spread_m2 = np.zeros((len(pairs), 2)), np.ones((len(pairs), 2))
-    visits = [(pair[1 + at], 2 * n + at) for n, pair in enumerate(pairs) for at in range(2)]
-    for cloud, _, visit in _with_clouds(visits, clouds):
-        n, at = divmod(visit, 2)
-        k, place, other = pairs[n]
-        center, half = boxes.center_m[k], boxes.size_m[k, :2] / 2
-        near = _points_at(boxes, k, place, cloud, SIDE_ERROR_M)
-        xy = near[near[:, 2] <= boxes.size_m[k, 2] / 2 + SIDE_ERROR_M, :2]
-        own = rotate(xy, -boxes.yaw_rad[k, place])
-        elsewhere = rotate(xy + (center[place] - center[other])[:2], -boxes.yaw_rad[k, other])
-        vacated = (np.abs(own) <= half + SIDE_ERROR_M).all(axis=1) & (np.abs(elsewhere) > half + SIDE_M / 2).any(axis=1)
-        points[n, at] = vacated.sum()
-        spread_m2[n, at] = np.sum((center[place] - cloud.origin - cloud.sensor)[:2] ** 2)
-    known = points[:, 0] >= MIN_SIDE_POINTS
-    share = np.minimum(points[:, 1] * spread_m2[:, 1] / np.maximum(points[:, 0] * spread_m2[:, 0], 1e-9), 1.0)[known]
-    agent = np.array([k for k, *_ in pairs], dtype=np.intp)[known]
-    count = np.bincount(agent, minlength=len(boxes.present))
-    return np.asarray(np.bincount(agent, share, len(count)) / np.maximum(count, 1))
-
-
-def _recorded(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> list[NDArray[np.intp]]:
-    """Return for each of A agents the ticks at which it is there and a LiDAR recorded."""
-    recorded = np.array([cloud is not None for cloud in clouds], dtype=bool)
-    return [np.flatnonzero(present & recorded) for present in boxes.present]
-
-
-def _some(ticks: NDArray[np.intp], most: int) -> list[int]:
-    """Return at most so many ticks, evenly spaced."""
-    return [int(tick) for tick in ticks[:: -(-len(ticks) // most) or 1]]
-
-
-def _with_clouds(
-    visits: list[tuple[int, int]], clouds: Sequence[Obstacles | None]
-) -> Iterator[tuple[Obstacles, int, int]]:
-    """Yield visits, a tick and a number each, in the order of their ticks with the cloud of the tick, which is read once."""
+    recorded, visits = np.array([cloud is not None for cloud in clouds], dtype=bool), []
+    for k, present in enumerate(boxes.present):
+        ticks = np.flatnonzero(present & recorded)
+        visits += [(int(tick), k) for tick in ticks[:: -(-len(ticks) // SIDE_TICKS) or 1]]
+    # By tick, so that each cloud is read once.
     for tick, same in groupby(sorted(visits), itemgetter(0)):
         cloud = clouds[tick]
         assert cloud is not None
-        for _, number in same:
-            yield cloud, tick, number
-
-
-def _points_at(boxes: AgentTable, k: int, tick: int, cloud: Obstacles, margin_m: float) -> Array:
-    """Return the points (n, 3) of a cloud around an agent's place at a tick, from its center, without those near its floor."""
-    center, half_m = boxes.center_m[k, tick], boxes.size_m[k] / 2
-    near = cloud.xyz[cloud.near(center[:2], float(np.hypot(*half_m[:2])) + margin_m)] - (center - cloud.origin)
-    return np.asarray(near[near[:, 2] > ABOVE_FLOOR_M - half_m[2]], dtype=np.float64)
-
-
-# Smaller objects are "small" in COCO (Lin et al., ECCV 2014), where detectors find less than half of them.
-MIN_HEIGHT_PX = 32.0
-# Share of the width of an image at either side in which an object is cut off.
-BORDER_SHARE = 0.05
-# From a camera farther from the LiDAR other things hide an object than from the LiDAR.
-MAX_BASELINE_M = 3.0
-
-
-def shown_in_images(boxes: AgentTable, recording: Recording) -> NDArray[np.bool_]:
-    """Mark (A, T) where a searched camera next to the LiDAR has an agent well inside its image, large enough to be detected."""
-    shown = np.zeros(boxes.present.shape, dtype=bool)
-    log, schedule = recording.log, recording.schedule
-    for name, frames in schedule.frames.items():
-        camera, ticks = log.cameras[name], np.flatnonzero((frames >= 0) & boxes.present.any(axis=0))
-        poses, known = log.map_T_sensor(name, log.streams[name].t_ns[frames[ticks]])
-        for tick, map_T_cam in zip(ticks[known].tolist(), poses[known]):
-            cloud, rows = recording.clouds[tick], np.flatnonzero(boxes.present[:, tick])
-            if cloud is None or np.linalg.norm(map_T_cam[:3, 3] - cloud.origin - cloud.sensor) > MAX_BASELINE_M:
-                continue
-            in_cam = apply(inverse(map_T_cam), boxes.center_m[rows, tick])
-            uv, inside = project(camera, in_cam)
-            border = BORDER_SHARE * camera.width_px
-            inside &= np.abs(np.nan_to_num(uv[:, 0]) - camera.width_px / 2) < camera.width_px / 2 - border
-            shown[rows, tick] |= inside & (camera.K[1, 1] * boxes.size_m[rows, 2] >= MIN_HEIGHT_PX * in_cam[:, 2])
-    return shown
-
-
-# Share of the images of a place without an object in which a detector finds one, and the highest rate at which it is taken
-# to find one that is there: no detector finds all. Fewer ticks tell no rate.
-FALSE_RATE, MAX_USUAL_RATE, MIN_SHOWN_TICKS = 0.05, 0.9, 8
-
-
-def missing_nats(shown: Array, detected: Array) -> Array:
-    """Return the nats (C,) against candidates by the ticks at which images show them well, and those at which one detects them.
-
-    The logarithm of the ratio of two Bernoulli likelihoods: an object is detected at the usual rate, that of all that is detected
-    in images at all, nothing at `FALSE_RATE`. Successive images err alike, which is why they count as few independent ones.
-    """
-    usual = min(detected.sum() / max(float(shown[detected > 0].sum()), 1.0), MAX_USUAL_RATE)
-    if usual <= FALSE_RATE:
-        return np.zeros(len(shown))
-    rate = detected / np.maximum(shown, 1)
-    mean = rate * np.log(FALSE_RATE / usual) + (1 - rate) * np.log((1 - FALSE_RATE) / (1 - usual))
-    return np.where(shown < MIN_SHOWN_TICKS, 0.0, np.maximum(mean, 0.0) * [independent(int(n)) for n in shown])
+        for _, k in same:
+            center, half = boxes.center_m[k, tick], boxes.size_m[k] / 2
+            near = cloud.near(center[:2], float(np.hypot(*half[:2])) + SIDE_M)
+            points = np.asarray(cloud.xyz[near] - (center - cloud.origin), dtype=np.float64)
+            points = points[points[:, 2] > ABOVE_FLOOR_M - half[2]]
+            local = np.vstack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]).T, points[:, 2]])
+            within = np.abs(local) < (half + SIDE_ERROR_M / 2)[:, None]
+            for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
+                depth, across = sign * local[axis] - half[axis], [a for a in range(3) if a != axis]
+                own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[across].all(axis=0)
+                count = np.count_nonzero(own)
+                if count < MIN_SIDE_POINTS:
+                    continue
+                level = np.ones(len(points), dtype=bool)
+                for column in local[across]:
+                    ordered = np.sort(column[own])
+                    low, high = ordered[count // 10], ordered[-1 - count // 10]  # but for stray points
+                    level &= (column > low - SIDE_ERROR_M) & (column < high + SIDE_ERROR_M)
+                inside[k, side] += np.count_nonzero(own & level)
+                beyond[k, side] += np.count_nonzero((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level)
+    share = np.minimum(beyond / np.maximum(inside, 1), 1)
+    return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))

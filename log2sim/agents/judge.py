@@ -264,7 +264,7 @@ def judge(
 
     At the place of the `ego` there is no other agent. `clutter`: from `evidence.clutter_nats`.
     """
-    t_s, lidar = recording.t_s, bool(recording.log.lidars)
+    t_s, lidar = recording.t_s, recording.lidar
     table = gather(candidates, recording)
     there, right = probabilities(table, lidar=lidar, clutter=clutter)
     kept = []
@@ -313,14 +313,11 @@ def suffices(there: float, *, confirmed: bool, lidar: bool) -> bool:
 
 def doubts_by_evidence(agent: Agent, evidence: Mapping[str, float], *, lidar: bool) -> list[Finding]:
     """Return what of the evidence of an agent, its row of the table, speaks against it."""
-    counts = {"detected_ticks": evidence["image_ticks"], "shown_ticks": evidence["shown_ticks"]}
-    weights = THERE[lidar]
-    reasons = {
-        "through": Finding("empty", values={"through_share": 1 - float(np.exp(-evidence["through"]))}),
-        "missing": Finding("hardly_observed", case="images", values=counts),
-    }
-    doubts = [doubt for name, doubt in reasons.items() if -weights.get(name, 0.0) * evidence[name] > DOUBT_NATS]
-    doubts += [Finding("hardly_observed", case="no_points")] if evidence["pointless"] else []
+    doubts = []
+    if -THERE[lidar].get("through", 0.0) * evidence["through"] > DOUBT_NATS:
+        doubts.append(Finding("empty", values={"through_share": 1 - float(np.exp(-evidence["through"]))}))
+    if evidence["pointless"]:
+        doubts.append(Finding("hardly_observed"))
     # As long as sizes go: they are limited to those of the category, so a vehicle at the greatest length was observed to be longer.
     length_m, longest_m = agent.size_m[0], MAX_SIZE_M[agent.category][0]
     if GROUP_OF[agent.category] == "vehicle" and length_m >= longest_m - SAME_M:

@@ -26,9 +26,7 @@ THERE = {
         "through": -2.04,
         "through_gaps": -0.526,
         "continued": -2.47,
-        "remains": -0.833,
         "thin": -0.727,
-        "missing": -0.339,
         "moving": 0.391,
         "two_wheeler": -0.784,
         "pedestrian": -0.817,
@@ -62,7 +60,6 @@ RIGHT = {
         "through": -0.927,
         "through_gaps": -0.942,
         "continued": -0.613,
-        "remains": -0.946,
         "moving": -1.56,
         "two_wheeler": -0.246,
         "pedestrian": 1.46,
@@ -87,4 +84,4 @@ VARIANCES = {
     "sigma_speed_mps": {"given": 10.1, "standing": 1.57, "moving": 0.27},
 }
 
-CONFIDENCE = {"vehicle": (-0.153, 1.05), "two_wheeler": (-0.258, 1.2), "pedestrian": (0.288, 1.18)}
+CONFIDENCE = {"vehicle": (-0.194, 1.05), "two_wheeler": (-0.313, 1.2), "pedestrian": (0.28, 1.18)}

@@ -49,7 +49,7 @@ PRIOR_SIGMA, MIN_EFFECT = 0.5, 0.05
 # of the standard deviation: it alone knows gaps, ends and turns.
 MIN_WEIGHT, MIN_GIVEN_WEIGHT, MAX_WEIGHT = 1e-7, 0.25, 25.0
 # Columns that say nothing of whether something is there, and those that say nothing of whether it is right where it is.
-ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "brief"), ("travel", "missing", "image", "sweep", "weak_sweep", "few")  # fmt: skip
+ONLY_RIGHT, ONLY_THERE = ("heading", "sigma_speed", "brief"), ("travel", "image", "sweep", "weak_sweep", "few")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
