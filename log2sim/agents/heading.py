@@ -435,6 +435,8 @@ def decide_headings(candidates: Sequence[AgentCandidate], ego_path: Array, timel
         for f, none in ((np.min, np.inf), (np.max, -np.inf))
     )
     for k, pose in enumerate(poses):
+        if GROUP_OF[road_users[k].agent.category] == "two_wheeler":
+            continue  # they are parked at any angle; those that ride have a course
         away_m = np.maximum(low - pose[:2], pose[:2] - high).max(axis=1)
         away_m[k + 1] = np.inf
         street[:, k] = street_log_odds(pose, [ways[i] for i in np.flatnonzero(away_m <= FAR_M).tolist()])
