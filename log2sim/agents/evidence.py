@@ -165,7 +165,7 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     return columns | {name: float(np.clip(columns[name], low, high)) for name, (low, high) in LIMITS.items()}
 
 
-# A smaller share of measurements that a homography placed are boxes of something else; 0.1 to 0.4 give the same (57 simulated logs).
+# A smaller share of measurements that a homography placed are boxes of something else; 0.1 to 0.4 give the same (64 simulated logs).
 MIN_PLACED_SHARE = 0.2
 # Fewer points may lie on one side of a person; by so much extents of points err, m.
 MIN_WIDE_POINTS, EXTENT_ERROR_M = 5, 0.05

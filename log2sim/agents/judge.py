@@ -288,9 +288,9 @@ def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[A
 
     Right is what `evaluate` finds right: at no more than a fifth of its ticks invented, a duplicate, in the ego, or with a wrong
     speed, motion, direction or size. It is the product of two logistic regressions on the same table: that it is there, and that it
-    is right where it is; with a LiDAR its log-odds are scaled by group (Platt, "Probabilistic Outputs for Support Vector Machines", 1999). Each
-    weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points is rather wrong; without one,
-    nothing has points, and what images say of the distance counts instead: each case has its weights.
+    is right where it is; with a LiDAR its log-odds are scaled by group (Platt, "Probabilistic Outputs for Support Vector Machines",
+    1999). Each weight has the sign of its reason (`evidence.SIGNS`). Where there is a LiDAR, an agent without points is rather wrong;
+    without one, nothing has points, and what images say of the distance counts instead: each case has its weights.
     """
     there, state = (
         np.sum([weight * table[name] for name, weight in weights[lidar].items()], axis=0) for weights in (THERE, RIGHT)
