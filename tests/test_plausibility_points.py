@@ -19,6 +19,7 @@ from log2sim.agents.evidence import (
     continued,
     gather,
     may_suffice,
+    remaining,
 )
 from log2sim.agents.judge import doubts_by_evidence, probabilities, suffices
 from log2sim.agents.rays import Ending, classify_rays, count_rays
@@ -201,6 +202,21 @@ def test_walls_go_on_beyond_a_box_and_vehicles_end(low_m, high_m, share):
     boxes = AgentTable.of([over_map(agent(20.0, yaw=yaw))], TIMELINE.seconds(TIMELINE.t_ns))
     # Of its sides two ends, one side and the top have points.
     assert continued(boxes, [cloud] * 5) == pytest.approx([share * 3 / 4], abs=0.05)
+
+
+@pytest.mark.parametrize(("wall", "speed", "share"), [(False, 1.0, 0.0), (True, 1.0, 1.0), (True, 0.2, 0.0)])
+def test_what_stays_where_an_agent_left_is_no_mover(wall, speed, share):
+    """A car of one side drives along x, or its box slides along a wall; as dense as a surface is at its distance."""
+    car = over_map(agent(20.0, y_m=6.0, speed=speed))
+    boxes, seen = AgentTable.of([car], TIMELINE.seconds(TIMELINE.t_ns)), []
+    for tick, x_m in enumerate(boxes.center_m[0, :, 0] - ORIGIN[0]):
+        low, high = (0.0, 60.0) if wall else (x_m - 2.2, x_m + 2.2)
+        x, z = (a.ravel() for a in np.meshgrid(np.arange(low, high, 0.05), np.arange(0.1, 1.5, 0.05)))
+        side = np.column_stack([x, np.full(len(x), 5.1), z]).astype(np.float32)
+        seen.append(Obstacles(tick, ORIGIN, side, np.zeros(len(x), np.float32), SENSOR.astype(np.float32)))
+    # At 0.2 m/s it stays within its place.
+    assert remaining(boxes, seen) == pytest.approx([share], abs=0.1)
+    assert remaining(boxes, [None] * 5) == [0.0]
 
 
 @pytest.mark.parametrize(("wide_m", "thin"), [(0.7, 0.0), (0.15, np.log(0.7 / 0.2)), (np.nan, 0.0)])

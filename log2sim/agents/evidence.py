@@ -5,7 +5,7 @@ What the weights of `agents/weights.py` make of a column is a log-likelihood rat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -41,7 +41,7 @@ class Recording:
 SIGNS = {
     "sweep": 1, "weak_sweep": 1, "image": 1, "travel": 1, "few": -1, "brief": -1, "scatter": -1, "sigma": -1, "unlikely_size": -1,
     "odd_size": -1, "odd_height": -1, "heading": 1, "other_category": -1, "impossible": -1, "sigma_speed": -1, "through": -1,
-    "through_gaps": -1, "continued": -1, "thin": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
+    "through_gaps": -1, "continued": -1, "remains": -1, "thin": -1, "moving": 0, "two_wheeler": 0, "pedestrian": 0,
 }  # fmt: skip
 """Columns of the table, and whether a candidate with more of one is rather right (1) or wrong (-1); 0 where either may be.
 
@@ -65,6 +65,7 @@ SIGNS = {
   people and bicycles have: all others go on behind it; 0 with few.
 - continued: mean over the sides and the top of a vehicle of the density of points just beyond over that just inside: walls, hedges and
   fences go on there, vehicles end.
+- remains: mean share of the points of what moves that are also where it is not yet or no more: what stays is no mover.
 - thin: logarithm of the typical width of a person over the widest extent of its points, where positive: poles are thinner.
 - moving, two_wheeler, pedestrian: 1 for one that moves, and for those of these groups.
 """
@@ -110,7 +111,8 @@ def _own_columns(candidate: AgentCandidate, timeline: Timeline) -> dict[str, flo
     in_image |= ~in_sweep
     group, moving = GROUP_OF[agent.category], not agent.static
     way_m = float(np.hypot(np.ptp(w.x_m), np.ptp(w.y_m))) if moving else 0.0
-    # Few points that move as the sensor does may be its artifact, such as rings on a wall along the road; more are a vehicle as fast.
+    # So few points do not show whether they stay behind (`remaining`): what moves as the sensor does may be its artifact, such as rings
+    # on a wall along the road.
     if np.median(m.points) < MIN_SIDE_POINTS:
         way_m = min(way_m, float(np.hypot(*np.ptp((m.center_m - m.sensor_m)[:, :2], axis=0))))
     way_m = max(way_m - DRIFT_MPS * float(w.t_s[-1] - w.t_s[0]), 0.0)
@@ -312,6 +314,7 @@ def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) 
         "through": np.where(solid, through_nats, 0.0),
         "through_gaps": np.where(solid, 0.0, through_nats),
         "continued": continued(boxes, recording.clouds) * solid,
+        "remains": remaining(boxes, recording.clouds),
         "pointless": np.array([look and not (m.points > 0).any() for look, m in zip(looking, of)], dtype=np.float64),
     }  # fmt: skip
 
@@ -327,33 +330,95 @@ def continued(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
     Only where the points inside are, which is where rays arrive: beyond a side of a vehicle whose end they show is nothing.
     """
     inside, beyond = np.zeros((len(boxes.present), 5)), np.zeros((len(boxes.present), 5))
-    recorded, visits = np.array([cloud is not None for cloud in clouds], dtype=bool), []
-    for k, present in enumerate(boxes.present):
-        ticks = np.flatnonzero(present & recorded)
-        visits += [(int(tick), k) for tick in ticks[:: -(-len(ticks) // SIDE_TICKS) or 1]]
-    # By tick, so that each cloud is read once.
+    visits = [(tick, k) for k, ticks in enumerate(_recorded(boxes, clouds)) for tick in _some(ticks, SIDE_TICKS)]
+    for cloud, tick, k in _with_clouds(visits, clouds):
+        half, points = boxes.size_m[k] / 2, _points_at(boxes, k, tick, cloud, SIDE_M)
+        local = np.vstack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]).T, points[:, 2]])
+        within = np.abs(local) < (half + SIDE_ERROR_M / 2)[:, None]
+        for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
+            depth, across = sign * local[axis] - half[axis], [a for a in range(3) if a != axis]
+            own = (
+                (depth > SIDE_ERROR_M / 2 - SIDE_M)
+                & (depth <= SIDE_ERROR_M / 2)
+                & within[across[0]]
+                & within[across[1]]
+            )
+            count = np.count_nonzero(own)
+            if count < MIN_SIDE_POINTS:
+                continue
+            level = np.ones(len(points), dtype=bool)
+            for column in local[across]:
+                ordered = np.sort(column[own])
+                low, high = ordered[count // 10], ordered[-1 - count // 10]  # but for stray points
+                level &= (column > low - SIDE_ERROR_M) & (column < high + SIDE_ERROR_M)
+            inside[k, side] += np.count_nonzero(own & level)
+            beyond[k, side] += np.count_nonzero((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level)
+    share = np.minimum(beyond / np.maximum(inside, 1), 1)
+    return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
+
+
+# An agent that moved so far, m, left its place by more than the errors of boxes. So many ticks of each agent suffice.
+MOVED_M, MOVED_TICKS = 1.5, 4
+
+
+def remaining(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> Array:
+    """Return the mean shares (A,) of the points of agents that are there also when these have left, or have not come yet.
+
+    Compared are pairs of ticks between which an agent moves by `MOVED_M`, in the part of its box at one that is outside of its box at
+    the other, by as many points as a surface shows at the other distance. 0 for what stands.
+    """
+    pairs = []
+    for k, ticks in enumerate(_recorded(boxes, clouds)):
+        way = boxes.center_m[k, ticks, :2]
+        for first in _some(np.arange(len(ticks)), MOVED_TICKS):
+            moved = np.flatnonzero(np.hypot(*(way[first:] - way[first]).T) >= MOVED_M)
+            for last in moved[:1].tolist():
+                pair = int(ticks[first]), int(ticks[first + last])
+                pairs += [(k, *pair), (k, *pair[::-1])]
+    points, spread_m2 = np.zeros((len(pairs), 2)), np.ones((len(pairs), 2))
+    visits = [(pair[1 + at], 2 * n + at) for n, pair in enumerate(pairs) for at in range(2)]
+    for cloud, _, visit in _with_clouds(visits, clouds):
+        n, at = divmod(visit, 2)
+        k, place, other = pairs[n]
+        center, half = boxes.center_m[k], boxes.size_m[k, :2] / 2
+        near = _points_at(boxes, k, place, cloud, SIDE_ERROR_M)
+        xy = near[near[:, 2] <= boxes.size_m[k, 2] / 2 + SIDE_ERROR_M, :2]
+        own = rotate(xy, -boxes.yaw_rad[k, place])
+        elsewhere = rotate(xy + (center[place] - center[other])[:2], -boxes.yaw_rad[k, other])
+        vacated = (np.abs(own) <= half + SIDE_ERROR_M).all(axis=1) & (np.abs(elsewhere) > half + SIDE_M / 2).any(axis=1)
+        points[n, at] = vacated.sum()
+        spread_m2[n, at] = np.sum((center[place] - cloud.origin - cloud.sensor)[:2] ** 2)
+    known = points[:, 0] >= MIN_SIDE_POINTS
+    share = np.minimum(points[:, 1] * spread_m2[:, 1] / np.maximum(points[:, 0] * spread_m2[:, 0], 1e-9), 1.0)[known]
+    agent = np.array([k for k, *_ in pairs], dtype=np.intp)[known]
+    count = np.bincount(agent, minlength=len(boxes.present))
+    return np.asarray(np.bincount(agent, share, len(count)) / np.maximum(count, 1))
+
+
+def _recorded(boxes: AgentTable, clouds: Sequence[Obstacles | None]) -> list[NDArray[np.intp]]:
+    """Return for each of A agents the ticks at which it is there and a LiDAR recorded."""
+    recorded = np.array([cloud is not None for cloud in clouds], dtype=bool)
+    return [np.flatnonzero(present & recorded) for present in boxes.present]
+
+
+def _some(ticks: NDArray[np.intp], most: int) -> list[int]:
+    """Return at most so many ticks, evenly spaced."""
+    return [int(tick) for tick in ticks[:: -(-len(ticks) // most) or 1]]
+
+
+def _with_clouds(
+    visits: list[tuple[int, int]], clouds: Sequence[Obstacles | None]
+) -> Iterator[tuple[Obstacles, int, int]]:
+    """Yield visits, a tick and a number each, in the order of their ticks with the cloud of the tick, which is read once."""
     for tick, same in groupby(sorted(visits), itemgetter(0)):
         cloud = clouds[tick]
         assert cloud is not None
-        for _, k in same:
-            center, half = boxes.center_m[k, tick], boxes.size_m[k] / 2
-            near = cloud.near(center[:2], float(np.hypot(*half[:2])) + SIDE_M)
-            points = np.asarray(cloud.xyz[near] - (center - cloud.origin), dtype=np.float64)
-            points = points[points[:, 2] > ABOVE_FLOOR_M - half[2]]
-            local = np.vstack([rotate(points[:, :2], -boxes.yaw_rad[k, tick]).T, points[:, 2]])
-            within = np.abs(local) < (half + SIDE_ERROR_M / 2)[:, None]
-            for side, (axis, sign) in enumerate(((0, 1), (0, -1), (1, 1), (1, -1), (2, 1))):
-                depth, across = sign * local[axis] - half[axis], [a for a in range(3) if a != axis]
-                own = (depth > SIDE_ERROR_M / 2 - SIDE_M) & (depth <= SIDE_ERROR_M / 2) & within[across].all(axis=0)
-                count = np.count_nonzero(own)
-                if count < MIN_SIDE_POINTS:
-                    continue
-                level = np.ones(len(points), dtype=bool)
-                for column in local[across]:
-                    ordered = np.sort(column[own])
-                    low, high = ordered[count // 10], ordered[-1 - count // 10]  # but for stray points
-                    level &= (column > low - SIDE_ERROR_M) & (column < high + SIDE_ERROR_M)
-                inside[k, side] += np.count_nonzero(own & level)
-                beyond[k, side] += np.count_nonzero((depth > SIDE_ERROR_M) & (depth <= SIDE_ERROR_M + SIDE_M) & level)
-    share = np.minimum(beyond / np.maximum(inside, 1), 1)
-    return np.asarray(share.sum(axis=1) / np.maximum((inside > 0).sum(axis=1), 1))
+        for _, number in same:
+            yield cloud, tick, number
+
+
+def _points_at(boxes: AgentTable, k: int, tick: int, cloud: Obstacles, margin_m: float) -> Array:
+    """Return the points (n, 3) of a cloud around an agent's place at a tick, from its center, without those near its floor."""
+    center, half_m = boxes.center_m[k, tick], boxes.size_m[k] / 2
+    near = cloud.xyz[cloud.near(center[:2], float(np.hypot(*half_m[:2])) + margin_m)] - (center - cloud.origin)
+    return np.asarray(near[near[:, 2] > ABOVE_FLOOR_M - half_m[2]], dtype=np.float64)
