@@ -117,7 +117,7 @@ def test_evidence_is_bounded_where_there_is_nothing_but_boxes_of_images():
     assert judge([], None, RECORDING) == []
 
 
-def test_few_detections_in_images_say_nothing_against_what_sweeps_show():
+def test_few_detections_in_images_are_no_evidence_against_an_object_in_sweeps():
     candidate = parked()
 
     def detected(count: int) -> AgentCandidate:

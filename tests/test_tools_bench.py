@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import pickle
@@ -125,16 +126,16 @@ def test_times_of_a_run_are_medians_a_tick_and_ratios_to_the_floor_of_one_thread
     assert "| detect | 100.0 | 100.0 |" in stages
 
 
-def test_scales_that_make_confidences_right_are_found_for_each_group():
+def test_scales_that_make_confidences_right_are_fitted_for_each_group():
     rng, true = np.random.default_rng(3), {"vehicle": (-0.5, 1.4), "two_wheeler": (0.0, 1.0), "pedestrian": (0.6, 0.7)}
     agents = [
         fit_confidence.Judged("one", "any", group, odds, bool(rng.random() < probability_of(offset + slope * odds)))
         for group, (offset, slope) in true.items()
         for odds in rng.normal(0.5, 1.5, 4000).tolist()
     ]
-    found = fit_confidence.fit_scales(agents)
+    fitted = fit_confidence.fit_scales(agents)
     for group, scales in true.items():
-        assert found[group] == pytest.approx(scales, abs=0.15)
+        assert fitted[group] == pytest.approx(scales, abs=0.15)
 
 
 @pytest.mark.slow
@@ -158,6 +159,9 @@ def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs():
     there, p = fit_confidence.probabilities(agents, fit_confidence.fit_there_and_right(agents))
     assert ((p > 0) & (p < 1) & (there < 1)).all()
     assert set(fit_confidence.fit_all_variances(agents, p)) == {"sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps"}
+    written = ast.parse(fit_confidence.module_text("fit.py", agents)).body
+    names = {target.id for line in written if isinstance(line, ast.Assign) for target in line.targets}
+    assert names == {"THERE", "RIGHT", "VARIANCES", "CONFIDENCE"}
 
 
 INPUTS = range(1, 48, 2)  # one or two of each kind

@@ -71,7 +71,7 @@ SIGNS = {
 """
 
 # Table of C candidates: each column (C,), by name. Beside those of `SIGNS` it has `bias`, all 1, `confirmed`, 1
-# where the detections alone make it likely, and `pointless`, 1 where the LiDAR looks toward it and none of its detections has a point.
+# where the detections alone make it likely, and `pointless`, 1 where LiDAR rays go toward it and none of its detections has a point.
 Table = dict[str, Array]
 
 
@@ -297,7 +297,7 @@ MIN_SEEN_TICKS = 3
 
 
 def _sensed_columns(candidates: Sequence[AgentCandidate], recording: Recording) -> Table:
-    """Return the columns that rays and points tell, of candidates of which there are not too many."""
+    """Return the columns of rays and points, of candidates of which there are not too many."""
     agents = [c.agent for c in candidates]
     inside, through, before = count_rays(agents, recording.clouds, recording.timeline)
     met = inside + through

@@ -299,7 +299,7 @@ def probabilities(table: Table, *, lidar: bool, clutter: float = 0.0) -> tuple[A
     odds = log_odds_of(np.clip(there * state, MIN_PROBABILITY, MAX_PROBABILITY))
     if lidar:
         group = np.where(table["pedestrian"] > 0, 2, np.where(table["two_wheeler"] > 0, 1, 0))
-        offset, slope = np.array([CONFIDENCE[name] for name in ("vehicle", "two_wheeler", "pedestrian")])[group].T
+        offset, slope = np.array(list(CONFIDENCE.values()))[group].T
         odds = offset + slope * odds
     return there, np.clip(probability_of(odds), MIN_PROBABILITY, MAX_PROBABILITY)
 

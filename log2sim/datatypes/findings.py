@@ -63,7 +63,7 @@ AGENT_KINDS: Mapping[str, Kind] = {
     "passes_through": Kind({"": "passes through {other}", "static": "stands in {other}"}, ("at_s",)),
     "in_ego": Kind("touches the ego", ("at_s",)),
     "empty": Kind("{through_share:.0%} of the LiDAR's rays pass through its place", ("through_share",)),
-    "hardly_observed": Kind("the LiDAR looks toward it and has no point of it"),
+    "hardly_observed": Kind("LiDAR rays go toward it and it has no points"),
     "unlikely_size": Kind("is longer than the {limit_m:.1f} m of the longest {other}", ("limit_m",)),
     "heading_ambiguous": Kind("front and back may be swapped"),
 }

@@ -1,8 +1,8 @@
 """Fit the weights of the evidence by which agents are judged, and those of their systematic errors, on simulated logs.
 
     python tools/fit.py confidence_logs FOLDER --logs 60 --seed 2
-    python tools/fit.py confidence FOLDER ... > log2sim/agents/weights.py
-    python tools/fit.py confidence FOLDER ... --scales       # with the weights as they are, `CONFIDENCE` alone
+    python tools/fit.py confidence FOLDER ... > weights.py && mv weights.py log2sim/agents/
+    python tools/fit.py confidence FOLDER ... --scales       # then, of the weights that are there, the line of `CONFIDENCE`
 
 Goes on from the first passes that the former made, judges every candidate as `evaluate` does, also those that are dropped, and
 prints the module. Tables go to stderr: each fifth of the logs is rated by weights that fit the others; and each kind of content
@@ -369,6 +369,7 @@ def module_text(command: str, agents: Sequence[Rated]) -> str:
                 "    },",
             ]
         lines.append("}")
+    lines.append(f"CONFIDENCE = {dict.fromkeys(CONFIDENCE, (0.0, 1.0))}")
     return "\n".join(lines).replace("'", '"')
 
 
