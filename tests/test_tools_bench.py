@@ -7,10 +7,12 @@ import importlib
 import inspect
 import pickle
 import re
+import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
 
+import benchmarks.agents
 import numpy as np
 import pytest
 from benchmarks import poses
@@ -139,7 +141,7 @@ def test_scales_that_make_confidences_right_are_fitted_for_each_group():
 
 
 @pytest.mark.slow
-def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs():
+def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs(tmp_path: Path) -> None:
     log, scene, true = confidence_logs.make_log(1, 0)
     detector = confidence_logs.SimulatedDetector(log, scene, true, 3)
     camera, stamp = log.cameras["camera"], int(log.streams["camera"].t_ns[3])
@@ -162,6 +164,18 @@ def test_agents_of_a_synthetic_log_are_rated_and_its_detector_errs():
     written = ast.parse(fit_confidence.module_text("fit.py", agents)).body
     names = {target.id for line in written if isinstance(line, ast.Assign) for target in line.targets}
     assert names == {"THERE", "RIGHT", "VARIANCES", "CONFIDENCE"}
+    # The cases with a LiDAR are measured, with a rule or without.
+    (tmp_path / "1-000.pkl").write_bytes(pickle.dumps(cases))
+    found = benchmarks.agents.measured(tmp_path / "1-000.pkl")
+    assert [m["recall"] > 0.3 for _, m in found] == [True]
+    assert f"{found[0][1]['recall']:.3f} | {found[0][1]['precision']:.3f}" in benchmarks.agents.tables(found)
+    command = [sys.executable, TOOLS / "bench.py", "agents", tmp_path, "--jobs", "1", "--without"]
+    without = [
+        subprocess.run([*command, name], capture_output=True, text=True)
+        for name in ("tracking.tracker.track", "no.rule")
+    ]
+    assert "| 1 | 0.000 |" in without[0].stdout  # a log of which nothing is found
+    assert "no.rule" in without[1].stderr
 
 
 INPUTS = range(1, 48, 2)  # one or two of each kind

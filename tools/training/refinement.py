@@ -48,6 +48,7 @@ from log2sim.perception.detect3d.refinement import (
     points_within,
     toward_sensor,
 )
+from log2sim.perception.lidar.cloud import ON_GROUND_M
 from log2sim.synth.traffic import Mount
 from training.clouds import CALIBRATED_KINDS, REPORTED_KINDS, STEP_M, Example, draw_example
 from training.export import CATEGORIES, RAW_CALIBRATION, calibrate, describe, export_checked, report
@@ -77,6 +78,7 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
     All positions are relative to the centers of the boxes in the plane and to the ground in height.
     """
     xyz, _ = level_points(example.cloud, detector.range_m)
+    xyz = xyz[xyz[:, 2] > ON_GROUND_M]
     found = detector.candidates(example.cloud).boxes
     around = points_around(xyz, found, MARGIN_M + STORED_M)
     some = np.flatnonzero(points_within(around, xyz, found).count > 0)

@@ -190,10 +190,12 @@ class NetworkDetector:
                 boxes = boxes.take(best >= (least if self.refinement is None else np.minimum(least, MIN_FIRST_SCORE)))
             without = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
             boxes = boxes.take(suppress(boxes.rectangles, without, boxes.group, across=False))
+        above = np.flatnonzero(xyz[:, 2] > ON_GROUND_M)
+        xyz, index = xyz.T.take(above, axis=1).T, index.take(above)
         if self.refinement is not None:
             boxes, inside = self.refinement.refine(boxes, xyz, sensors)
         else:
-            inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
+            inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad)
         return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensors)))
 
     def _least(self, found: LevelBoxes) -> NDArray[np.float64]:

@@ -30,7 +30,6 @@ from log2sim.perception.detect3d.network import (
     first_line,
     open_session,
 )
-from log2sim.perception.lidar.cloud import ON_GROUND_M
 
 SUFFIX = ".boxes.onnx"
 METADATA_KEY = "log2sim.boxes"
@@ -59,9 +58,9 @@ class Refinement:
     def refine(self, boxes: LevelBoxes, xyz: NDArray[np.float32], sensors: Array) -> tuple[LevelBoxes, PointsOfBoxes]:
         """Correct boxes by their points; those without points are left out.
 
-        `xyz`: (N, 3), m: level frame. `sensors`: (V, 2), m: where they were measured from.
+        `xyz`: (N, 3), m: level frame, above the ground. `sensors`: (V, 2), m: where they were measured from.
 
-        Returns the boxes, each of its most probable group, whose heat is the logit of that, and their points above the ground.
+        Returns the boxes, each of its most probable group, whose heat is the logit of that, and their points.
         """
         around = points_around(xyz, boxes)
         inside = points_within(around, xyz, boxes)
@@ -93,10 +92,10 @@ def toward_sensor(boxes: LevelBoxes, sensors: Array) -> Array:
 
 
 def points_around(xyz: NDArray[np.float32], boxes: LevelBoxes, margin_m: float = MARGIN_M) -> PointsOfBoxes:
-    """Find the points (N, 3) above the ground in boxes and up to a margin around them, at any height."""
+    """Find the points (N, 3) in boxes and up to a margin around them, at any height."""
     center, size = boxes.center_m.copy(), boxes.size_m + 2 * margin_m
     center[:, 2], size[:, 2] = 0.0, 2 * MAX_HEIGHT_M
-    return points_of_boxes(xyz, center, size, boxes.yaw_rad, xyz[:, 2] > ON_GROUND_M)
+    return points_of_boxes(xyz, center, size, boxes.yaw_rad)
 
 
 def points_within(around: PointsOfBoxes, xyz: NDArray[np.float32], boxes: LevelBoxes) -> PointsOfBoxes:
