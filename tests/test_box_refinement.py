@@ -21,6 +21,7 @@ from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.detect3d.boxes import LevelBoxes
 from log2sim.perception.detect3d.detectors import create_lidar_detector, open_network, open_shipped
 from log2sim.perception.detect3d.refinement import MOST_POINTS, box_inputs, points_around
+from log2sim.perception.lidar.cloud import ON_GROUND_M
 
 
 def boxes_at(rows: Sequence[Sequence[float]]) -> LevelBoxes:
@@ -85,6 +86,7 @@ def test_boxes_without_points_are_left_out_and_none_are_fine(tmp_path: Path) -> 
     assert len(detector.detect(cloud_of(np.zeros((0, 3))))) == 0
     assert len(detector.detect(cloud_of(np.full((5, 3), np.nan)))) == 0
     xyz = solid(10, 6).astype(np.float32)
+    xyz = xyz[xyz[:, 2] > ON_GROUND_M]
     boxes, inside = detector.refinement.refine(boxes_at([BOX, (30.5, 30.5, *BOX[2:])]), xyz, np.zeros((1, 2)))
     assert (len(boxes), inside.boxes) == (1, 1)
 

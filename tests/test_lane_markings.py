@@ -14,7 +14,7 @@ from log2sim.geometry import Array, Camera, apply, ground_homography, inverse, p
 from log2sim.road.lane_course import RoadShape, find_lane_lines
 from log2sim.road.lane_picture import find_markings_in_picture
 from log2sim.road.markings import find_markings
-from log2sim.road.paint import log_odds_of_line, no_pieces
+from log2sim.road.paint import Pieces, by_lidar, log_odds_of_line, log_probabilities_of_shares, no_pieces
 from log2sim.road.strokes import stretches_of
 
 GRAVEL = (120, 125, 130)
@@ -181,6 +181,26 @@ def test_wet_paint_returns_little_and_glare_nothing(change) -> None:
     precision, recall, _ = compare(find_markings(painter.ground(reflects=0.015, noise=0.01))[0], truth)
     assert precision >= 0.95
     assert recall >= 0.8
+
+
+def test_how_much_paint_returns_is_weighed_where_few_lines_leave_it_open() -> None:
+    """Lines that return as wet paint does make each other likelier one by one; bright seams of a dry road do not."""
+    seen = {"color": 0.4, "reflected_sigma": 0.01, "width_m": 0.12, "outshines": 0.4, "edge_m": 0.04, "uneven": 0.0}
+
+    def line(reflected: float) -> Pieces:
+        return no_pieces(6, **{k: np.full(6, v) for k, v in (seen | {"reflected": reflected, "resolved": 1.0}).items()})
+
+    wet, dry = line(0.1), line(0.8)
+    shares = [log_probabilities_of_shares([(wet, 12.0, 1)] * k + [(line(0.0), 12.0, 1)]) for k in range(5)]
+    odds = [by_lidar(wet, of) for of in shares]
+    assert odds == sorted(odds)
+    assert by_lidar(wet) < 0 < odds[0] < odds[-1]
+    np.testing.assert_allclose([np.exp(of).sum() for of in shares], 1.0)
+    # Between what it is on a dry road and with the share that fits it best, as long as that is open.
+    alone = [by_lidar(wet, np.where(np.arange(len(shares[0])) == k, 0.0, -np.inf)) for k in range(len(shares[0]))]
+    assert alone[-1] < odds[0] < max(alone)
+    on_dry = log_probabilities_of_shares([(dry, 12.0, 1)] * 3 + [(line(0.0), 12.0, 1)])
+    assert by_lidar(line(0.0), on_dry) == pytest.approx(by_lidar(line(0.0)), abs=1e-3)
 
 
 def test_lidar_says_nothing_of_paint_that_its_points_miss() -> None:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.paint import Pieces, log_odds_of_line, returned_share
+from log2sim.road.paint import Pieces, log_odds_of_line, log_probabilities_of_shares
 from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
 
@@ -289,10 +289,10 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
                 continue
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
             parts.append((xy, stretch, member, traced.painted_m(begin, end)))
-    returned = returned_share((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in parts)
+    shares = log_probabilities_of_shares((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in parts)
     out = []
     for xy, stretch, member, painted_m in parts:
-        odds = log_odds_of_line(member, painted_m, dashes=stretch.dashes, returned=returned)
+        odds = log_odds_of_line(member, painted_m, dashes=stretch.dashes, shares=shares)
         out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
     return _in_context(drop_repeats(out))
 

@@ -246,16 +246,22 @@ MIN_LIDAR_DASH_M = 2.0
 MIN_ABOVE_ROAD, NO_BRIGHTER = 0.15, -4.0
 MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
+# Shares of the usual contrast that are compared. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which compress
+# strong returns, a fifth; that one map in ten is such is an assumption.
+RETURNED, LOW_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
+DRY = np.where(RETURNED < 1, -np.inf, 0.0)  # log-probabilities
+
 
 def log_odds_of_line(
-    pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True, returned: float = 1.0
+    pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True, shares: Array = DRY
 ) -> float:
     """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks.
 
-    `returned`: share of its usual contrast that paint has in LiDAR intensities of this map, see `returned_share`.
+    `shares`: log-probabilities of the shares of its usual contrast that paint has in LiDAR intensities of this map, see
+    `log_probabilities_of_shares`; by default all of it.
     """
     if np.isfinite(pieces.color).any():
-        return log_odds_by_camera(pieces, painted_m, dashes=dashes, alone=alone) + by_lidar(pieces, returned)
+        return log_odds_by_camera(pieces, painted_m, dashes=dashes, alone=alone) + by_lidar(pieces, shares)
     # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen. Rings of the road
     # between darker ones stand out as paint does, but return no more than the road.
     odds = min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(by_lidar(pieces), MAX_BY_LIDAR_ALONE)
@@ -298,28 +304,25 @@ def _by_shape(pieces: Pieces, *, alone: bool) -> float:
     return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
 
 
-# Shares of the usual contrast that are compared. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which compress
-# strong returns, a fifth; that one map in ten is such is an assumption.
-RETURNED, LOW_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
 # Errors that all returns along a line share, as by the angle of a ring to the ground.
 SHARED_SIGMA = 0.015
 MIN_PAINTED_M = 4.0  # of lines by which that share is estimated
 
 
-def by_lidar(pieces: Pieces, returned: float = 1.0) -> float:
-    """Log-odds by LiDAR intensity, whose contrasts are a share of what they usually are; 0 where it saw too little."""
+def by_lidar(pieces: Pieces, shares: Array = DRY) -> float:
+    """Log-odds by LiDAR intensity, given the log-probabilities of the shares that paint returns; 0 where it saw too little."""
     contrast = _reflected(pieces)
     if contrast is None:
         return 0.0
-    paint, other = _log_densities(np.array(contrast), returned)
+    paint, other = (float(np.logaddexp.reduce(of + shares)) for of in _log_densities(np.array(contrast), RETURNED))
     return float(np.clip(paint - other, -MAX_BY_LIDAR, MAX_BY_LIDAR))
 
 
-def returned_share(lines: Iterable[tuple[Pieces, float, int]]) -> float:
-    """Estimate which share of its usual contrast paint has in LiDAR intensities of a map.
+def log_probabilities_of_shares(lines: Iterable[tuple[Pieces, float, int]]) -> Array:
+    """Estimate how probable it is that paint has each share in `RETURNED` of its usual contrast in LiDAR intensities of a map.
 
-    `lines`: pieces, length with paint, m, and number of dashes. Of those that stand out to a camera, the likelihood of the
-    contrasts to LiDAR is the highest with that share, each of paint as likely as the camera says or of something else.
+    `lines`: pieces, length with paint, m, and number of dashes. Those that stand out to a camera count, by the likelihood of their
+    contrasts to LiDAR, each of paint as likely as the camera says or of something else. Few lines often leave it open.
     """
     odds, contrasts = [], []
     for pieces, painted_m, dashes in lines:
@@ -328,12 +331,13 @@ def returned_share(lines: Iterable[tuple[Pieces, float, int]]) -> float:
             odds.append(log_odds_by_camera(pieces, painted_m, dashes=dashes))
             contrasts.append(contrast)
     if not contrasts:
-        return 1.0
+        return DRY
     paint, other = _log_densities(np.array(contrasts)[:, None], RETURNED)
     by_camera = np.array(odds)[:, None]
     likelihood = np.logaddexp(paint + by_camera, other) - np.logaddexp(by_camera, 0)
     prior = np.log(np.where(RETURNED < 1, LOW_PRIOR / (len(RETURNED) - 1), 1 - LOW_PRIOR))
-    return float(RETURNED[np.argmax(likelihood.sum(axis=0) + prior)])
+    total = likelihood.sum(axis=0) + prior
+    return np.asarray(total - np.logaddexp.reduce(total))
 
 
 def _reflected(pieces: Pieces) -> tuple[float, float, float] | None:
@@ -346,7 +350,7 @@ def _reflected(pieces: Pieces) -> tuple[float, float, float] | None:
     return median(values), float(error), median(pieces.resolved[known])
 
 
-def _log_densities(reflected: Array, returned: Array | float) -> tuple[Array, Array]:
+def _log_densities(reflected: Array, returned: Array) -> tuple[Array, Array]:
     """Logarithms of the densities (...) of contrasts (..., 3), see `_reflected`, for paint and for something else."""
     mean, error, resolved = np.moveaxis(reflected, -1, 0)
     # Paint that LiDAR does not resolve looks like something else.
