@@ -3,8 +3,8 @@
     python tools/fit.py confidence_logs FOLDER --logs 20 --seed 17
     python tools/bench.py agents FOLDER ... [--without agents.judge.resolve_conflicts ...]
 
-Goes on from the first passes in the folders; logs in which sweeps are searched count. `--without` switches rules and constants off, by
-the names that `tools/ablate.py` gives them.
+Goes on from the first passes in the folders; logs count in which sweeps are searched and anything is reconstructed. `--without` switches
+rules and constants off, by the names that `tools/ablate.py` gives them.
 """
 
 from __future__ import annotations
