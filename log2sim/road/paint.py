@@ -246,8 +246,8 @@ MIN_LIDAR_DASH_M = 2.0
 MIN_ABOVE_ROAD, NO_BRIGHTER = 0.15, -4.0
 MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
-# Shares of the usual contrast that are compared. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which compress
-# strong returns, a fifth; that one map in ten is such is an assumption.
+# Shares that are compared of the contrast which dry paint has. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which
+# compress strong returns, a fifth; that one map in ten is such is an assumption.
 RETURNED, LOW_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
 DRY = np.where(RETURNED < 1, -np.inf, 0.0)  # log-probabilities
 
@@ -257,7 +257,7 @@ def log_odds_of_line(
 ) -> float:
     """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks.
 
-    `shares`: log-probabilities of the shares of its usual contrast that paint has in LiDAR intensities of this map, see
+    `shares`: log-probabilities of the shares of its dry contrast that paint has in LiDAR intensities of this map, see
     `log_probabilities_of_shares`; by default all of it.
     """
     if np.isfinite(pieces.color).any():
@@ -319,10 +319,10 @@ def by_lidar(pieces: Pieces, shares: Array = DRY) -> float:
 
 
 def log_probabilities_of_shares(lines: Iterable[tuple[Pieces, float, int]]) -> Array:
-    """Estimate how probable it is that paint has each share in `RETURNED` of its usual contrast in LiDAR intensities of a map.
+    """Estimate how probable it is that paint has each share in `RETURNED` of its dry contrast in LiDAR intensities of a map.
 
     `lines`: pieces, length with paint, m, and number of dashes. Those that stand out to a camera count, by the likelihood of their
-    contrasts to LiDAR, each of paint as likely as the camera says or of something else. Few lines often leave it open.
+    contrasts to LiDAR, each of paint as likely as by the camera or of something else. Few lines often leave it open.
     """
     odds, contrasts = [], []
     for pieces, painted_m, dashes in lines:

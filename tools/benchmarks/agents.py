@@ -4,7 +4,7 @@
     python tools/bench.py agents FOLDER ... [--without agents.judge.resolve_conflicts ...]
 
 Goes on from the first passes in the folders; logs count in which sweeps are searched and anything is reconstructed. `--without` switches
-rules and constants off, by the names that `tools/ablate.py` gives them.
+rules and constants off, by the names that `tools/ablate.py` gives them; what answers yes or no answers no.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from benchmarks.table import markdown
 from log2sim.agents.weights import CONFIDENCE
 from log2sim.config import Config
 from log2sim.datatypes import GROUP_OF
-from log2sim.errors import ConfigError, NothingToReconstruct
+from log2sim.errors import NothingToReconstruct
 from log2sim.evaluation.metrics.correctness import reliability
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.metrics.verdicts import MAX_WRONG_SHARE
@@ -50,12 +50,12 @@ def measured(path: Path) -> list[tuple[bool, dict[str, Any]]]:
 
 
 def switch_off(names: list[str]) -> None:
-    """Switch rules and constants off in this process and in those that it forks; `ConfigError` for a name that there is not."""
-    known = {v.label: v for v in variations(Config()) if v.module}
+    """Switch rules and constants off in this process and in those that it forks; ends it at a name that there is not."""
+    known = {v.label: v for v in variations(Config()) if v.module and v.change != "always"}
     imports = Imports(method_modules())
     for name in names:
         if name not in known:
-            raise ConfigError(f"--without {name}: no rule or constant has this name")
+            raise SystemExit(f"--without {name}: no rule or constant has this name")
         imports.put(known[name].module, known[name].name, known[name].value)
 
 
@@ -65,30 +65,26 @@ def tables(found: list[tuple[bool, dict[str, Any]]]) -> str:
     for images, name in SEARCHED.items():
         own = [result for of, result in found if of == images]
         count = {key: sum(m["counts"][key] for m in own) for key in ("truth_ticks", "matched_ticks", "false_ticks")}
-        hota = (
-            np.average([m["hota"] or 0.0 for m in own], weights=[m["counts"]["truth_ticks"] for m in own])
-            if own
-            else np.nan
+        hota = sum(m["counts"]["truth_ticks"] * (m["hota"] or 0.0) for m in own)
+        wrong = sum(m["correctness"]["wrong"]["ticks"] for m in own)
+        shares = (
+            (count["matched_ticks"], count["truth_ticks"]),
+            (count["matched_ticks"], count["matched_ticks"] + count["false_ticks"]),
+            (hota, count["truth_ticks"]),
+            (wrong, sum(m["correctness"]["ticks"] for m in own)),
         )
-        wrong, ticks = (
-            sum(v)
-            for v in ([m["correctness"]["wrong"]["ticks"] for m in own], [m["correctness"]["ticks"] for m in own])
-        )
-        precision = count["matched_ticks"] / max(count["matched_ticks"] + count["false_ticks"], 1)
-        shares = count["matched_ticks"] / max(count["truth_ticks"], 1), precision, hota, wrong / max(ticks, 1)
-        rows.append([name, str(len(own)), *(f"{v:.3f}" for v in shares)])
+        rows.append([name, str(len(own)), *(f"{part / max(whole, 1):.3f}" for part, whole in shares)])
     of_agents = []
     for group in CONFIDENCE:
         agents = [a for _, m in found for a in m["correctness"]["judged_agents"] if GROUP_OF[a["category"]] == group]
+        if not agents:
+            continue
         columns = ("ticks", "wrong_ticks", "confidence", "doubted", "backwards_ticks")
         ticks, wrong, confidence, doubted, backwards = (np.array([a[key] for a in agents]) for key in columns)
-        if not len(agents):
-            continue
         error = reliability(confidence, wrong <= MAX_WRONG_SHARE * ticks)["expected_calibration_error"]
         of_doubted = [(of * doubted).sum() / max(of.sum(), 1) for of in (wrong, ticks - wrong)]
-        of_agents.append(
-            [group, str(len(agents)), *(f"{v:.3f}" for v in (error, *of_doubted, backwards.sum() / ticks.sum()))]
-        )
+        shares = error, *of_doubted, backwards.sum() / ticks.sum()
+        of_agents.append([group, str(len(agents)), *(f"{v:.3f}" for v in shares)])
     return f"{markdown(LOG_HEAD, rows)}\n\n{markdown(AGENT_HEAD, of_agents)}"
 
 
@@ -96,7 +92,7 @@ def main(folders: list[Path], without: list[str] = [], jobs: int = 2) -> None:
     """Measure and print."""
     paths = sorted(path for folder in folders for path in folder.glob("*.pkl"))
     if not paths:
-        raise ConfigError(f"{', '.join(map(str, folders))}: no first passes; `tools/fit.py confidence_logs` makes them")
+        raise SystemExit(f"{', '.join(map(str, folders))}: no first passes; `tools/fit.py confidence_logs` makes them")
     switch_off(without)
     with multiprocessing.get_context("fork").Pool(jobs) as pool:
         print(tables([row for rows in pool.imap_unordered(measured, paths) for row in rows]))

@@ -191,7 +191,7 @@ class NetworkDetector:
             without = boxes.score(info, boxes.terms(np.zeros(len(boxes)), ranges_m(boxes, sensors)))
             boxes = boxes.take(suppress(boxes.rectangles, without, boxes.group, across=False))
         above = np.flatnonzero(xyz[:, 2] > ON_GROUND_M)
-        xyz, index = xyz.T.take(above, axis=1).T, index.take(above)
+        xyz, index = xyz.T.take(above, axis=1).T, index.take(above)  # values of one coordinate still side by side
         if self.refinement is not None:
             boxes, inside = self.refinement.refine(boxes, xyz, sensors)
         else:
