@@ -86,4 +86,4 @@ VARIANCES = {
     "sigma_speed_mps": {"given": 10.1, "standing": 1.57, "moving": 0.27},
 }
 
-CONFIDENCE = {"vehicle": (-0.153, 1.05), "two_wheeler": (-0.258, 1.2), "pedestrian": (0.288, 1.18)}
+CONFIDENCE = {"vehicle": (-0.164, 1.08), "two_wheeler": (-0.208, 1.23), "pedestrian": (0.163, 1.24)}

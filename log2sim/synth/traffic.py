@@ -76,7 +76,8 @@ class TrafficScene:
 
 REACH_M = 60.0
 OWN_CAR_M = (4.4, 1.8, 1.5)
-WALKING_MPS, RIDING_MPS = 1.4, 5.0
+# Medians and the standard deviation of logarithms of those who walk (Weidmann 1993: 1.34 m/s, less in groups, more of runners) and ride.
+WALKING_MPS, RIDING_MPS, SPEED_SIGMA = 1.34, 4.5, 0.4
 # Shares of what stands before a wall.
 AT_WALLS = {
     "person": 0.15, "bicycle": 0.12, "motorcycle": 0.13, "stand": 0.2, "bin": 0.15, "pole": 0.1, "planter": 0.05, "corner": 0.07, "sign board": 0.03,
@@ -132,6 +133,10 @@ class _Layout:
         place = np.append(xy, self.surface.elevation(xy))
         self.objects.append(TrafficObject(category, place, yaw, size, parts, speed, turn, kind))
         return True
+
+    def draw_speed(self, median: float) -> float:
+        """Draw how fast somebody walks or rides, m/s."""
+        return float(median * np.exp(SPEED_SIGMA * self.rng.spawn(1)[0].normal()))
 
     def one_of(self, shares: dict[str, float]) -> str:
         """Draw one of some kinds of small things that are not left out; "" where all are."""
@@ -213,7 +218,8 @@ def _close(out: _Layout, road: Road) -> None:
         xy, direction = road.at(rng.uniform(-6, 8), own + rng.choice([-1, 1]) * rng.uniform(1.3, 3))
         category = str(rng.choice(["pedestrian", "cyclist", "motorcycle"], p=[0.5, 0.35, 0.15]))
         yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
-        speed = (WALKING_MPS if category == "pedestrian" else RIDING_MPS) * float(rng.random() < 0.7)
+        median = WALKING_MPS if category == "pedestrian" else RIDING_MPS
+        speed = out.draw_speed(median) * float(rng.random() < 0.7)
         out.add_user(category, xy, yaw, speed=speed, margin=0.0)
 
 
@@ -289,7 +295,7 @@ def _people(out: _Layout, road: Road) -> None:
         xy, direction = road.at(rng.uniform(-40, 40), side * (half + rng.uniform(-1.5, 5)))
         across = rng.random() < 0.3
         yaw = direction + (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(0, 0.3)
-        out.add_user("pedestrian", xy, yaw, speed=WALKING_MPS * float(rng.random() < 0.6), margin=0.02)
+        out.add_user("pedestrian", xy, yaw, speed=out.draw_speed(WALKING_MPS) * float(rng.random() < 0.6), margin=0.02)
     for _ in range(rng.choice(3, p=[0.45, 0.35, 0.2])):
         middle, direction = road.at(rng.uniform(-30, 30), rng.choice([-1, 1]) * (half + rng.uniform(-3, 4)))
         spread = rng.uniform(0.4, 1.5)
@@ -308,7 +314,7 @@ def _people(out: _Layout, road: Road) -> None:
     for _ in range(rng.poisson(rng.choice([1, 4, 8]))):
         xy, direction = road.at(rng.uniform(-40, 40), rng.choice([-1, 1]) * (half + rng.uniform(-2.5, 2.5)))
         yaw = direction + np.pi * rng.integers(2) + rng.normal(0, 0.2)
-        speed = RIDING_MPS * float(rng.random() < 0.8)
+        speed = out.draw_speed(RIDING_MPS) * float(rng.random() < 0.8)
         out.add_user(str(rng.choice(["cyclist", "motorcycle"], p=[0.65, 0.35])), xy, yaw, speed=speed, margin=0.1)
     for _ in range(rng.choice(3, p=[0.5, 0.3, 0.2])):
         xy, direction = road.at(rng.uniform(-25, 25), rng.choice([-1, 1]) * (half + rng.uniform(0.2, 4)))
