@@ -14,8 +14,17 @@ from log2sim.geometry import Array, Camera, apply, ground_homography, inverse, p
 from log2sim.road.lane_course import RoadShape, find_lane_lines
 from log2sim.road.lane_picture import find_markings_in_picture
 from log2sim.road.markings import find_markings
-from log2sim.road.paint import Pieces, by_lidar, log_odds_of_line, log_probabilities_of_shares, no_pieces
+from log2sim.road.paint import (
+    Pieces,
+    by_lidar,
+    evidence_of_line,
+    log_odds_of,
+    log_probabilities_of_shares,
+    no_pieces,
+    table_of,
+)
 from log2sim.road.strokes import stretches_of
+from log2sim.road.weights import WEIGHTS
 
 GRAVEL = (120, 125, 130)
 EXTENT = (0.0, 50.0, -10.0, 14.0)
@@ -160,16 +169,20 @@ def test_what_a_shadow_leaves_of_a_bar_is_no_dash_of_the_line_behind_the_crosswa
     assert markings["dashed"].points_m[:, 0].min() == pytest.approx(41, abs=0.3)
 
 
+def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, bars: bool = False) -> float:
+    return log_odds_of(
+        evidence_of_line(pieces, painted_m, dashes=dashes, bars=bars), WEIGHTS[table_of(pieces, bars=bars)]
+    )
+
+
 def test_rings_that_return_what_the_road_does_are_no_paint() -> None:
     """Without a camera: rings between darker ones stand out as much as paint beside the road."""
-    each = {"reflected": 0.6, "reflected_sigma": 0.05, "width_m": 0.5, "color": np.nan}
+    each = {"reflected": 0.9, "reflected_sigma": 0.05, "width_m": 0.55, "color": np.nan, "beside_road": 0.0}
     rings, paint = (
         no_pieces(6, **{name: np.full(6, value) for name, value in (each | {"above_road": above}).items()})
-        for above in (0.0, 0.6)
+        for above in (0.0, 0.9)
     )
-    assert (
-        log_odds_of_line(rings, 14.0, dashes=6, alone=False) < 0 < log_odds_of_line(paint, 14.0, dashes=6, alone=False)
-    )
+    assert log_odds_of_line(rings, 14.0, dashes=12, bars=True) < 0 < log_odds_of_line(paint, 14.0, dashes=12, bars=True)
 
 
 @pytest.mark.parametrize("change", [None, wet_glare], ids=["wet", "glare"])
@@ -185,7 +198,7 @@ def test_wet_paint_returns_little_and_glare_nothing(change) -> None:
 
 def test_how_much_paint_returns_is_weighed_where_few_lines_leave_it_open() -> None:
     """Lines that return as wet paint does make each other likelier one by one; bright seams of a dry road do not."""
-    seen = {"color": 0.4, "reflected_sigma": 0.01, "width_m": 0.12, "outshines": 0.4, "edge_m": 0.04, "uneven": 0.0}
+    seen = {"color": 0.4, "reflected_sigma": 0.01, "width_m": 0.12, "outshines": 0.4}
 
     def line(reflected: float) -> Pieces:
         return no_pieces(6, **{k: np.full(6, v) for k, v in (seen | {"reflected": reflected, "resolved": 1.0}).items()})
@@ -205,20 +218,26 @@ def test_how_much_paint_returns_is_weighed_where_few_lines_leave_it_open() -> No
 
 def test_lidar_says_nothing_of_paint_that_its_points_miss() -> None:
     seen = {"color": 0.4, "reflected": 0.0, "reflected_sigma": 0.05, "width_m": 0.12, "outshines": 0.4}
-    seen |= {"edge_m": 0.04, "uneven": 0.0}
+    seen |= {"beside_road": 0.0, "above_road": 0.0}
 
     def odds(**more: float) -> float:
         return log_odds_of_line(no_pieces(6, **{k: np.full(6, v) for k, v in (seen | more).items()}), 12.0, dashes=1)
 
-    assert odds(resolved=0.0) == pytest.approx(odds(reflected=np.nan))
+    missed = no_pieces(6, **{k: np.full(6, v) for k, v in (seen | {"resolved": 0.0}).items()})
+    assert by_lidar(missed) == pytest.approx(0.0, abs=1e-9)
     assert odds(resolved=0.0) > odds(resolved=0.5) > odds(resolved=1.0)
 
 
-def test_regular_dashes_are_paint_to_a_lidar_alone_and_rings_on_grass_are_not() -> None:
-    each = {"reflected": 0.28, "reflected_sigma": 0.05, "width_m": 0.35, "color": np.nan, "above_road": 0.45}
-    pieces = no_pieces(8, **{name: np.full(8, value) for name, value in each.items()})
-    odds = {(m, n): log_odds_of_line(pieces, m * n, dashes=n) for m, n in ((2.5, 8), (10.0, 2), (1.2, 8), (1.2, 17))}
-    assert odds[2.5, 8] > 0 > max(odds[10.0, 2], odds[1.2, 8], odds[1.2, 17])
+def test_to_a_lidar_alone_narrow_lines_beside_a_road_are_paint_and_rings_on_grass_are_not() -> None:
+    each = {"reflected": 0.6, "reflected_sigma": 0.05, "width_m": 0.15, "color": np.nan, "above_road": 0.6}
+
+    def odds(**more: float) -> float:
+        pieces = no_pieces(
+            8, **{name: np.full(8, value) for name, value in (each | {"beside_road": 0.0} | more).items()}
+        )
+        return log_odds_of_line(pieces, 24.0, dashes=8)
+
+    assert odds() > 0 > max(odds(beside_road=0.4), odds(width_m=0.5))
 
 
 def test_two_solid_lines_before_and_behind_a_junction_are_no_dashes() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,10 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.paint import Pieces, log_odds_of_line, log_probabilities_of_shares
+from log2sim.road.paint import Pieces, evidence_of_line, log_odds_of, log_probabilities_of_shares, table_of
 from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
+from log2sim.road.weights import WEIGHTS
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
 # The longest gaps of dashed lines are 12 m (Germany: 12 m at 6 m dashes; MUTCD: 30 ft = 9.1 m; UK: 7 m; Japan: 12 m).
@@ -226,11 +228,11 @@ MIN_LINE_M = 1.0
 MIN_YELLOW = 0.2
 REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 # Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
-BESIDE_M, MAX_BESIDE, CROWDED = (0.45, 1.7), 1, -5.0
+BESIDE_M, MAX_BESIDE = (0.45, 1.7), 1
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
 # Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
-REMNANT_SHARE, REMNANT = 0.65, -6.0
+REMNANT_SHARE = 0.65
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
 
@@ -244,7 +246,12 @@ class PaintedLine:
     width_m: float
     pieces: Pieces  # what shows it
     dashes: int
-    log_odds: float  # that it is a marking
+    evidence: dict[str, float]  # that it is a marking, see `evidence_of_line`
+
+    @cached_property
+    def log_odds(self) -> float:
+        """Log-odds that it is a marking."""
+        return log_odds_of(self.evidence, WEIGHTS[table_of(self.pieces)])
 
     @property
     def length_m(self) -> float:
@@ -292,8 +299,8 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
     shares = log_probabilities_of_shares((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in parts)
     out = []
     for xy, stretch, member, painted_m in parts:
-        odds = log_odds_of_line(member, painted_m, dashes=stretch.dashes, shares=shares)
-        out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, odds))
+        evidence = evidence_of_line(member, painted_m, dashes=stretch.dashes, shares=shares)
+        out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, evidence))
     return _in_context(drop_repeats(out))
 
 
@@ -323,7 +330,7 @@ def _dense(xy: Array) -> Array:
 
 
 def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
-    """Lower the log-odds of lines that form combs or grids, or run beside much brighter ones."""
+    """Add to the evidence which lines form combs or grids, or run beside much brighter ones."""
     if len(lines) < 2:
         return lines
     dense = [_dense(line.xy)[::5] for line in lines]
@@ -347,17 +354,17 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     beside = count > BESIDE_PER_M * length[i]
     i, j = i[beside], j[beside]
     crowded = np.bincount(i[_alike(lines, contrast, i, j)], minlength=len(lines)) > MAX_BESIDE
-    added = np.where(crowded, CROWDED, 0.0)
     # Combs do not tell against what they cross, unless that is a comb, too.
     k, other, _ = _counted(owner[a[crossing]], owner[b[crossing]])
     told = _alike(lines, contrast, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
     crossings = np.bincount(k[told], minlength=len(lines))
-    added += np.where((crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length), CROWDED, 0.0)
+    grid = (crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length)
     brighter = odds[j] > odds[i] - 1
     brightest = np.full(len(lines), -np.inf)
     np.maximum.at(brightest, i[brighter], contrast[j[brighter]])
-    added += np.where(np.isfinite(brightest) & (contrast < REMNANT_SHARE * brightest), REMNANT, 0.0)
-    return [replace(line, log_odds=line.log_odds + more) for line, more in zip(lines, added.tolist())]
+    remnant = np.isfinite(brightest) & (contrast < REMNANT_SHARE * brightest)
+    context = zip(lines, (crowded.astype(float) + grid).tolist(), remnant.astype(float).tolist())
+    return [replace(line, evidence=line.evidence | {"crowded": c, "remnant": r}) for line, c, r in context]
 
 
 def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:

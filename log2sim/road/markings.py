@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -18,7 +19,17 @@ from log2sim.datatypes import Marking, RoadBorder
 from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.lines import Chain, PaintedLine, color_of, dashed_chains, find_lines, sources_of, touching_chains
-from log2sim.road.paint import Pieces, at_height, find_pieces, fit_lines, log_odds_of_line, no_pieces, probability
+from log2sim.road.paint import (
+    Pieces,
+    at_height,
+    evidence_of_line,
+    find_pieces,
+    fit_lines,
+    log_odds_of,
+    no_pieces,
+    probability,
+    table_of,
+)
 from log2sim.road.ridges import (
     Layer,
     RidgePoints,
@@ -31,18 +42,17 @@ from log2sim.road.ridges import (
     warp,
 )
 from log2sim.road.strokes import Curve, fit_curve, thin, trace
+from log2sim.road.weights import WEIGHTS
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).
 BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
 MAX_BAR_TURN_RAD = np.deg2rad(10)
 MIN_BARS = 3
-SURE_BARS, FEW_BARS = 6, -3.0  # fewer are often side by side by chance in LiDAR intensities of grass
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
 STOP_WIDTH_M, STOP_LENGTH_M = (0.22, 0.85), (1.5, 20.0)
 LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
-ALONE = -1.0  # log-odds of a stop line beside which no lane line is seen
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
 MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
 # A plain stroke fills its rectangle, also where it is blurred; an arrow of as many widths length half of it.
@@ -61,7 +71,12 @@ class PaintedArea:
     outline: Array  # (P, 2), m
     width_m: float  # of a crosswalk its extent along the road, of others the lesser extent
     pieces: Pieces  # what shows it
-    log_odds: float  # that it is a marking
+    evidence: dict[str, float]  # that it is a marking, see `evidence_of_line`
+
+    @cached_property
+    def log_odds(self) -> float:
+        """Log-odds that it is a marking."""
+        return log_odds_of(self.evidence, WEIGHTS[table_of(self.pieces, bars=self.kind == "crosswalk")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +104,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
-        odds = log_odds_of_line(own, sum(lengths), dashes=len(chosen), alone=False)
-        if not np.isfinite(own.color).any() and len(chosen) < SURE_BARS:
-            odds += FEW_BARS
+        evidence = evidence_of_line(own, sum(lengths), dashes=len(chosen), bars=True)
         corners = []
         for _, bar in chosen:
             d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
@@ -100,7 +113,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         origin = np.mean(corners, axis=0)
         hull = cv2.approxPolyDP(cv2.convexHull((np.array(corners) - origin).astype(np.float32)), HULL_ERROR_M, True)
         outline = np.asarray(hull, np.float64).reshape(-1, 2) + origin
-        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, odds))
+        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, evidence))
     # What is left of a bar, as where a shadow parts it, is no line.
     inside = np.zeros(len(pieces), dtype=bool)
     for area in (area for area in areas if area.log_odds > 0):
@@ -159,7 +172,7 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
                 cross = chord[0] * tangent[1] - chord[1] * tangent[0]
                 angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
-            stops.append(replace(line, log_odds=line.log_odds + (ALONE if angle is None else 0.0)))
+            stops.append(replace(line, evidence=line.evidence | {"no_lane_line": float(angle is None)}))
         else:
             others.append(line)
     return stops, others
@@ -183,7 +196,7 @@ def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[Pain
             if not any(cv2.pointPolygonTest(other, middle, True) > -SAME_SYMBOL_M for other in outlines):
                 outlines.append(outline.astype(np.float32))
                 extent = np.array(cv2.minAreaRect(outlines[-1])[1])
-                areas.append(PaintedArea("other", outline, float(extent.min()), line.pieces, line.log_odds))
+                areas.append(PaintedArea("other", outline, float(extent.min()), line.pieces, line.evidence))
     return areas, [line for line in lines if id(line) not in used]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -17,6 +17,7 @@ from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.ridges import EXPECTED_COLOR, Layer, RidgePoints, Samples, log_intensity, sample
 from log2sim.road.surface import USUAL
+from log2sim.road.weights import WEIGHTS
 
 AROUND_M = 0.25
 
@@ -62,8 +63,6 @@ class Pieces:
     # where no camera saw it
     color: Array
     color_sigma: Array
-    uneven: Array  # (N,): difference of both sides
-    edge_m: Array  # (N,): length in which the edges rise from a quarter to three quarters of the contrast
     # (N,): logarithm by which it is brighter than the brightest quarter of the ground within 1.5 m, on the darker side
     outshines: Array
     yellow: Array  # (N,): contrast of yellowness
@@ -71,7 +70,10 @@ class Pieces:
     # where LiDAR saw too little
     reflected: Array
     reflected_sigma: Array
-    above_road: Array  # (N,): logarithm by which LiDAR intensity is above what the road around the ego's way returns
+    # `above_road`, `beside_road`: (N,): logarithms by which LiDAR intensity, there and on the darker side, is above what the road
+    # around the ego's way returns
+    above_road: Array
+    beside_road: Array
     resolved: Array  # (N,): share of paint there that LiDAR resolves
 
     def __len__(self) -> int:
@@ -108,24 +110,24 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     flat = (len(lines), ALONG_SAMPLES * len(across))
     seen = sample(ground, x.reshape(flat), y.reshape(flat))
     samples = Samples(*(a.reshape(x.shape) for a in (seen.bright, seen.yellow, seen.intensity)))
-    color, reflected = (_quiet(np.nanmean, a) for a in (samples.paint, samples.intensity))
+    color, intensity = (_quiet(np.nanmean, a) for a in (samples.paint, samples.intensity))
     by_camera = np.isfinite(color[:, np.abs(across) <= 0.5]).mean(1) > MIN_SEEN
     # Of values, not of their logarithms, in which edges that are blurred lie farther out.
-    left, right, edge = _edges(np.exp(np.where(by_camera[:, None], color, reflected)), across)
+    left, right = _edges(np.exp(np.where(by_camera[:, None], color, intensity)), across)
     shift, width = (left + right) / 2, right - left
     inside = np.abs(across - shift[:, None]) <= np.maximum(width / 2 - 0.02, 0.03)[:, None]
     # From the edges of the paint outwards, on either side: the road beside it, near and farther.
     away = [side * (across - shift[:, None]) - width[:, None] / 2 for side in (-1, 1)]
     sides = [[(distance > low) & (distance < high) for low, high in SIDES_M] for distance in away]
-    by_color = _contrast(samples.paint, inside, sides, one_side=True)
+    by_color = _contrast(samples.paint, inside, sides, one_side=True)[:2]
     yellow = _contrast(samples.yellow, inside, sides, one_side=True)[0]
-    by_lidar = _contrast(samples.intensity, inside, sides, one_side=False)
+    reflected, reflected_sigma, apart = _contrast(samples.intensity, inside, sides, one_side=False)
     xy = lines[:, :2] + shift[:, None] * np.stack([-s, c], 1)
     far = [side * (across - shift[:, None]) > width[:, None] / 2 + 0.1 for side in (-1, 1)]
     around = [_quiet(np.nanquantile, np.where(part, color, np.nan), q=0.75) for part in far]
     # Beside a road there are brighter grounds; the road itself is on one side at least.
     outshines = _quiet(np.nanmean, np.where(inside, color, np.nan)) - np.fmin(*around)
-    above_road = _quiet(np.nanmean, np.where(inside, reflected, np.nan)) - float(log_intensity(np.array(USUAL)))
+    above_road = _quiet(np.nanmean, np.where(inside, intensity, np.nan)) - float(log_intensity(np.array(USUAL)))
     resolved = np.ones(len(lines))
     if ground.spacing_m is not None:
         row, column = (np.rint(a).astype(int) for a in ground.raster.cells_of(lines[:, :2]))
@@ -134,9 +136,8 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
         # How likely one of points that are scattered at random so far apart lies within half the width of paint. Without a camera
         # the contrast is all there is to go by.
         resolved = np.where(by_camera, 1 - np.exp(-np.pi / 4 * (PAINT_WIDTH_M / spacing) ** 2), 1.0)
-    return Pieces(
-        xy, lines[:, 2], lines[:, 3], width, *by_color, edge, outshines, yellow, *by_lidar[:2], above_road, resolved
-    )
+    by_lidar = reflected, reflected_sigma, above_road, above_road - reflected - apart
+    return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, outshines, yellow, *by_lidar, resolved)
 
 
 def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
@@ -146,11 +147,8 @@ def _quiet(function: Any, values: NDArray[Any], **options: Any) -> Array:
         return np.asarray(function(values, axis=1, **options), np.float64)
 
 
-def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
-    """Positions (N,) left and right of the middle where profiles (N, P) fall to half of their contrast on that side.
-
-    The third result is the length in which they fall from three quarters to one.
-    """
+def _edges(profile: Array, across: Array) -> tuple[Array, Array]:
+    """Positions (N,) left and right of the middle where profiles (N, P) fall to half of their contrast on that side."""
     # Gaps, where LiDAR hit no cell, are filled from their neighbors; `soft` is blurred, too.
     known = np.isfinite(profile).astype(np.float64)
     total, count = cv2.blur(np.nan_to_num(profile), (3, 1)), cv2.blur(known, (3, 1))
@@ -160,7 +158,7 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
     peak = np.argmax(np.where(near, soft, -np.inf), axis=1)
     top = soft[np.arange(len(profile)), peak]
     # Lines wider than the blur have a flat top: its mean is nearer to the paint than its largest value.
-    edges, falls = [], []
+    edges = []
     distance = across - across[peak][:, None]
     roads = []
     for side in (-1, 1):
@@ -168,10 +166,8 @@ def _edges(profile: Array, across: Array) -> tuple[Array, Array, Array]:
         roads.append(np.where(flank, soft, np.inf).min(axis=1))
     for side, road, other in zip((-1, 1), roads, roads[::-1]):
         road = np.where(np.isfinite(road), road, np.where(np.isfinite(other), other, np.nan))
-        high, half, low = (_crossing(filled, peak, road + q * (top - road), side, across) for q in (0.75, 0.5, 0.25))
-        edges.append(half)
-        falls.append(side * (low - high))
-    return edges[0], edges[1], np.fmax(falls[0], falls[1])
+        edges.append(_crossing(filled, peak, road + (top - road) / 2, side, across))
+    return edges[0], edges[1]
 
 
 def _crossing(profile: Array, peak: NDArray[Any], half: Array, side: int, across: Array) -> Array:
@@ -218,33 +214,10 @@ def _masked_mean(values: Layer, mask: NDArray[Any]) -> Array:
     return np.asarray(np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0), np.float64)
 
 
-# Log-odds before anything but one ridge of a meter is known: on gravel, one in 20 is followed by paint.
-PRIOR = -3.0
-PER_METER = 0.8  # of paint in line, which texture seldom continues
-MAX_BY_LENGTH = 5.5
-PER_METER_MORE, MAX_BY_MORE = 0.03, 1.5  # of longer lines
-PER_DASH, MAX_DASHES = 0.75, 4  # of one length at one distance, from the third on
-# Sun between two shadows and wet glare are ridges to a camera, too: more than that it alone does not say.
-MAX_BY_CAMERA = 3.0
-UNEVEN = -1.5  # a step beside which a little stands out
-NOT_BRIGHTEST, MIN_OUTSHINING = -2.5, 0.4  # no brighter than much of the ground around; share of its contrast
-# Glare fades to its sides; paint ends. Lines of 0.3 m or less look alike to a camera.
-FADING, FADING_FROM_M, FADING_WIDTH_M = -5.0, 0.1, 0.3
-FADING_SHARE = 0.25  # of the width; 0.39 of a Gaussian's
-WIDTH_VARIES = -2.0
-WIDTH_UNUSUAL = -4.0
 # Contrast of logarithms of LiDAR intensity of paint and of other ridges: mean, sigma.
 PAINT_REFLECTS, OTHER_REFLECTS = (0.8, 0.35), (0.0, 0.12)
-# Dashes along lanes are up to 0.3 m wide (VwV-StVO: broad lines of 0.25 m and 0.3 m).
-MAX_DASH_WIDTH_M, WIDE_DASHES = 0.4, -2.0
-MAX_BY_LIDAR, MAX_BY_LIDAR_ALONE = 6.0, 3.0
-ALONE_PRIOR, ALONE_PER_METER, ALONE_AT_MOST = -6.0, 0.4, -1.0
+MAX_BY_LIDAR = 6.0
 MIN_REFLECTING = 2  # pieces
-# Rings of successive sweeps on grass are as regular as dashes, 3 m apart at 30 m/s, but shorter.
-MIN_LIDAR_DASH_M = 2.0
-# Paint returns three times as much as the road; worn and blurred, a sixth more.
-MIN_ABOVE_ROAD, NO_BRIGHTER = 0.15, -4.0
-MIN_WIDTH_M, MAX_WIDTH_M = 0.06, 0.7
 
 # Shares that are compared of the contrast which dry paint has. Under a film of water paint returns 7 to 15 % of it, to some LiDARs, which
 # compress strong returns, a fifth; that one map in ten is such is an assumption.
@@ -252,56 +225,56 @@ RETURNED, LOW_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
 DRY = np.where(RETURNED < 1, -np.inf, 0.0)  # log-probabilities
 
 
-def log_odds_of_line(
-    pieces: Pieces, painted_m: float, *, dashes: int, alone: bool = True, shares: Array = DRY
-) -> float:
-    """Log-odds that pieces in a line are a marking; `alone` unless others like it are beside it, as bars of crosswalks.
+MIN_OUTSHINING = 0.4  # share of its contrast
+PLAIN_CONTRAST = 0.2  # logarithm of color: worn paint
+MAX_DASHES = 4  # from the third on
+WIDE_M = 0.3  # up to which lane lines are as wide as any (VwV-StVO: broad lines of 0.25 m and 0.3 m)
+# Paint returns three times as much as the road; worn and blurred, a sixth more. Grass and sidewalks return a third more and beyond.
+MIN_ABOVE_ROAD, BRIGHT_GROUND = 0.15, 0.3
+
+
+def evidence_of_line(
+    pieces: Pieces, painted_m: float, *, dashes: int, shares: Array = DRY, bars: bool = False
+) -> dict[str, float]:
+    """Gather what tells whether pieces in a line, or in the `bars` of a crosswalk, are paint, by the names in `WEIGHTS`.
 
     `shares`: log-probabilities of the shares of its dry contrast that paint has in LiDAR intensities of this map, see
     `log_probabilities_of_shares`; by default all of it.
     """
-    if np.isfinite(pieces.color).any():
-        return log_odds_by_camera(pieces, painted_m, dashes=dashes, alone=alone) + by_lidar(pieces, shares)
-    # Intensities vary more than colors on grass and gravel: where no camera saw it, more of the line must be seen. Rings of the road
-    # between darker ones stand out as paint does, but return no more than the road.
-    odds = min(ALONE_PRIOR + ALONE_PER_METER * painted_m, ALONE_AT_MOST) + min(by_lidar(pieces), MAX_BY_LIDAR_ALONE)
-    odds += _by_dashes(dashes) if alone and painted_m >= MIN_LIDAR_DASH_M * dashes else 0.0
-    return odds + (NO_BRIGHTER if _median_known(pieces.above_road) < MIN_ABOVE_ROAD else 0.0)
+    by_camera, width_m = bool(np.isfinite(pieces.color).any()), median(pieces.width_m)
+    varies = median(np.abs(pieces.width_m - width_m)) / width_m if len(pieces) > 2 and not bars else 0.0
+    contrast = np.log(np.maximum(pieces.color, 1e-3) / PLAIN_CONTRAST)
+    if not by_camera:
+        contrast = np.log(np.maximum(pieces.reflected, 1e-3) / PAINT_REFLECTS[0])
+    bright = pieces.outshines > MIN_OUTSHINING * np.maximum(pieces.color, 1e-3)
+    evidence = {
+        "bias": 1.0,
+        "length": np.log(max(painted_m, 0.5)),
+        "dashes": np.log(dashes) if bars else min(max(dashes - 2, 0), MAX_DASHES),
+        "varies": np.clip((varies - 0.2) / 0.3, 0, 1),
+        "wide": np.clip((width_m - WIDE_M) / WIDE_M, 0, 1),
+        "contrast": np.clip(_median_known(contrast), -3, 1.5),
+        "outshone": np.clip((0.5 - _mean_known(bright, pieces.outshines)) / 0.4, 0, 1),
+        "reflects": by_lidar(pieces, shares if by_camera else DRY),
+        "dull": np.clip(1 - _median_known(pieces.above_road) / MIN_ABOVE_ROAD, 0, 2),
+        "bright_beside": np.clip(_median_known(pieces.beside_road) / BRIGHT_GROUND, 0, 1.5),
+    }
+    return {name: float(value) if np.isfinite(value) else 0.0 for name, value in evidence.items()}
 
 
-def log_odds_by_camera(pieces: Pieces, painted_m: float, *, dashes: int = 1, alone: bool = True) -> float:
-    """Log-odds that pieces in a line, some of which a camera saw, are a marking, by shape and color."""
-    odds = PRIOR + min(PER_METER * painted_m, MAX_BY_LENGTH) + min(PER_METER_MORE * painted_m, MAX_BY_MORE)
-    odds += _by_dashes(dashes) + _by_shape(pieces, alone=alone)
-    width = median(pieces.width_m)
-    by_width = 0.0 if MIN_WIDTH_M <= width <= MAX_WIDTH_M else WIDTH_UNUSUAL
-    if len(pieces) >= 3:
-        varies = median(np.abs(pieces.width_m - width)) / width
-        by_width += WIDTH_VARIES * float(np.clip((varies - 0.2) / 0.3, 0, 1))
-    odds += by_width
-    if alone and dashes > 1 and width > MAX_DASH_WIDTH_M:
-        odds += WIDE_DASHES
-    return min(odds, MAX_BY_CAMERA)
+def table_of(pieces: Pieces, *, bars: bool = False) -> str:
+    """Name the weights of the evidence for pieces: by what they are parts of, and by the sensors that saw enough of them."""
+    by_camera, by_lidar = bool(np.isfinite(pieces.color).any()), _reflected(pieces) is not None
+    if bars:
+        return "crosswalk, camera" if by_camera else "crosswalk, LiDAR"
+    if by_camera:
+        return "line, camera and LiDAR" if by_lidar else "line, camera"
+    return "line, LiDAR" if by_lidar else "line, few returns"
 
 
-def _by_dashes(dashes: int) -> float:
-    return PER_DASH * min(max(dashes - 2, 0), MAX_DASHES)
-
-
-def _by_shape(pieces: Pieces, *, alone: bool) -> float:
-    contrast = np.maximum(pieces.color, 1e-3)
-    odds = 0.0
-    uneven = _median_known(pieces.uneven / contrast)
-    odds += UNEVEN * float(np.clip((uneven - 0.5) / 0.5, 0, 1))
-    bright = pieces.outshines[np.isfinite(pieces.outshines)]
-    if len(bright) and alone:
-        share = float(np.mean(bright > MIN_OUTSHINING * contrast[np.isfinite(pieces.outshines)]))
-        odds += NOT_BRIGHTEST * float(np.clip((0.5 - share) / 0.4, 0, 1))
-    width, edge = median(pieces.width_m), _median_known(pieces.edge_m)
-    if width > FADING_WIDTH_M and edge > max(FADING_FROM_M, FADING_SHARE * width):
-        odds += FADING
-    typical = _median_known(pieces.color)
-    return odds + float(np.clip(np.log(max(typical, 1e-3) / 0.2), -2.0, 1.0))
+def log_odds_of(evidence: Mapping[str, float], weights: Mapping[str, float]) -> float:
+    """Add up evidence by its weights."""
+    return sum(weight * evidence.get(name, 0.0) for name, weight in weights.items())
 
 
 # Errors that all returns along a line share, as by the angle of a ring to the ground.
@@ -328,7 +301,7 @@ def log_probabilities_of_shares(lines: Iterable[tuple[Pieces, float, int]]) -> A
     for pieces, painted_m, dashes in lines:
         contrast = _reflected(pieces) if painted_m > MIN_PAINTED_M else None
         if contrast is not None and _median_known(pieces.color) > EXPECTED_COLOR / 2:
-            odds.append(log_odds_by_camera(pieces, painted_m, dashes=dashes))
+            odds.append(log_odds_of(evidence_of_line(pieces, painted_m, dashes=dashes), WEIGHTS["line, camera"]))
             contrasts.append(contrast)
     if not contrasts:
         return DRY
@@ -370,6 +343,11 @@ def probability(log_odds: float) -> float:
 def _median_known(values: Array) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
+
+
+def _mean_known(values: NDArray[Any], known_by: Array) -> float:
+    known = np.isfinite(known_by)
+    return float(np.mean(values[known])) if known.any() else float("nan")
 
 
 HALF_PIECE_M = 1.0

@@ -1,11 +1,12 @@
 """Lane lines, markings and lanes in synthetic scenes, by light, weather and wear.
 
     python tools/bench.py lanes [--only PATTERN] [--rig cameras|lidar]
+    python tools/bench.py lanes --roads 40 --seed 1
 
 Each scene is rendered in its conditions, reconstructed and compared with its truth as `log2sim evaluate` does: precision and
 recall of lane lines at 0.3 m within 40 m of the ego's path where a sensor saw the ground, the same recall where they stand out of the map,
 lateral error, kinds, false length, stop lines and crosswalks, borders of the roads, and how much of the true paths lies in a found lane.
-`--rig` leaves out the other sensors.
+`--rig` leaves out the other sensors. `--roads` takes so many random roads (`fits/line_maps.py`) instead, from a seed that no fit used.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, Literal
 
 import numpy as np
 from entry import SAMPLES
+from fits.line_maps import MAPS_OF_SEED, draw_scene
 from scipy.ndimage import uniform_filter1d
 
 from benchmarks.table import cell, markdown
@@ -31,7 +33,7 @@ from log2sim.evaluation.road import MATCH_M, Area, RoadSamples, nearest_road
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.ridges import sample
-from log2sim.synth.scene import load_scene
+from log2sim.synth.scene import Scene, load_scene
 from log2sim.synth.synthesis import write_synthetic
 
 Rig = Literal["all", "cameras", "lidar"]
@@ -139,12 +141,18 @@ def lengths_that_stand_out(ground: GroundMap, scenario: Scenario, truth: Scenari
     return shown_m, matched_m
 
 
-def measure(case: Case, rig: Rig, folder: Path) -> dict[str, Any]:
-    """Render one case, reconstruct it by its labels and compare the map with its truth."""
+def scene_of(case: Case) -> Scene:
+    """Load the scene of a case in its conditions."""
     scene = load_scene(SAMPLES / case.scene)
     light = scene.environment.model_copy(update={"light": case.light, "weather": case.weather})
-    write_synthetic(scene.model_copy(update={"environment": light}), folder, seed=1)
-    detector, log = "lidar:labels" if rig == "lidar" else "labels", with_rig(open_log(folder), rig)
+    return scene.model_copy(update={"environment": light})
+
+
+def measure(scene: Scene, rig: Rig, folder: Path, seed: int = 1) -> dict[str, Any]:
+    """Render a scene, reconstruct it by its labels and compare the map with its truth."""
+    write_synthetic(scene, folder, seed=seed)
+    log = with_rig(open_log(folder), rig)
+    detector = "labels" if log.cameras else "lidar:labels"
     scenario, truth = (
         reconstruct(log, Config.load(detect={"name": detector})).scenario,
         Scenario.load(folder / "truth.json"),
@@ -154,7 +162,7 @@ def measure(case: Case, rig: Rig, folder: Path) -> dict[str, Any]:
 
 
 def summary(all_found: list[dict[str, Any]]) -> str:
-    """Precision and recall of the lane lines of all cases by their length."""
+    """Precision and recall of the lane lines of all cases by their length, and counts of stop lines and crosswalks."""
     lines = [f["lane_lines"] for f in all_found if f.get("lane_lines")]
     shown_m, matched_m = np.sum([f["standing_out_m"] for f in all_found], axis=0)
 
@@ -164,36 +172,44 @@ def summary(all_found: list[dict[str, Any]]) -> str:
         )
 
     by_length = mean("precision", "found_m"), mean("recall", "true_m"), matched_m / max(shown_m, 1e-9)
-    return "All lane lines: precision {:.3f}, recall {:.3f}, where they stand out {:.3f}.".format(*by_length)
+    counts = [f"{name.replace('_', ' ')} {count(all_found, name)}" for name in ("stop_lines", "crosswalks")]
+    text = "All lane lines: precision {:.3f}, recall {:.3f}, where they stand out {:.3f}; ".format(*by_length)
+    return text + ", ".join(counts) + "."
+
+
+def count(all_found: list[dict[str, Any]], kind: str) -> str:
+    """Count markings of a kind that were found, that there are, and that are false."""
+    n = {key: sum((found.get(kind) or {}).get(key) or 0 for found in all_found) for key in ("found", "true", "false")}
+    return (
+        f"{n['found']} of {n['true']}" + (f" + {n['false']}" if n["false"] else "") if n["true"] or n["false"] else "-"
+    )
 
 
 def row(case: Case, found: dict[str, Any]) -> list[str]:
     """A row of the table."""
     lines, borders, lanes = (found.get(name) or {} for name in ("lane_lines", "borders", "lanes"))
     shown_m, matched_m = found["standing_out_m"]
-
-    def count(kind: str) -> str:
-        n = found.get(kind) or {}
-        false = f" + {n['false']}" if n.get("false") else ""
-        return f"{n['found']} of {n['true']}{false}" if n.get("true") or false else "-"
-
     return [
         Path(case.scene).stem, case.condition, *(cell(lines.get(k)) for k in ("precision", "recall", "recall_20_m")), cell(matched_m / shown_m if shown_m else None),
         *(cell(lines.get(k), 3, " m") for k in ("lateral_median_m", "lateral_p95_m")), cell(lines.get("kind_accuracy")),
-        cell(lines.get("false_m_per_100_m"), 1, " m"), count("stop_lines"), count("crosswalks"),
+        cell(lines.get("false_m_per_100_m"), 1, " m"), count([found], "stop_lines"), count([found], "crosswalks"),
         *(cell(of.get(k)) for of in (borders, lanes) for k in ("precision", "recall")), cell(lanes.get("center_median_m"), 2, " m"), cell(lanes.get("inside")),
     ]  # fmt: skip
 
 
-def main(only: str = "*", rig: Rig = "all") -> None:
-    """Print the table of the cases that a pattern names, such as 'worn*' or '*_night_*'."""
-    rows, all_found = [], []
+def main(only: str = "*", rig: Rig = "all", roads: int = 0, seed: int = 1) -> None:
+    """Print the table of the cases that a pattern names, such as 'worn*' or '*_night_*', or the summary of random roads."""
+    cases = {case.name: case for case in CASES if fnmatch.fnmatch(case.name, only) and not roads}
+    scenes = {name: (scene_of(case), 1) for name, case in cases.items()}
+    for number in range(MAPS_OF_SEED * seed, MAPS_OF_SEED * seed + roads):
+        scenes[f"road-{number}"] = draw_scene(number), number
+    found = {}
     with tempfile.TemporaryDirectory() as folder:
-        for case in (case for case in CASES if fnmatch.fnmatch(case.name, only)):
+        for name, (scene, of) in scenes.items():
             try:
-                all_found.append(measure(case, rig, Path(folder) / case.name))
-                rows.append(row(case, all_found[-1]))
+                found[name] = measure(scene, rig, Path(folder) / name, of)
             except Log2SimError as error:
-                print(f"{case.name}: {error}", file=sys.stderr)
-    print(markdown(HEADER, rows))
-    print(f"\n{summary(all_found)}" if all_found else "")
+                print(f"{name}: {error}", file=sys.stderr)
+    if cases:
+        print(markdown(HEADER, [row(cases[name], figures) for name, figures in found.items()]), end="\n\n")
+    print(summary(list(found.values())))

@@ -1,0 +1,152 @@
+"""Fit the weights of the evidence by which markings are judged, on maps of random roads.
+
+    python tools/fit.py line_maps FOLDER --maps 160
+    python tools/fit.py lines FOLDER ... > weights.py && mv weights.py log2sim/road/
+
+Judges every line and every row of bars that is found in the maps, also the unlikely ones, by how much of it lies on paint, and prints the
+module. Tables go to stderr: each fifth of the maps is rated by weights that fit the others, beside those that are there.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+
+from fits.confidence import fit_weights
+from fits.line_maps import RoadMap
+from log2sim.datatypes import Marking
+from log2sim.geometry import Array
+from log2sim.road.lines import dashed_chains, find_lines, touching_chains
+from log2sim.road.markings import find_crosswalks, part_stop_lines
+from log2sim.road.paint import find_pieces, log_odds_of, table_of
+from log2sim.road.ridges import find_ridges
+from log2sim.road.strokes import Curve
+from log2sim.road.weights import WEIGHTS
+
+FOLDS = 5
+NEAR_M, STEP_M = 0.25, 0.1
+MIN_EFFECT = 0.05  # of a standard deviation of the evidence, in log-odds: what has less is left out
+# Lines that one sensor alone shows have to be as likely as two to one: rings of a LiDAR and textures in pictures differ more than simulated
+# ones do.
+ONE_SENSOR, COST_OF_ONE_SENSOR = ("line, camera", "line, LiDAR", "line, few returns"), 2.0
+# What the evidence can say, at most, by what it means: for paint, against it.
+SIGNS = {
+    "length": 1, "dashes": 1, "contrast": 1, "reflects": 1, "outshone": -1, "varies": -1, "bright_beside": -1, "dull": -1, "crowded": -1,
+    "remnant": -1, "no_lane_line": -1, "wide": 0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A line or a row of bars: where, the table of its weights, its evidence, the share of it that is on paint, and its length, m."""
+
+    road_map: str
+    table: str
+    evidence: dict[str, float]
+    right: float
+    length_m: float
+
+
+def judged_of(path: Path) -> list[Judged]:
+    """Find lines and bars in a map, and judge them."""
+    road: RoadMap = pickle.loads(path.read_bytes())
+    pieces = find_pieces(road.ground, find_ridges(road.ground))
+    areas, chains = find_crosswalks(road.ground, pieces, touching_chains(pieces))
+    stops, lines = part_stop_lines(find_lines(road.ground, pieces, dashed_chains(pieces, chains)))
+    painted, stop, bars = (
+        _Paint([m for m in road.true if kind in ("", m.kind)]) for kind in ("", "stop_line", "crosswalk")
+    )
+
+    out = [
+        Judged(path.name, table_of(line.pieces), line.evidence, paint.share(_dense(line.xy)), line.length_m)
+        for some, paint in ((stops, stop), (lines, painted))
+        for line in some
+    ]
+    out += [Judged(path.name, table_of(a.pieces, bars=True), a.evidence, bars.share(a.pieces.xy), 1.0) for a in areas]
+    return out
+
+
+class _Paint:
+    """Where some markings are."""
+
+    def __init__(self, true: list[Marking]) -> None:
+        outlines = [m for m in true if m.kind in ("crosswalk", "other")]
+        self._inside = shapely.union_all([shapely.Polygon(m.points_m[:, :2]).buffer(NEAR_M) for m in outlines])
+        along = [_dense(m.points_m[:, :2]) for m in true if m not in outlines]
+        self._lines = cKDTree(np.concatenate(along)) if along else None
+
+    def share(self, xy: Array) -> float:
+        """Return the share of points (N, 2) on paint."""
+        on = shapely.contains_xy(self._inside, *xy.T)
+        if self._lines is not None:
+            on |= self._lines.query(xy)[0] < NEAR_M
+        return float(on.mean())
+
+
+def _dense(xy: Array) -> Array:
+    curve = Curve(xy)
+    return curve.at(np.arange(0, curve.s[-1] + STEP_M / 2, STEP_M))
+
+
+def fit_table(rows: list[Judged], cost: float = 1.0) -> dict[str, float]:
+    """Fit the weights of one table; evidence without effect is left out, and the others are fitted again.
+
+    `cost`: how many missed markings a false one is worth: even confidence is where both cost the same.
+    """
+    names = [name for name in SIGNS if any(row.evidence.get(name) for row in rows)]
+    right = np.array([row.right for row in rows])
+    weight = np.sqrt([row.length_m for row in rows])
+    for _ in range(2):
+        x = np.array([[row.evidence.get(name, 0.0) for name in names] for row in rows])
+        bias, found = fit_weights(x, right, weight / weight.mean(), [SIGNS[name] for name in names])
+        table = {"bias": bias - np.log(cost), **dict(zip(names, found.tolist()))}
+        names = [n for n, effect in zip(names, np.abs(found) * x.std(axis=0)) if effect > MIN_EFFECT]
+    return {name: float(f"{weight:.3g}") for name, weight in table.items()}
+
+
+def say(table: str, rows: list[Judged], title: str, odds: Array) -> None:
+    """Print log loss, and which share of the length that is kept is paint, and of the paint is kept."""
+    right, length = np.array([row.right for row in rows]), np.array([row.length_m for row in rows])
+    loss = np.average(np.logaddexp(0, odds) - right * odds, weights=np.sqrt(length))
+    kept, paint = odds > 0, right * length
+    shares = paint[kept].sum() / max(length[kept].sum(), 1e-9), paint[kept].sum() / max(paint.sum(), 1e-9)
+    print(
+        f"{table}, {title}: {len(rows)}, log loss {loss:.3f}, precision {shares[0]:.3f}, recall {shares[1]:.3f}",
+        file=sys.stderr,
+    )
+
+
+def main(folders: list[Path], jobs: int = 2) -> None:
+    """Fit, report and print."""
+    paths = sorted(path for folder in folders for path in folder.glob("*.pkl"))
+    with multiprocessing.get_context("fork").Pool(jobs) as pool:
+        judged = [row for rows in pool.imap(judged_of, paths) for row in rows]
+    print(
+        f'"""Weights of the evidence for markings (`road/paint.py`), by what they are of and which sensors saw it.\n\nPrinted by `tools/fit.py lines` on {len(paths)} maps of random roads, `tools/fit.py line_maps`.\n"""\n'
+    )
+    print("WEIGHTS: dict[str, dict[str, float]] = {")
+    for table in WEIGHTS:
+        rows, cost = (
+            [row for row in judged if row.table == table],
+            COST_OF_ONE_SENSOR if table in ONE_SENSOR else 1.0,
+        )
+        folds, odds = np.unique([row.road_map for row in rows], return_inverse=True)[1] % FOLDS, np.zeros(len(rows))
+        for fold in range(FOLDS):
+            weights = fit_table([row for row, k in zip(rows, folds) if k != fold], cost)
+            odds[folds == fold] = [log_odds_of(row.evidence, weights) for row, k in zip(rows, folds) if k == fold]
+        say(
+            table, rows, "weights that are there", np.array([log_odds_of(row.evidence, WEIGHTS[table]) for row in rows])
+        )
+        say(table, rows, "fitted to other maps", odds)
+        print(f'    "{table}": {{')
+        for name, value in fit_table(rows, cost).items():
+            print(f'        "{name}": {value:g},')
+        print("    },")
+    print("}")
