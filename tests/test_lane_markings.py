@@ -18,10 +18,10 @@ from log2sim.road.paint import (
     Pieces,
     by_lidar,
     evidence_of_line,
-    log_odds_of,
     log_probabilities_of_shares,
     no_pieces,
     table_of,
+    weighted_sum,
 )
 from log2sim.road.strokes import stretches_of
 from log2sim.road.weights import WEIGHTS
@@ -170,7 +170,7 @@ def test_what_a_shadow_leaves_of_a_bar_is_no_dash_of_the_line_behind_the_crosswa
 
 
 def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, bars: bool = False) -> float:
-    return log_odds_of(
+    return weighted_sum(
         evidence_of_line(pieces, painted_m, dashes=dashes, bars=bars), WEIGHTS[table_of(pieces, bars=bars)]
     )
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.paint import Pieces, evidence_of_line, log_odds_of, log_probabilities_of_shares, table_of
+from log2sim.road.paint import Pieces, evidence_of_line, log_probabilities_of_shares, table_of, weighted_sum
 from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
 from log2sim.road.weights import WEIGHTS
@@ -251,7 +251,7 @@ class PaintedLine:
     @cached_property
     def log_odds(self) -> float:
         """Log-odds that it is a marking."""
-        return log_odds_of(self.evidence, WEIGHTS[table_of(self.pieces)])
+        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces)])
 
     @property
     def length_m(self) -> float:

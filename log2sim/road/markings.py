@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Marking, RoadBorder
+from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import Array, median
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.lines import Chain, PaintedLine, color_of, dashed_chains, find_lines, sources_of, touching_chains
@@ -25,10 +26,9 @@ from log2sim.road.paint import (
     evidence_of_line,
     find_pieces,
     fit_lines,
-    log_odds_of,
     no_pieces,
-    probability,
     table_of,
+    weighted_sum,
 )
 from log2sim.road.ridges import (
     Layer,
@@ -76,7 +76,7 @@ class PaintedArea:
     @cached_property
     def log_odds(self) -> float:
         """Log-odds that it is a marking."""
-        return log_odds_of(self.evidence, WEIGHTS[table_of(self.pieces, bars=self.kind == "crosswalk")])
+        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, bars=self.kind == "crosswalk")])
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,11 +423,13 @@ def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[A
     sigmas = float(_surface_step(np.array(by_color), np.array(by_lidar), np.array(len(steps[1]) > 3)))
     curb = CURB_M[0] <= by_height * HEIGHT_SIGMA_M <= CURB_M[1]
     odds = PRIOR + min(PER_METER * length, MAX_BY_LENGTH) + PER_SIGMA * min(sigmas - MIN_STEP, CLEAR_STEP) + 2.0 * curb
-    if probability(odds) < MIN_BORDER_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
+    if probability_of(odds) < MIN_BORDER_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
         return None
     shown = (("camera", by_color > 1), ("lidar", by_lidar > 1 or curb))
     sources = tuple(name for name, shows in shown if shows)
-    return RoadBorder("", "curb" if curb else "edge", at_height(ground, thin(curve.xy)), probability(odds), sources)
+    return RoadBorder(
+        "", "curb" if curb else "edge", at_height(ground, thin(curve.xy)), float(probability_of(odds)), sources
+    )
 
 
 MIN_CONFIDENCE = 0.5  # what is rather not there than there is left out
@@ -441,10 +443,10 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
 
     Returns `markings`: sure ones first; `borders`; `notes`: what was not found, and why.
 
-    Ridges of color and LiDAR intensity (`ridges`) become straight pieces with profiles (`pieces`), chains of pieces
-    (`chains`) and smooth curves (`curves`). What lies along a curve tells solid from dashed lines (`strokes`), parallel
-    bars are crosswalks, and wide strokes across lanes are stop lines (`areas`). Each is rated by both sensors
-    (`evidence`). The cost grows with the area that was seen.
+    Ridges of color and LiDAR intensity (`ridges`) become straight pieces with profiles (`paint`), chains of pieces
+    (`lines`) and smooth curves. Strokes along a curve are a solid or a dashed line (`strokes`), parallel bars are
+    crosswalks, and wide strokes across lanes are stop lines. Evidence of each by both sensors is weighed (`paint`,
+    `weights`). The cost grows with the area that was seen.
     """
     by_camera, by_lidar = ground.has_color, bool(np.isfinite(ground.intensity).any())
     if not by_camera and not by_lidar:
@@ -481,7 +483,7 @@ def list_markings(
     painted += [(line.kind, thin(line.xy), line) for line in long]
     found = []
     for kind, xy, one in painted:
-        shown_by = color_of(one.pieces), probability(one.log_odds), sources_of(one.pieces)
+        shown_by = color_of(one.pieces), float(probability_of(one.log_odds)), sources_of(one.pieces)
         if shown_by[1] >= min_confidence:
             found.append(Marking("", kind, at_height(ground, xy), one.width_m, *shown_by))
     markings = sorted(found, key=lambda m: -m.confidence)

@@ -84,6 +84,11 @@ class Pieces:
         """Choose pieces by a mask or by indices."""
         return Pieces(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
+    @property
+    def by_camera(self) -> bool:
+        """Whether a camera saw any of them well enough for its contrast."""
+        return bool(np.isfinite(self.color).any())
+
     @cached_property
     def ends(self) -> Array:
         """Both ends (N, 2, 2), m."""
@@ -121,7 +126,7 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
     sides = [[(distance > low) & (distance < high) for low, high in SIDES_M] for distance in away]
     by_color = _contrast(samples.paint, inside, sides, one_side=True)[:2]
     yellow = _contrast(samples.yellow, inside, sides, one_side=True)[0]
-    reflected, reflected_sigma, apart = _contrast(samples.intensity, inside, sides, one_side=False)
+    reflected, reflected_sigma, difference = _contrast(samples.intensity, inside, sides, one_side=False)
     xy = lines[:, :2] + shift[:, None] * np.stack([-s, c], 1)
     far = [side * (across - shift[:, None]) > width[:, None] / 2 + 0.1 for side in (-1, 1)]
     around = [_quiet(np.nanquantile, np.where(part, color, np.nan), q=0.75) for part in far]
@@ -136,7 +141,7 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
         # How likely one of points that are scattered at random so far apart lies within half the width of paint. Without a camera
         # the contrast is all there is to go by.
         resolved = np.where(by_camera, 1 - np.exp(-np.pi / 4 * (PAINT_WIDTH_M / spacing) ** 2), 1.0)
-    by_lidar = reflected, reflected_sigma, above_road, above_road - reflected - apart
+    by_lidar = reflected, reflected_sigma, above_road, above_road - reflected - difference
     return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, outshines, yellow, *by_lidar, resolved)
 
 
@@ -224,7 +229,6 @@ MIN_REFLECTING = 2  # pieces
 RETURNED, LOW_PRIOR = np.array([0.07, 0.1, 0.14, 0.2, 1.0]), 0.1
 DRY = np.where(RETURNED < 1, -np.inf, 0.0)  # log-probabilities
 
-
 MIN_OUTSHINING = 0.4  # share of its contrast
 PLAIN_CONTRAST = 0.2  # logarithm of color: worn paint
 MAX_DASHES = 4  # from the third on
@@ -236,17 +240,20 @@ MIN_ABOVE_ROAD, BRIGHT_GROUND = 0.15, 0.3
 def evidence_of_line(
     pieces: Pieces, painted_m: float, *, dashes: int, shares: Array = DRY, bars: bool = False
 ) -> dict[str, float]:
-    """Gather what tells whether pieces in a line, or in the `bars` of a crosswalk, are paint, by the names in `WEIGHTS`.
+    """Gather the evidence that pieces in a line, or in the `bars` of a crosswalk, are paint, by the names in `WEIGHTS`.
 
     `shares`: log-probabilities of the shares of its dry contrast that paint has in LiDAR intensities of this map, see
     `log_probabilities_of_shares`; by default all of it.
     """
-    by_camera, width_m = bool(np.isfinite(pieces.color).any()), median(pieces.width_m)
+    width_m = median(pieces.width_m)
     varies = median(np.abs(pieces.width_m - width_m)) / width_m if len(pieces) > 2 and not bars else 0.0
     contrast = np.log(np.maximum(pieces.color, 1e-3) / PLAIN_CONTRAST)
-    if not by_camera:
+    if not pieces.by_camera:
         contrast = np.log(np.maximum(pieces.reflected, 1e-3) / PAINT_REFLECTS[0])
-    bright = pieces.outshines > MIN_OUTSHINING * np.maximum(pieces.color, 1e-3)
+    # Of pieces around which alone a camera saw the ground, none outshines it.
+    finite = np.isfinite(pieces.outshines)
+    outshines = pieces.outshines[finite] > MIN_OUTSHINING * np.maximum(pieces.color, 1e-3)[finite]
+    share = float(np.mean(outshines)) if finite.any() else np.nan
     evidence = {
         "bias": 1.0,
         "length": np.log(max(painted_m, 0.5)),
@@ -254,8 +261,8 @@ def evidence_of_line(
         "varies": np.clip((varies - 0.2) / 0.3, 0, 1),
         "wide": np.clip((width_m - WIDE_M) / WIDE_M, 0, 1),
         "contrast": np.clip(_median_known(contrast), -3, 1.5),
-        "outshone": np.clip((0.5 - _mean_known(bright, pieces.outshines)) / 0.4, 0, 1),
-        "reflects": by_lidar(pieces, shares if by_camera else DRY),
+        "outshone": np.clip((0.5 - share) / 0.4, 0, 1),
+        "reflects": by_lidar(pieces, shares if pieces.by_camera else DRY),
         "dull": np.clip(1 - _median_known(pieces.above_road) / MIN_ABOVE_ROAD, 0, 2),
         "bright_beside": np.clip(_median_known(pieces.beside_road) / BRIGHT_GROUND, 0, 1.5),
     }
@@ -264,16 +271,16 @@ def evidence_of_line(
 
 def table_of(pieces: Pieces, *, bars: bool = False) -> str:
     """Name the weights of the evidence for pieces: by what they are parts of, and by the sensors that saw enough of them."""
-    by_camera, by_lidar = bool(np.isfinite(pieces.color).any()), _reflected(pieces) is not None
     if bars:
-        return "crosswalk, camera" if by_camera else "crosswalk, LiDAR"
-    if by_camera:
-        return "line, camera and LiDAR" if by_lidar else "line, camera"
-    return "line, LiDAR" if by_lidar else "line, few returns"
+        return "crosswalk, camera" if pieces.by_camera else "crosswalk, LiDAR"
+    enough = _reflected(pieces) is not None
+    if pieces.by_camera:
+        return "line, camera and LiDAR" if enough else "line, camera"
+    return "line, LiDAR" if enough else "line, few returns"
 
 
-def log_odds_of(evidence: Mapping[str, float], weights: Mapping[str, float]) -> float:
-    """Add up evidence by its weights."""
+def weighted_sum(evidence: Mapping[str, float], weights: Mapping[str, float]) -> float:
+    """Add up evidence by its weights: log-odds."""
     return sum(weight * evidence.get(name, 0.0) for name, weight in weights.items())
 
 
@@ -301,7 +308,7 @@ def log_probabilities_of_shares(lines: Iterable[tuple[Pieces, float, int]]) -> A
     for pieces, painted_m, dashes in lines:
         contrast = _reflected(pieces) if painted_m > MIN_PAINTED_M else None
         if contrast is not None and _median_known(pieces.color) > EXPECTED_COLOR / 2:
-            odds.append(log_odds_of(evidence_of_line(pieces, painted_m, dashes=dashes), WEIGHTS["line, camera"]))
+            odds.append(weighted_sum(evidence_of_line(pieces, painted_m, dashes=dashes), WEIGHTS["line, camera"]))
             contrasts.append(contrast)
     if not contrasts:
         return DRY
@@ -335,19 +342,9 @@ def _log_densities(reflected: Array, returned: Array) -> tuple[Array, Array]:
     return out[0], out[1]
 
 
-def probability(log_odds: float) -> float:
-    """Probability of log-odds."""
-    return float(1 / (1 + np.exp(-log_odds)))
-
-
 def _median_known(values: Array) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
-
-
-def _mean_known(values: NDArray[Any], known_by: Array) -> float:
-    known = np.isfinite(known_by)
-    return float(np.mean(values[known])) if known.any() else float("nan")
 
 
 HALF_PIECE_M = 1.0

@@ -1,4 +1,4 @@
-"""Weights of the evidence for markings (`road/paint.py`), by what they are of and which sensors saw it.
+"""Weights of the evidence for markings (`road/paint.py`), by kind of marking and the sensors that saw it.
 
 Printed by `tools/fit.py lines` on 160 maps of random roads, `tools/fit.py line_maps`.
 """

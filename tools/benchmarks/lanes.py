@@ -180,9 +180,9 @@ def summary(all_found: list[dict[str, Any]]) -> str:
 def count(all_found: list[dict[str, Any]], kind: str) -> str:
     """Count markings of a kind that were found, that there are, and that are false."""
     n = {key: sum((found.get(kind) or {}).get(key) or 0 for found in all_found) for key in ("found", "true", "false")}
-    return (
-        f"{n['found']} of {n['true']}" + (f" + {n['false']}" if n["false"] else "") if n["true"] or n["false"] else "-"
-    )
+    if not n["true"] and not n["false"]:
+        return "-"
+    return f"{n['found']} of {n['true']}" + (f" + {n['false']}" if n["false"] else "")
 
 
 def row(case: Case, found: dict[str, Any]) -> list[str]:
@@ -212,4 +212,5 @@ def main(only: str = "*", rig: Rig = "all", roads: int = 0, seed: int = 1) -> No
                 print(f"{name}: {error}", file=sys.stderr)
     if cases:
         print(markdown(HEADER, [row(cases[name], figures) for name, figures in found.items()]), end="\n\n")
-    print(summary(list(found.values())))
+    if found:
+        print(summary(list(found.values())))

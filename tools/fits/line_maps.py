@@ -4,8 +4,8 @@
 
 Each road is straight or bent, a street or one side of a motorway, with traffic on either side, lines of any usual width, kind, color and
 wear, removed ones, crosswalks, stop lines, arrows, houses, shadows, sidewalks or grass beside it, in any light and weather; it is rendered,
-and reconstructed by its labels, with one to three cameras and a LiDAR of 16 to 64 lines, or without one of both. Files that exist are left
-as they are.
+and reconstructed by its labels, with one to three cameras and a LiDAR of 16 to 64 lines, or without one of both. One map in eight is of
+plain ground, whose texture is coarser than that of rendered grounds. Files that exist are left as they are.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def draw_scene(seed: int) -> Scene:
     lane_m = draw(3.3, 3.8) if motorway else draw(2.7, 3.7)
     inset_m = draw(0.15, 1.2) if motorway else draw(0.15, 0.35)
     width = lanes * lane_m + (2 * inset_m if motorway else 0.2)
-    # A millionth is a straight road.
+    # The first is as good as straight, with a radius that exists.
     course = _Course(one_of(1e-6, draw(-1, 1), draw(-1, 1)) * (0.0012 if motorway else 0.008) + 1e-9)
     reach = MOTORWAY_M if motorway else STREET_M
     near_side = 1 if left_hand else -1
@@ -181,6 +181,7 @@ def draw_scene(seed: int) -> Scene:
     }  # fmt: skip
     if wet and chance(0.4):
         scene["environment"]["wetness"] = draw(0.2, 1)
+    # By a stream of its own, so that a road is the same with its markings and without.
     if np.random.default_rng([seed, 79]).random() < UNMARKED:
         for kind in ("zebra", "stop_line", "arrow"):
             scene.pop(kind, None)

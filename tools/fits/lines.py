@@ -25,7 +25,7 @@ from log2sim.datatypes import Marking
 from log2sim.geometry import Array
 from log2sim.road.lines import dashed_chains, find_lines, touching_chains
 from log2sim.road.markings import find_crosswalks, part_stop_lines
-from log2sim.road.paint import find_pieces, log_odds_of, table_of
+from log2sim.road.paint import find_pieces, table_of, weighted_sum
 from log2sim.road.ridges import find_ridges
 from log2sim.road.strokes import Curve
 from log2sim.road.weights import WEIGHTS
@@ -126,10 +126,12 @@ def say(table: str, rows: list[Judged], title: str, odds: Array) -> None:
 def main(folders: list[Path], jobs: int = 2) -> None:
     """Fit, report and print."""
     paths = sorted(path for folder in folders for path in folder.glob("*.pkl"))
+    if not paths:
+        raise SystemExit(f"{', '.join(map(str, folders))}: no maps; `tools/fit.py line_maps` makes them")
     with multiprocessing.get_context("fork").Pool(jobs) as pool:
         judged = [row for rows in pool.imap(judged_of, paths) for row in rows]
     print(
-        f'"""Weights of the evidence for markings (`road/paint.py`), by what they are of and which sensors saw it.\n\nPrinted by `tools/fit.py lines` on {len(paths)} maps of random roads, `tools/fit.py line_maps`.\n"""\n'
+        f'"""Weights of the evidence for markings (`road/paint.py`), by kind of marking and the sensors that saw it.\n\nPrinted by `tools/fit.py lines` on {len(paths)} maps of random roads, `tools/fit.py line_maps`.\n"""\n'
     )
     print("WEIGHTS: dict[str, dict[str, float]] = {")
     for table in WEIGHTS:
@@ -140,9 +142,12 @@ def main(folders: list[Path], jobs: int = 2) -> None:
         folds, odds = np.unique([row.road_map for row in rows], return_inverse=True)[1] % FOLDS, np.zeros(len(rows))
         for fold in range(FOLDS):
             weights = fit_table([row for row, k in zip(rows, folds) if k != fold], cost)
-            odds[folds == fold] = [log_odds_of(row.evidence, weights) for row, k in zip(rows, folds) if k == fold]
+            odds[folds == fold] = [weighted_sum(row.evidence, weights) for row, k in zip(rows, folds) if k == fold]
         say(
-            table, rows, "weights that are there", np.array([log_odds_of(row.evidence, WEIGHTS[table]) for row in rows])
+            table,
+            rows,
+            "weights that are there",
+            np.array([weighted_sum(row.evidence, WEIGHTS[table]) for row in rows]),
         )
         say(table, rows, "fitted to other maps", odds)
         print(f'    "{table}": {{')
