@@ -171,7 +171,8 @@ def test_what_a_shadow_leaves_of_a_bar_is_no_dash_of_the_line_behind_the_crosswa
 
 def log_odds_of_line(pieces: Pieces, painted_m: float, *, dashes: int, bars: bool = False) -> float:
     return weighted_sum(
-        evidence_of_line(pieces, painted_m, dashes=dashes, bars=bars), WEIGHTS[table_of(pieces, bars=bars)]
+        evidence_of_line(pieces, painted_m, dashes=dashes, bars=bars),
+        WEIGHTS[table_of(pieces, "crosswalk" if bars else "line")],
     )
 
 
@@ -179,8 +180,8 @@ def test_rings_that_return_what_the_road_does_are_no_paint() -> None:
     """Without a camera: rings between darker ones stand out as much as paint beside the road."""
     each = {"reflected": 0.9, "reflected_sigma": 0.05, "width_m": 0.55, "color": np.nan, "beside_road": 0.0}
     rings, paint = (
-        no_pieces(6, **{name: np.full(6, value) for name, value in (each | {"above_road": above}).items()})
-        for above in (0.0, 0.9)
+        no_pieces(6, **{name: np.full(6, value) for name, value in (each | own).items()})
+        for own in ({"above_road": 0.0, "resolved": 0.3}, {"above_road": 0.9, "resolved": 1.0})
     )
     assert log_odds_of_line(rings, 14.0, dashes=12, bars=True) < 0 < log_odds_of_line(paint, 14.0, dashes=12, bars=True)
 
@@ -238,6 +239,22 @@ def test_to_a_lidar_alone_narrow_lines_beside_a_road_are_paint_and_rings_on_gras
         return log_odds_of_line(pieces, 24.0, dashes=8)
 
     assert odds() > 0 > max(odds(beside_road=0.4), odds(width_m=0.5))
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+def test_a_fainter_line_beside_another_is_what_is_left_of_it(lidar: bool) -> None:
+    """Removed paint beside the new one; two that are as bright as each other are the lines of a path for bicycles."""
+
+    def found(shade: int, reflects: float) -> list[float]:
+        painter = Painter(EXTENT)
+        painter.lines([line_of(lambda x: 0 * x, 0, 50)])
+        beside = painter.cover([outline_of(line_of(lambda x: 0 * x + 1.2, 0, 50), 0.14)])
+        painter.lay(beside, (shade,) * 3, reflects=reflects)
+        markings = find_markings(painter.ground(lidar=lidar))[0]
+        return sorted(round(float(m.points_m[:, 1].mean()), 1) for m in markings)
+
+    assert found(WHITE[0], 1.0) == [0.0, 1.2]
+    assert found(ASPHALT[0] + 40, 0.3) == [0.0]
 
 
 def test_two_solid_lines_before_and_behind_a_junction_are_no_dashes() -> None:
@@ -298,7 +315,7 @@ def test_borders_are_where_the_road_ends(curb_m: float, inset_m: float | None) -
     off = cKDTree(np.concatenate([dense(line) for line in truth])).query(found)[0]
     assert off.max() < 0.4
     assert np.median(off) < 0.15
-    assert np.mean(cKDTree(found).query(np.concatenate([dense(line) for line in truth]))[0] < 0.4) > 0.8
+    assert np.mean(cKDTree(found).query(np.concatenate([dense(line) for line in truth]))[0] < 0.4) > 0.7
     assert not any("no borders" in note for note in notes)
 
 

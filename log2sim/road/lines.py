@@ -12,7 +12,14 @@ from scipy.spatial import cKDTree
 
 from log2sim.geometry import Array, median, wrap_angle
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.paint import Pieces, evidence_of_line, log_probabilities_of_shares, table_of, weighted_sum
+from log2sim.road.paint import (
+    Pieces,
+    evidence_of_line,
+    log_probabilities_of_shares,
+    median_known,
+    table_of,
+    weighted_sum,
+)
 from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
 from log2sim.road.weights import WEIGHTS
@@ -231,8 +238,9 @@ REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 BESIDE_M, MAX_BESIDE = (0.45, 1.7), 1
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
+MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
 # Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
-REMNANT_SHARE = 0.65
+MIN_CONTRAST, MAX_FAINTER = 0.02, 1.0  # logarithms
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
 
@@ -242,7 +250,7 @@ class PaintedLine:
     """A line of paint."""
 
     xy: Array  # (P, 2), m: middle, from end to end
-    kind: str  # "solid" or "dashed"
+    kind: str  # "solid", "dashed" or "stop_line"
     width_m: float
     pieces: Pieces  # what shows it
     dashes: int
@@ -251,7 +259,7 @@ class PaintedLine:
     @cached_property
     def log_odds(self) -> float:
         """Log-odds that it is a marking."""
-        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces)])
+        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, self.kind)])
 
     @property
     def length_m(self) -> float:
@@ -278,8 +286,8 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
     return tuple(name for name, shows in (("camera", camera), ("lidar", lidar)) if shows)
 
 
-def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[PaintedLine]:
-    """Make lines of chains."""
+def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[list[PaintedLine], Array]:
+    """Make lines of chains; also estimate the shares that paint returns, see `log_probabilities_of_shares`."""
     parts: list[tuple[Array, Stretch, Pieces, float]] = []  # with the length that is painted, m
     for chain in chains:
         corners = chain.corners(pieces)
@@ -301,7 +309,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> list[P
     for xy, stretch, member, painted_m in parts:
         evidence = evidence_of_line(member, painted_m, dashes=stretch.dashes, shares=shares)
         out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, evidence))
-    return _in_context(drop_repeats(out))
+    return _in_context(drop_repeats(out)), shares
 
 
 def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
@@ -330,7 +338,7 @@ def _dense(xy: Array) -> Array:
 
 
 def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
-    """Add to the evidence which lines form combs or grids, or run beside much brighter ones."""
+    """Add to the evidence which lines form combs or grids, and how much fainter they are than others beside them."""
     if len(lines) < 2:
         return lines
     dense = [_dense(line.xy)[::5] for line in lines]
@@ -348,23 +356,20 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     parallel = (turn < PARALLEL_RAD) & (distance > BESIDE_M[0])
     crossing = (turn > np.pi / 4) & (np.linalg.norm(offset, axis=1) < 0.5)
     length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
-    contrast = np.array([float(np.median(np.nan_to_num(line.pieces.color))) for line in lines])
     # Pairs of lines, not a table of all: a long log has thousands.
     i, j, count = _counted(owner[a[parallel]], owner[b[parallel]])
     beside = count > BESIDE_PER_M * length[i]
     i, j = i[beside], j[beside]
-    crowded = np.bincount(i[_alike(lines, contrast, i, j)], minlength=len(lines)) > MAX_BESIDE
+    crowded = np.bincount(i[_alike(lines, odds, i, j)], minlength=len(lines)) > MAX_BESIDE
     # Combs do not tell against what they cross, unless that is a comb, too.
     k, other, _ = _counted(owner[a[crossing]], owner[b[crossing]])
-    told = _alike(lines, contrast, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
+    told = _alike(lines, odds, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
     crossings = np.bincount(k[told], minlength=len(lines))
     grid = (crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length)
-    brighter = odds[j] > odds[i] - 1
-    brightest = np.full(len(lines), -np.inf)
-    np.maximum.at(brightest, i[brighter], contrast[j[brighter]])
-    remnant = np.isfinite(brightest) & (contrast < REMNANT_SHARE * brightest)
-    context = zip(lines, (crowded.astype(float) + grid).tolist(), remnant.astype(float).tolist())
-    return [replace(line, evidence=line.evidence | {"crowded": c, "remnant": r}) for line, c, r in context]
+    fainter, likely = np.zeros(len(lines)), odds[j] > odds[i] - 1
+    np.maximum.at(fainter, i[likely], _brighter(lines, i[likely], j[likely]))
+    context = zip(lines, (crowded.astype(float) + grid).tolist(), np.minimum(fainter, MAX_FAINTER).tolist())
+    return [replace(line, evidence=line.evidence | {"crowded": c, "fainter": f}) for line, c, f in context]
 
 
 def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
@@ -374,9 +379,22 @@ def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray
     return pair // most, pair % most, count
 
 
-def _alike(lines: list[PaintedLine], contrast: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
+def _alike(lines: list[PaintedLine], odds: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
     """Mask (P,) of pairs of lines that look alike, and the other as likely as the one: what combs and grids are made of."""
-    width, odds = np.array([line.width_m for line in lines]), np.array([line.log_odds for line in lines])
-    same = np.maximum(width[one], width[other]) <= 2 * np.minimum(width[one], width[other])
-    same &= np.maximum(contrast[one], contrast[other]) <= 2 * np.minimum(contrast[one], contrast[other])
+    width = np.array([line.width_m for line in lines])
+    same = np.abs(np.log(width[one] / width[other])) <= MAX_LOG_RATIO
+    same &= np.abs(_brighter(lines, one, other)) <= MAX_LOG_RATIO
     return np.asarray(same & (odds[other] > odds[one] - 2))
+
+
+def _brighter(lines: list[PaintedLine], one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
+    """Logarithm (P,) of the ratio of the contrasts of other lines to those of some.
+
+    Of color where a camera saw both, else of LiDAR intensity; 0 where neither sensor saw both.
+    """
+    ratio = np.zeros(len(one))
+    for name in ("reflected", "color"):
+        contrast = np.array([median_known(getattr(line.pieces, name)) for line in lines])
+        found = np.log(np.maximum(contrast[other], MIN_CONTRAST) / np.maximum(contrast[one], MIN_CONTRAST))
+        ratio = np.where(np.isfinite(found), found, ratio)
+    return ratio

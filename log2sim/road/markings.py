@@ -2,46 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import Array, median
+from log2sim.road.borders import find_borders
 from log2sim.road.ground_map import GroundMap
 from log2sim.road.lines import Chain, PaintedLine, color_of, dashed_chains, find_lines, sources_of, touching_chains
 from log2sim.road.paint import (
+    DRY,
     Pieces,
     at_height,
     evidence_of_line,
     find_pieces,
-    fit_lines,
-    no_pieces,
+    median_known,
     table_of,
     weighted_sum,
 )
 from log2sim.road.ridges import (
-    Layer,
-    RidgePoints,
-    coarse_means,
     find_ridges,
-    log_color,
-    log_intensity,
     log_paint,
-    turn_image,
-    warp,
 )
-from log2sim.road.strokes import Curve, fit_curve, thin, trace
+from log2sim.road.strokes import Curve, thin, trace
 from log2sim.road.weights import WEIGHTS
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).
@@ -55,10 +47,10 @@ LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
 MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
-# A plain stroke fills its rectangle, also where it is blurred; an arrow of as many widths length half of it.
-PLAIN_SHARE, PLAIN_ASPECT = 0.6, 6.0
+FLAKE_M = 0.1  # gaps in worn paint
+MIN_TEXTURE = 0.01  # of the road, logarithm of color
 MAX_SYMBOLS, SYMBOL_STEP_M, SAME_SYMBOL_M = 3, 20.0, 0.3  # in a row, from one to the next, and parts of one
-MAX_ACROSS_M = 2.5  # within a lane
+MAX_ACROSS_M = 3.0  # within a lane
 ROAD_AROUND_M = 4.0  # whose mean is nearly that of the road
 OUTLINE_ERROR_M, HULL_ERROR_M = 0.03, 0.15
 
@@ -72,11 +64,12 @@ class PaintedArea:
     width_m: float  # of a crosswalk its extent along the road, of others the lesser extent
     pieces: Pieces  # what shows it
     evidence: dict[str, float]  # that it is a marking, see `evidence_of_line`
+    bars_m: Sequence[float] = ()  # lengths of the bars of a crosswalk
 
     @cached_property
     def log_odds(self) -> float:
         """Log-odds that it is a marking."""
-        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, bars=self.kind == "crosswalk")])
+        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, self.kind)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +81,11 @@ class _Bar:
     length_m: float
     width_m: float
     members: NDArray[np.int64]
+
+
+def evidence_of_bars(pieces: Pieces, lengths_m: Sequence[float], shares: Array = DRY) -> dict[str, float]:
+    """Gather the evidence that bars of some lengths are a crosswalk, as `evidence_of_line`."""
+    return evidence_of_line(pieces, sum(lengths_m), dashes=len(lengths_m), shares=shares, bars=True)
 
 
 def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[list[PaintedArea], list[Chain]]:
@@ -104,7 +102,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
-        evidence = evidence_of_line(own, sum(lengths), dashes=len(chosen), bars=True)
+        evidence = evidence_of_bars(own, lengths)
         corners = []
         for _, bar in chosen:
             d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
@@ -113,7 +111,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         origin = np.mean(corners, axis=0)
         hull = cv2.approxPolyDP(cv2.convexHull((np.array(corners) - origin).astype(np.float32)), HULL_ERROR_M, True)
         outline = np.asarray(hull, np.float64).reshape(-1, 2) + origin
-        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, evidence))
+        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, evidence, lengths))
     # What is left of a bar, as where a shadow parts it, is no line.
     inside = np.zeros(len(pieces), dtype=bool)
     for area in (area for area in areas if area.log_odds > 0):
@@ -172,51 +170,54 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
                 cross = chord[0] * tangent[1] - chord[1] * tangent[0]
                 angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
-            stops.append(replace(line, evidence=line.evidence | {"no_lane_line": float(angle is None)}))
+            stops.append(
+                replace(line, kind="stop_line", evidence=line.evidence | {"no_lane_line": float(angle is None)})
+            )
         else:
             others.append(line)
     return stops, others
 
 
 def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[PaintedArea], list[PaintedLine]]:
-    """Part arrows, letters and other small paint from lane lines: symbols with their outlines, others."""
-    outlines: list[NDArray[np.float32]] = []
-    areas, used = [], set()
+    """Part arrows, letters and other small paint from lane lines: symbols with their outlines, also unlikely ones, and others."""
+    areas, rest = list[PaintedArea](), []
     for line in lines:
-        if line.dashes > MAX_SYMBOLS or line.length_m > MAX_SYMBOL_M + SYMBOL_STEP_M * (line.dashes - 1):
-            continue
-        # Arrows one behind the other look like dashes: their pieces are looked at one by one.
-        found = [_outline_around(ground, line, xy) for xy in (line.pieces.xy if line.dashes > 1 else [line.xy])]
-        shapes = [outline for outline in found if outline is not None]
-        if len(shapes) <= len(found) / 2:
-            continue
-        used.add(id(line))
-        for outline in shapes:
-            middle = tuple(outline.mean(axis=0).tolist())
-            if not any(cv2.pointPolygonTest(other, middle, True) > -SAME_SYMBOL_M for other in outlines):
-                outlines.append(outline.astype(np.float32))
-                extent = np.array(cv2.minAreaRect(outlines[-1])[1])
-                areas.append(PaintedArea("other", outline, float(extent.min()), line.pieces, line.evidence))
-    return areas, [line for line in lines if id(line) not in used]
+        found: list[PaintedArea | None] = []
+        if line.dashes <= MAX_SYMBOLS and line.length_m <= MAX_SYMBOL_M + SYMBOL_STEP_M * (line.dashes - 1):
+            # Arrows one behind the other look like dashes: their pieces are looked at one by one.
+            found = [_symbol_at(ground, line, xy) for xy in (line.pieces.xy if line.dashes > 1 else [line.xy])]
+        shapes = [area for area in found if area is not None]
+        areas += shapes
+        # What lies in a row is of one kind.
+        if len(shapes) <= len(found) / 2 or sum(area.log_odds for area in shapes) <= 0:
+            rest.append(line)
+    kept = list[PaintedArea]()
+    for area in sorted(areas, key=lambda area: -area.log_odds):
+        middle = tuple(area.outline.mean(axis=0).tolist())
+        if not any(cv2.pointPolygonTest(o.outline.astype(np.float32), middle, True) > -SAME_SYMBOL_M for o in kept):
+            kept.append(area)
+    return kept, rest
 
 
-def _outline_around(ground: GroundMap, line: PaintedLine, xy: Array) -> Array | None:
-    """Outline (P, 2) of the paint at points (N, 2) of a line; None where it is a plain stroke, or too large."""
+def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea | None:
+    """Outline the paint at points (N, 2) of a line; None where no camera saw it, or it is too large or too small."""
     xy = xy.reshape(-1, 2)
     low, high = xy.min(axis=0) - MAX_SYMBOL_M / 2, xy.max(axis=0) + MAX_SYMBOL_M / 2
     res, (x0, _, _, y1) = ground.resolution_m, ground.extent_m
     rows = slice(max(int((y1 - high[1]) / res), 0), max(int((y1 - low[1]) / res), 0))
     columns = slice(max(int((low[0] - x0) / res), 0), max(int((high[0] - x0) / res), 0))
     color = ground.color_bgr[rows, columns]
-    contrast = line.pieces.color[np.isfinite(line.pieces.color)]
-    if not color.size or not len(contrast):
+    expected = median_known(line.pieces.color)
+    if not color.size or not np.isfinite(expected):
         return None
     paint, seen = log_paint(color), (ground.alpha[rows, columns] > 0).astype(np.float32)
     size = (round(ROAD_AROUND_M / res) | 1,) * 2
     share = cv2.blur(seen, size)
     road = np.divide(cv2.blur(paint * seen, size), share, out=np.full_like(share, np.inf), where=share > 0.1)
-    mask = ((paint > road + 0.4 * float(np.median(contrast))) & (seen > 0)).astype(np.uint8)
-    labels = cv2.connectedComponents(mask)[1]
+    mask = ((paint > road + 0.4 * expected) & (seen > 0)).astype(np.uint8)
+    labels = cv2.connectedComponents(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((round(FLAKE_M / res) | 1,) * 2)))[
+        1
+    ]
     u = np.clip(((xy[:, 0] - x0) / res).astype(int) - columns.start, 0, mask.shape[1] - 1)
     v = np.clip(((y1 - xy[:, 1]) / res).astype(int) - rows.start, 0, mask.shape[0] - 1)
     under = labels[v, u]
@@ -226,210 +227,34 @@ def _outline_around(ground: GroundMap, line: PaintedLine, xy: Array) -> Array | 
     own = (labels == np.bincount(under).argmax()).astype(np.uint8)
     contour = max(cv2.findContours(own, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], key=cv2.contourArea)
     area = float(own.sum()) * res**2
-    extent = np.array(cv2.minAreaRect(contour)[1]) * res
-    fits = MIN_SYMBOL_M2 <= area <= MAX_SYMBOL_M2 and extent.max() <= MAX_SYMBOL_M and extent.min() <= MAX_ACROSS_M
-    if not fits or len(contour) < 4:
-        return None
-    if area > PLAIN_SHARE * extent.prod() and (extent.min() < 0.3 or extent.max() > PLAIN_ASPECT * extent.min()):
+    extent = (np.array(cv2.minAreaRect(contour)[1]) + 1) * res
+    if not (MIN_SYMBOL_M2 <= area <= MAX_SYMBOL_M2 and extent.max() <= MAX_SYMBOL_M and extent.min() <= MAX_ACROSS_M):
         return None
     simple = cv2.approxPolyDP(contour, OUTLINE_ERROR_M / res, True).reshape(-1, 2).astype(np.float64)
+    if len(simple) < 3:
+        return None
     x, y = x0 + (simple[:, 0] + columns.start + 0.5) * res, y1 - (simple[:, 1] + rows.start + 0.5) * res
-    return np.stack([x, y], 1) if len(simple) >= 3 else None
+    inside = own > 0
+    contrast = float(np.median(paint[inside])) - float(np.median(road[inside]))
+    texture = max(float(np.median(np.abs(paint - road)[(mask == 0) & (seen > 0)])), MIN_TEXTURE)
+    evidence = {
+        "bias": 1.0,
+        "clear": float(np.clip(np.log(max(contrast, 1e-3) / texture), 0, 4)),
+        "filled": area / float(extent.prod()),
+        "slender": float(np.log(extent.max() / extent.min())),
+        "widens": _widens(own),
+        "hidden": float(1 - seen[cv2.dilate(own, np.ones((9, 9), np.uint8)) > 0].mean()),
+    }
+    return PaintedArea("other", np.stack([x, y], 1), float(extent.min()), line.pieces, evidence)
 
 
-CELL_M = 0.2
-DIRECTIONS = 8
-HEIGHT = 2  # the last of the layers
-ALONG_M, ACROSS_M = 2.0, 0.8
-GAP_M = 0.2  # to either side of a border: curbs, and lines painted next to it
-# What surfaces of one kind differ by, as logarithms: yellowness (grass, earth and paving against asphalt) and intensity.
-# Brightness does not count, as shadows change it most; neither yellowness nor intensity follow them.
-YELLOW_SIGMA, INTENSITY_SIGMA = 0.03, 0.2
-CURB_M = (0.05, 0.25)  # heights of curbs
-HEIGHT_SIGMA_M = 0.03
-MIN_STEP, CLEAR_STEP = 1.8, 3.0  # sigmas, together
-MIN_SEEN = 0.5
-ROAD_TOLERANCE = 1.5  # sigmas that a road may differ from where lane lines are
-# Log-odds: a meter of seam, patch or wear is much more frequent than that of a border, long ones are not.
-PRIOR, PER_METER, MAX_BY_LENGTH, PER_SIGMA = -3.0, 0.15, 4.5, 0.7
-MIN_BORDER_M, MIN_BORDER_CONFIDENCE = 5.0, 0.5
-NEAR_LINE_M = 12.0  # borders farther from all lane lines are those of something else
-
-
-@dataclass(frozen=True, eq=False)
-class _Coarse:
-    """Layers (K, R, C) of a map in cells of `cell_m`: yellowness and intensity in sigmas, height in sigmas; and where known."""
-
-    values: NDArray[np.float32]
-    known: NDArray[np.float32]
-    cell_m: float
-
-
-def find_borders(ground: GroundMap, markings: tuple[Marking, ...]) -> tuple[tuple[RoadBorder, ...], tuple[str, ...]]:
-    """Find borders of the roads that lane lines are painted on; the second result says why there are none.
-
-    Both sides of a border are compared over `ACROSS_M` by yellowness, LiDAR intensity and height, each in sigmas of one
-    surface. One side has to look like the ground beside lane lines, so without them there are no borders.
-    """
-    lines = [m.points_m[:, :2] for m in markings if m.is_lane_line]
-    if not lines:
-        return (), ("no borders of roads seen: without lane lines it is not known which surface is the road",)
-    coarse = _coarsen(ground)
-    around = [xy + shift for xy in lines for shift in ((0.6, 0.6), (-0.6, -0.6), (0.6, -0.6), (-0.6, 0.6))]
-    cells = _cells(coarse, ground, np.concatenate(around))
-    road = np.full(2, np.nan)  # its yellowness and intensity
-    for k in range(2):
-        known = coarse.known[k][cells] > 0
-        if known.any():
-            road[k] = np.median(coarse.values[k][cells][known])
-    # Under paint there is road, which would look like another surface.
-    paint = _draw_paint(coarse, ground, markings)
-    for k in np.flatnonzero(np.isfinite(road)).tolist():
-        coarse.values[k][paint] = road[k]
-    points = _steps(coarse, ground, road)
-    fitted = fit_lines(points, coarse.cell_m)
-    pieces = no_pieces(len(fitted), xy=fitted[:, :2], direction=fitted[:, 2], length_m=fitted[:, 3])
-    found = [_border_of(coarse, ground, chain.corners(pieces), lines) for chain in touching_chains(pieces)]
-    kept = sorted((b for b in found if b is not None), key=lambda b: -b.confidence)
-    named = tuple(replace(border, id=f"border-{k + 1}") for k, border in enumerate(kept))
-    return named, () if named else ("no borders of roads seen: the surface does not change beside the lane lines",)
-
-
-def _coarsen(ground: GroundMap) -> _Coarse:
-    factor = max(1, round(CELL_M / ground.resolution_m))
-    rows, columns = (size // factor for size in ground.alpha.shape)
-    part = (slice(rows * factor), slice(columns * factor))
-    intensity, height_m = ground.intensity[part], ground.height_m[part]
-    layers = (
-        (log_color(ground.color_bgr[part])[1] / np.float32(YELLOW_SIGMA), ground.alpha[part] > 0),
-        (log_intensity(intensity) / np.float32(INTENSITY_SIGMA), np.isfinite(intensity)),
-        (height_m / np.float32(HEIGHT_SIGMA_M), np.isfinite(height_m)),
-    )
-    means = [coarse_means(values, valid, factor) for values, valid in layers]
-    values, known = (np.stack(column) for column in zip(*means))
-    return _Coarse(values, (known > 0).astype(np.float32), factor * ground.resolution_m)
-
-
-def _draw_paint(coarse: _Coarse, ground: GroundMap, markings: tuple[Marking, ...]) -> NDArray[np.bool_]:
-    """Mask of the cells (R, C) that markings touch."""
-    mask = np.zeros(coarse.values.shape[1:], np.uint8)
-    for marking in markings:
-        rows, columns = ground.raster.cells_of(marking.points_m[:, :2])
-        at = (np.stack([columns, rows], axis=1) + 0.5) * ground.resolution_m / coarse.cell_m - 0.5
-        corners = np.rint(at).astype(np.int32)
-        if marking.is_lane_line or marking.kind == "stop_line":
-            cv2.polylines(mask, [corners], False, 1, round(marking.width_m / coarse.cell_m) + 1)
-        else:
-            cv2.fillPoly(mask, [corners], 1)
-    return mask > 0
-
-
-def _cells(coarse: _Coarse, ground: GroundMap, xy: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    rows = ((ground.extent_m[3] - xy[:, 1]) / coarse.cell_m).astype(np.int64)
-    columns = ((xy[:, 0] - ground.extent_m[0]) / coarse.cell_m).astype(np.int64)
-    shape = coarse.values.shape[1:]
-    return np.clip(rows, 0, shape[0] - 1), np.clip(columns, 0, shape[1] - 1)
-
-
-def _steps(coarse: _Coarse, ground: GroundMap, road: Array) -> RidgePoints:
-    """Find points where the road is on one side only."""
-    seen = [bool(layer.any()) for layer in coarse.known]
-    height, width = coarse.values.shape[1:]
-    best = np.zeros((height, width), np.float32)
-    number = np.zeros(best.shape, np.uint8)
-    for k in range(DIRECTIONS):
-        there, back, size = turn_image((height, width), np.pi * k / DIRECTIONS)
-        turned, known = (
-            [warp(layer, there, size) if some else None for layer, some in zip(layers, seen, strict=True)]
-            for layers in (coarse.values, coarse.known)
-        )
-        for way, step in enumerate(_step(turned, known, road, size, coarse.cell_m)):
-            response = warp(step, back, (width, height))
-            better = response > best
-            best[better], number[better] = response[better], k + way * DIRECTIONS
-    rows, columns = np.nonzero(best > MIN_STEP)
-    angle = number[rows, columns] * (np.pi / DIRECTIONS)
-    across = np.stack([-np.cos(angle), -np.sin(angle)])  # rows, columns
-    here = best[rows, columns]
-    sides = [map_coordinates(best, np.stack([rows, columns]) + s * across, order=1) for s in (-2, -1, 1, 2)]
-    crest = here >= np.max(sides, axis=0)
-    x = ground.extent_m[0] + (columns[crest] + 0.5) * coarse.cell_m
-    y = ground.extent_m[3] - (rows[crest] + 0.5) * coarse.cell_m
-    return RidgePoints(np.stack([x, y], 1), angle[crest] % np.pi, here[crest].astype(np.float64))
-
-
-def _step(
-    turned: list[Layer | None], known: list[Layer | None], road: Array, size: tuple[int, int], cell_m: float
-) -> tuple[Layer, Layer]:
-    """Sigmas by which the ground on one side of the rows differs from the road on the other: road below, road above.
-
-    Layers are None where nothing of them is known; `size` is that of the others (columns, rows).
-    """
-    kernel = (round(ALONG_M / cell_m), round(ACROSS_M / cell_m))
-    reach = round((GAP_M + ACROSS_M / 2) / cell_m)
-    shape = (max(size[1] - 2 * reach, 0), size[0])
-    steps: list[NDArray[Any]] = []
-    boths: list[NDArray[Any]] = []
-    below_differs: NDArray[Any] = np.zeros(shape, bool)
-    above_differs, told = below_differs, below_differs
-    for k, (values, valid) in enumerate(zip(turned, known, strict=True)):
-        if values is None or valid is None:
-            steps.append(np.zeros(shape, np.float32))
-            boths.append(np.zeros(shape, bool))
-            continue
-        share = np.asarray(cv2.blur(valid, kernel), np.float32)
-        mean = np.divide(cv2.blur(values * valid, kernel), share, out=np.zeros_like(share), where=share > MIN_SEEN)
-        above, below = mean[: -2 * reach], mean[2 * reach :]
-        both = np.minimum(share[: -2 * reach], share[2 * reach :]) > MIN_SEEN
-        steps.append(np.where(both, above - below, 0))
-        boths.append(both)
-        if k != HEIGHT and np.isfinite(road[k]):
-            told = told | both
-            below_differs = below_differs | (both & (np.abs(below - np.float32(road[k])) > ROAD_TOLERANCE))
-            above_differs = above_differs | (both & (np.abs(above - np.float32(road[k])) > ROAD_TOLERANCE))
-    surface = np.square(_surface_step(steps[0], steps[1], boths[1]))
-    height = steps[HEIGHT] * np.float32(HEIGHT_SIGMA_M)
-    out = (np.zeros(size[::-1], np.float32), np.zeros(size[::-1], np.float32))
-    for layer, other, rise in zip(out, (below_differs, above_differs), (height, -height)):
-        curb = np.where((rise > CURB_M[0]) & (rise < CURB_M[1]), np.square(steps[HEIGHT]), 0)  # only up, and no wall
-        layer[reach:-reach] = np.where(told & ~other, np.sqrt(surface + curb), 0)
-    return out
-
-
-def _surface_step(yellow: NDArray[Any], intensity: NDArray[Any], by_lidar: NDArray[Any]) -> NDArray[Any]:
-    """Join steps of yellowness and intensity (...), sigmas.
-
-    Shadows are bluer than the sun's light but reflect LiDAR as before, so color counts no more than intensity where that
-    is known, and half without.
-    """
-    y, i = np.abs(yellow), np.abs(intensity)
-    return np.asarray(np.where(by_lidar, np.hypot(i, np.minimum(y, i)), y / 2))
-
-
-def _border_of(coarse: _Coarse, ground: GroundMap, corners: Array, lines: list[Array]) -> RoadBorder | None:
-    """Rate a chain of steps; None for one that is short, unlikely, or far from lane lines."""
-    length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
-    if length < MIN_BORDER_M:
-        return None
-    curve = fit_curve(corners, sigma_m=coarse.cell_m / 2)
-    distance = cKDTree(np.concatenate(lines)).query(curve.xy[::4])[0]
-    # Steps of each layer across the line, in sigmas, where both sides are known.
-    reach, steps = GAP_M + ACROSS_M / 2, []
-    left, right = (_cells(coarse, ground, curve.xy + side * reach * curve.normal) for side in (1, -1))
-    for values, known in zip(coarse.values, coarse.known):
-        both = np.minimum(known[left], known[right]) > 0
-        steps.append((values[left] - values[right])[both].astype(np.float64))
-    by_color, by_lidar, by_height = (float(abs(np.median(s))) if len(s) > 3 else 0.0 for s in steps)
-    sigmas = float(_surface_step(np.array(by_color), np.array(by_lidar), np.array(len(steps[1]) > 3)))
-    curb = CURB_M[0] <= by_height * HEIGHT_SIGMA_M <= CURB_M[1]
-    odds = PRIOR + min(PER_METER * length, MAX_BY_LENGTH) + PER_SIGMA * min(sigmas - MIN_STEP, CLEAR_STEP) + 2.0 * curb
-    if probability_of(odds) < MIN_BORDER_CONFIDENCE or np.median(distance) > NEAR_LINE_M:
-        return None
-    shown = (("camera", by_color > 1), ("lidar", by_lidar > 1 or curb))
-    sources = tuple(name for name, shows in shown if shows)
-    return RoadBorder(
-        "", "curb" if curb else "edge", at_height(ground, thin(curve.xy)), float(probability_of(odds)), sources
-    )
+def _widens(mask: NDArray[np.uint8]) -> float:
+    """Logarithm by which the widest part of a shape, across its length, is wider than the middle one: an arrow's head."""
+    xy = np.stack(np.nonzero(mask), axis=1).astype(np.float64)
+    xy -= xy.mean(axis=0)
+    along = xy @ np.linalg.eigh(xy.T @ xy)[1][:, 1]
+    width = np.bincount((along - along.min()).astype(np.intp))
+    return float(np.log(np.quantile(width, 0.95) / np.median(width)))
 
 
 MIN_CONFIDENCE = 0.5  # what is rather not there than there is left out
@@ -466,25 +291,37 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
     return markings, borders, notes
 
 
-def list_markings(
-    ground: GroundMap, *, min_confidence: float, min_line_m: float, symbols: bool = True
-) -> tuple[Marking, ...]:
-    """List markings, sure ones first, from a confidence and, for plain strokes, a length on; `symbols` tells arrows apart."""
+def find_paint(ground: GroundMap, *, symbols: bool = True) -> tuple[list[PaintedArea], list[PaintedLine]]:
+    """Find what may be paint, also the unlikely; `symbols` tells arrows apart."""
     pieces = find_pieces(ground, find_ridges(ground))
     areas, chains = find_crosswalks(ground, pieces, touching_chains(pieces))
-    lines = find_lines(ground, pieces, dashed_chains(pieces, chains))
+    lines, shares = find_lines(ground, pieces, dashed_chains(pieces, chains))
+    areas = [replace(area, evidence=evidence_of_bars(area.pieces, area.bars_m, shares)) for area in areas]
     stops, lines = part_stop_lines(lines)
     if symbols:
         small, lines = part_symbols(ground, lines)
         areas += small
-    long = [line for line in lines if line.kind == "dashed" or line.length_m >= min_line_m]
-    painted: list[tuple[str, Array, PaintedArea | PaintedLine]] = [(area.kind, area.outline, area) for area in areas]
-    painted += [("stop_line", thin(line.xy), line) for line in stops]
-    painted += [(line.kind, thin(line.xy), line) for line in long]
+    return areas, stops + lines
+
+
+def list_markings(
+    ground: GroundMap, *, min_confidence: float, min_line_m: float, symbols: bool = True
+) -> tuple[Marking, ...]:
+    """List markings, sure ones first, from a confidence and, for plain strokes, a length on; `symbols` tells arrows apart."""
+    areas, lines = find_paint(ground, symbols=symbols)
+    return markings_of(ground, areas, lines, min_confidence, min_line_m)
+
+
+def markings_of(
+    ground: GroundMap, areas: list[PaintedArea], lines: list[PaintedLine], min_confidence: float, min_line_m: float
+) -> tuple[Marking, ...]:
+    """Choose the likely ones, sure ones first."""
+    painted: list[tuple[Array, PaintedArea | PaintedLine]] = [(area.outline, area) for area in areas]
+    painted += [(thin(line.xy), line) for line in lines if line.kind != "solid" or line.length_m >= min_line_m]
     found = []
-    for kind, xy, one in painted:
+    for xy, one in painted:
         shown_by = color_of(one.pieces), float(probability_of(one.log_odds)), sources_of(one.pieces)
         if shown_by[1] >= min_confidence:
-            found.append(Marking("", kind, at_height(ground, xy), one.width_m, *shown_by))
+            found.append(Marking("", one.kind, at_height(ground, xy), one.width_m, *shown_by))
     markings = sorted(found, key=lambda m: -m.confidence)
     return tuple(replace(marking, id=f"marking-{k + 1}") for k, marking in enumerate(markings))

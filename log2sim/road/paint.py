@@ -138,9 +138,8 @@ def measure_pieces(ground: GroundMap, lines: Array) -> Pieces:
         row, column = (np.rint(a).astype(int) for a in ground.raster.cells_of(lines[:, :2]))
         rows, columns = ground.alpha.shape
         spacing = ground.spacing_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)].astype(np.float64)
-        # How likely one of points that are scattered at random so far apart lies within half the width of paint. Without a camera
-        # the contrast is all there is to go by.
-        resolved = np.where(by_camera, 1 - np.exp(-np.pi / 4 * (PAINT_WIDTH_M / spacing) ** 2), 1.0)
+        # How likely one of points that are scattered at random so far apart lies within half the width of paint.
+        resolved = 1 - np.exp(-np.pi / 4 * (PAINT_WIDTH_M / spacing) ** 2)
     by_lidar = reflected, reflected_sigma, above_road, above_road - reflected - difference
     return Pieces(xy, lines[:, 2], lines[:, 3], width, *by_color, outshines, yellow, *by_lidar, resolved)
 
@@ -260,19 +259,26 @@ def evidence_of_line(
         "dashes": np.log(dashes) if bars else min(max(dashes - 2, 0), MAX_DASHES),
         "varies": np.clip((varies - 0.2) / 0.3, 0, 1),
         "wide": np.clip((width_m - WIDE_M) / WIDE_M, 0, 1),
-        "contrast": np.clip(_median_known(contrast), -3, 1.5),
+        "contrast": np.clip(median_known(contrast), -3, 1.5),
         "outshone": np.clip((0.5 - share) / 0.4, 0, 1),
         "reflects": by_lidar(pieces, shares if pieces.by_camera else DRY),
-        "dull": np.clip(1 - _median_known(pieces.above_road) / MIN_ABOVE_ROAD, 0, 2),
-        "bright_beside": np.clip(_median_known(pieces.beside_road) / BRIGHT_GROUND, 0, 1.5),
+        # Wet paint may return less than a dry road does.
+        "dull": np.clip(1 - median_known(pieces.above_road) / MIN_ABOVE_ROAD, 0, 2) * np.exp(shares[-1]),
+        "unresolved": 1 - median(pieces.resolved) if np.isfinite(pieces.reflected).any() else 0.0,
+        "bright_beside": np.clip(median_known(pieces.beside_road) / BRIGHT_GROUND, 0, 1.5),
     }
     return {name: float(value) if np.isfinite(value) else 0.0 for name, value in evidence.items()}
 
 
-def table_of(pieces: Pieces, *, bars: bool = False) -> str:
-    """Name the weights of the evidence for pieces: by what they are parts of, and by the sensors that saw enough of them."""
-    if bars:
-        return "crosswalk, camera" if pieces.by_camera else "crosswalk, LiDAR"
+def table_of(pieces: Pieces, kind: str = "line") -> str:
+    """Name the weights of the evidence for pieces: by what they are parts of, and by the sensors that saw enough of them.
+
+    `kind`: "crosswalk", "stop_line" or that of any other line.
+    """
+    if kind == "other":
+        return kind
+    if kind in ("crosswalk", "stop_line"):
+        return f"{kind}, {'camera' if pieces.by_camera else 'LiDAR'}"
     enough = _reflected(pieces) is not None
     if pieces.by_camera:
         return "line, camera and LiDAR" if enough else "line, camera"
@@ -307,14 +313,15 @@ def log_probabilities_of_shares(lines: Iterable[tuple[Pieces, float, int]]) -> A
     odds, contrasts = [], []
     for pieces, painted_m, dashes in lines:
         contrast = _reflected(pieces) if painted_m > MIN_PAINTED_M else None
-        if contrast is not None and _median_known(pieces.color) > EXPECTED_COLOR / 2:
-            odds.append(weighted_sum(evidence_of_line(pieces, painted_m, dashes=dashes), WEIGHTS["line, camera"]))
+        if contrast is not None and median_known(pieces.color) > EXPECTED_COLOR / 2:
+            by_camera = evidence_of_line(pieces, painted_m, dashes=dashes) | {"dull": 0.0, "bright_beside": 0.0}
+            odds.append(weighted_sum(by_camera, WEIGHTS["line, camera"]))
             contrasts.append(contrast)
     if not contrasts:
         return DRY
     paint, other = _log_densities(np.array(contrasts)[:, None], RETURNED)
-    by_camera = np.array(odds)[:, None]
-    likelihood = np.logaddexp(paint + by_camera, other) - np.logaddexp(by_camera, 0)
+    prior_odds = np.array(odds)[:, None]
+    likelihood = np.logaddexp(paint + prior_odds, other) - np.logaddexp(prior_odds, 0)
     prior = np.log(np.where(RETURNED < 1, LOW_PRIOR / (len(RETURNED) - 1), 1 - LOW_PRIOR))
     total = likelihood.sum(axis=0) + prior
     return np.asarray(total - np.logaddexp.reduce(total))
@@ -327,7 +334,8 @@ def _reflected(pieces: Pieces) -> tuple[float, float, float] | None:
         return None
     values = pieces.reflected[known]
     error = median(pieces.reflected_sigma[known]) / np.sqrt(len(values))
-    return median(values), float(error), median(pieces.resolved[known])
+    # Without a camera the contrast is all there is to go by.
+    return median(values), float(error), median(pieces.resolved[known]) if pieces.by_camera else 1.0
 
 
 def _log_densities(reflected: Array, returned: Array) -> tuple[Array, Array]:
@@ -342,7 +350,8 @@ def _log_densities(reflected: Array, returned: Array) -> tuple[Array, Array]:
     return out[0], out[1]
 
 
-def _median_known(values: Array) -> float:
+def median_known(values: Array) -> float:
+    """Return the median of what is finite; NaN where nothing is."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
 

@@ -162,19 +162,21 @@ def measure(scene: Scene, rig: Rig, folder: Path, seed: int = 1) -> dict[str, An
 
 
 def summary(all_found: list[dict[str, Any]]) -> str:
-    """Precision and recall of the lane lines of all cases by their length, and counts of stop lines and crosswalks."""
-    lines = [f["lane_lines"] for f in all_found if f.get("lane_lines")]
+    """Precision and recall of the lane lines and borders of all cases by their length, and counts of other markings."""
     shown_m, matched_m = np.sum([f["standing_out_m"] for f in all_found], axis=0)
 
-    def mean(name: str, length: str) -> float:
+    def mean(of: str, name: str, length: str) -> float:
+        lines = [f[of] for f in all_found if f.get(of)]
         return sum((line[name] or 0.0) * line[length] for line in lines) / max(
             sum(line[length] for line in lines), 1e-9
         )
 
-    by_length = mean("precision", "found_m"), mean("recall", "true_m"), matched_m / max(shown_m, 1e-9)
-    counts = [f"{name.replace('_', ' ')} {count(all_found, name)}" for name in ("stop_lines", "crosswalks")]
-    text = "All lane lines: precision {:.3f}, recall {:.3f}, where they stand out {:.3f}; ".format(*by_length)
-    return text + ", ".join(counts) + "."
+    lines, borders = (
+        (mean(of, "precision", "found_m"), mean(of, "recall", "true_m")) for of in ("lane_lines", "borders")
+    )
+    counts = [f"{name.replace('_', ' ')} {count(all_found, name)}" for name in ("stop_lines", "crosswalks", "others")]
+    text = "All lane lines: precision {:.3f}, recall {:.3f}, where they stand out {:.3f}; borders {:.3f}, {:.3f}; "
+    return text.format(*lines, matched_m / max(shown_m, 1e-9), *borders) + ", ".join(counts) + "."
 
 
 def count(all_found: list[dict[str, Any]], kind: str) -> str:

@@ -1,10 +1,10 @@
 """Make maps of random roads with their true markings, on which `fit.py lines` fits.
 
-    python tools/fit.py line_maps FOLDER --maps 160 --seed 0
+    python tools/fit.py line_maps FOLDER --maps 160 --plain 80 --seed 0
 
 Each road is straight or bent, a street or one side of a motorway, with traffic on either side, lines of any usual width, kind, color and
 wear, removed ones, crosswalks, stop lines, arrows, houses, shadows, sidewalks or grass beside it, in any light and weather; it is rendered,
-and reconstructed by its labels, with one to three cameras and a LiDAR of 16 to 64 lines, or without one of both. One map in eight is of
+and reconstructed by its labels, with one to three cameras and a LiDAR of 16 to 64 lines, or without one of both. Others are of
 plain ground, whose texture is coarser than that of rendered grounds. Files that exist are left as they are.
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import pickle
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,9 @@ import numpy as np
 import shapely
 
 from log2sim import Config, open_log, reconstruct
-from log2sim.datatypes import Marking, Scenario
+from log2sim.datatypes import MapFeatures, Scenario
 from log2sim.errors import Log2SimError
+from log2sim.evaluation.road import Area
 from log2sim.geometry import Array
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap
@@ -31,16 +32,17 @@ from log2sim.synth.synthesis import write_synthetic
 
 MAPS_OF_SEED = 100_000
 STREET_M, MOTORWAY_M, STEP_M = 200.0, 300.0, 12.0  # to where roads lead both ways, and from point to point
-WITHOUT_LIDAR, UNMARKED = 0.25, 0.15  # shares of maps, of roads
-APART_M = 14.0  # vehicles begin farther from each other
+WITHOUT_CAMERA, WITHOUT_LIDAR, UNMARKED = 0.2, 0.2, 0.15  # shares of maps, of roads
+APART_M, ARROW_APART_M = 14.0, 8.0  # vehicles from each other at first, arrows from what is across the road
 
 
 @dataclass(frozen=True, eq=False)
 class RoadMap:
-    """A map and the markings that are there."""
+    """A map, what is on the road in truth, and where that counts."""
 
     ground: GroundMap
-    true: tuple[Marking, ...]
+    true: MapFeatures
+    area: Area
 
 
 @dataclass(frozen=True)
@@ -72,27 +74,28 @@ def draw_scene(seed: int) -> Scene:
     def chance(share: float) -> bool:
         return bool(rng.random() < share)
 
+    def wear() -> float:
+        return float(one_of(0.0, 0.0, draw(0.05, 0.6)))
+
     left_hand, motorway = chance(0.35), chance(0.25)
     speed, duration = (draw(22, 34), 4.0) if motorway else (draw(5, 18), 5.0)
     one_way = motorway or chance(0.15)
-    lanes = int(rng.integers(2, 5)) if one_way else one_of(2, 2, 2, 4, 4)
+    lanes = one_of(2, 2, 3, 4) if one_way else one_of(2, 2, 2, 4, 4)
     lane_m = draw(3.3, 3.8) if motorway else draw(2.7, 3.7)
-    inset_m = draw(0.15, 1.2) if motorway else draw(0.15, 0.35)
-    width = lanes * lane_m + (2 * inset_m if motorway else 0.2)
-    # The first is as good as straight, with a radius that exists.
-    course = _Course(one_of(1e-6, draw(-1, 1), draw(-1, 1)) * (0.0012 if motorway else 0.008) + 1e-9)
+    # Beside the outer lines there is a hard shoulder, or cars park there; lanes of a road are as wide as each other with that.
+    beside_m = draw(1.8, 3.5) if lanes == 2 and chance(0.4) else 0.0
+    inset_m = beside_m or (draw(0.15, 1.2) if motorway else draw(0.15, 0.35))
+    width = lanes * lane_m + (2 * inset_m if motorway or beside_m else 0.2)
+    bend_pm = 0.0012 if motorway else 0.008
+    course = _Course(one_of(1e-8, draw(-bend_pm, bend_pm), draw(-bend_pm, bend_pm)))  # the first is as good as straight
     reach = MOTORWAY_M if motorway else STREET_M
     near_side = 1 if left_hand else -1
     centers = [-lanes * lane_m / 2 + (k + 0.5) * lane_m for k in range(lanes)]  # of lanes, to the left of the middle
     along = [d for d in centers if one_way or d * near_side > 0]
-    own, worn, walk_m = (
-        one_of(*along),
-        one_of(0.0, 0.0, draw(0.05, 0.6)),
-        0.0 if motorway or chance(0.35) else draw(1.2, 4),
-    )
+    own, walk_m = one_of(*along), 0.0 if motorway or chance(0.35) else draw(1.2, 4)
     road: dict[str, Any] = {
         "line": [course.at(float(s), 0.0) for s in np.arange(-reach, reach, STEP_M)],
-        "width_m": width, "lanes": lanes, "worn": worn, "sidewalk_m": walk_m, "side_inset_m": max(inset_m, 0.12),
+        "width_m": width, "lanes": lanes, "worn": wear(), "sidewalk_m": walk_m, "side_inset_m": max(inset_m, 0.12),
         "marking": one_of("dashed", "dashed", "dashed", "solid", "none"),
         "side_marking": one_of("solid", "solid", "solid", "dashed", "none"),
         "side_line_m": draw(0.1, 0.3) if motorway else draw(0.1, 0.16),
@@ -112,25 +115,44 @@ def draw_scene(seed: int) -> Scene:
         "name": f"road-{seed}", "duration_s": duration, "traffic": "left" if left_hand else "right", "road": [road],
         "ego": {"waypoints": course.driven(-0.55 * speed * duration, 0.6 * speed * duration, own, speed)},
     }  # fmt: skip
-    if not motorway and chance(0.3):
-        at = draw(15, 40)
-        crossing = {"line": [course.at(at, 60), course.at(at, -60)], "width_m": draw(6, 10)}
+    zebras, stops = list[tuple[float, float]](), list[tuple[float, int]]()  # with widths, with the direction driven in
+    crossing_at = np.inf
+    if not motorway and chance(0.45):
+        crossing_at = at = draw(15, 40)
+        across_m = draw(6, 10)
+        crossing = {"line": [course.at(at, 60), course.at(at, -60)], "width_m": across_m}
         scene["road"].append(crossing | {"sidewalk_m": walk_m, "side_inset_m": 0.2})
-        if not one_way and chance(0.7):
-            line = [course.at(at - 9, 0.1 * near_side), course.at(at - 9, near_side * (width / 2 - 0.2))]
-            scene["stop_line"] = [{"line": line, "width_m": draw(0.3, 0.6), "worn": worn}]
+        for way in (1, -1):
+            edge = at - way * (across_m / 2 + walk_m + draw(0.5, 3))
+            walk = draw(2.5, 5) if chance(0.4) else 0.0
+            if walk:
+                zebras.append((edge - way * walk / 2, walk))
+            if chance(0.7) and (way > 0 or not one_way):
+                stops.append((edge - way * (walk + draw(0.8, 2)), way))
     elif not motorway and chance(0.6):
-        at = draw(5, 35)
-        line = [course.at(at, -width / 2), course.at(at, width / 2)]
-        scene["zebra"] = [{"line": line, "width_m": draw(2.5, 5), "worn": worn}]
-    if chance(0.4):
-        scene["arrow"] = [
-            {
-                "position": course.at(s, own), "yaw_deg": float(np.degrees(course.curvature_pm * s)), "worn": worn,
-                "shape": one_of("straight", "left", "right"), "length_m": draw(3, 7),
-            }
-            for s in rng.uniform(-30, 40, int(rng.integers(1, 4))).tolist()
-        ]  # fmt: skip
+        at, walk, way = draw(5, 35), draw(2.5, 5), one_of(1, -1)
+        zebras = [(at, walk)]
+        if chance(0.4) and (way > 0 or not one_way):
+            stops = [(at - way * (walk / 2 + draw(0.8, 2)), way)]
+    scene["zebra"] = [
+        {"line": [course.at(at, -width / 2), course.at(at, width / 2)], "width_m": walk, "worn": wear()}
+        for at, walk in zebras
+    ]
+    across = [-(width / 2 - 0.2) if one_way else 0.1, width / 2 - 0.2]  # of the lanes that lead to a stop line
+    scene["stop_line"] = [
+        {"line": [course.at(at, way * near_side * left) for left in across], "width_m": draw(0.3, 0.6), "worn": wear()}
+        for at, way in stops
+    ]
+    if chance(0.6):
+        crossed = [at for at, _ in zebras + stops] + [crossing_at]
+        for s in rng.uniform(-30, 40, int(rng.integers(1, 6))).tolist():
+            lane, shape, length = one_of(*centers), one_of("straight", "left", "right"), draw(3, 7)
+            turn = np.degrees(course.curvature_pm * s) + (0 if lane in along else 180)
+            # Bent arrows reach half their length to the side, and are within their lane.
+            length = length if shape == "straight" else min(length, lane_m - 0.6)
+            arrow = {"position": course.at(s, lane), "yaw_deg": float(turn), "shape": shape, "length_m": length}
+            if all(abs(s - at) > ARROW_APART_M for at in crossed):
+                scene.setdefault("arrow", []).append(arrow | {"worn": wear()})
     beside = width / 2 + walk_m
     if not motorway and chance(0.6):
         scene["building"] = [
@@ -172,7 +194,7 @@ def draw_scene(seed: int) -> Scene:
         "elevation_deg": [draw(-26, -16), draw(2, 8)], "azimuth_deg": [-140.0, 140.0], "azimuth_step_deg": draw(0.2, 0.6), "offset_s": 0.08,
     }  # fmt: skip
     sensors = rng.random()
-    scene["camera"] = [] if sensors < 0.1 else scene["camera"]
+    scene["camera"] = [] if sensors < WITHOUT_CAMERA else scene["camera"]
     scene["lidar"] = [] if sensors > 1 - WITHOUT_LIDAR else [lidar]
     wet = chance(0.3)
     scene["environment"] = {
@@ -202,7 +224,7 @@ def _shadow(xy: Array, rng: np.random.Generator) -> list[list[float]]:
     return [[float(x), float(y)] for x, y in shapely.MultiPoint(points).convex_hull.exterior.coords[:-1]]
 
 
-PLAIN_EVERY = 8
+BLUR_M = 0.05
 PLAIN_M, CELL_M = (60.0, 30.0), 0.05
 # Colors, BGR, of asphalt, gravel, grass, earth and sand; brightness varies by up to this share from grain to grain.
 PLAIN_BGR = ((92, 91, 90), (120, 124, 130), (60, 110, 80), (60, 80, 105), (120, 150, 175))
@@ -226,29 +248,50 @@ def plain_map(seed: int) -> RoadMap:
     intensity = np.full(shape, np.nan) if rng.random() < WITHOUT_LIDAR else returns
     layers = np.clip(image, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8), np.zeros(shape, np.float32)
     extent = (0.0, PLAIN_M[0], 0.0, PLAIN_M[1])
-    return RoadMap(GroundMap(*layers, intensity.astype(np.float32), CELL_M, extent), ())
+    everywhere = Area(None, None, None, 0.0)
+    return RoadMap(GroundMap(*layers, intensity.astype(np.float32), CELL_M, extent), MapFeatures(), everywhere)
+
+
+def raise_roadsides(ground: GroundMap, scene: Scene, shift_m: Array, rng: np.random.Generator) -> GroundMap:
+    """Raise what is beside the roads, as rendered ground is flat: sidewalks by a curb, grass up or down by less.
+
+    `shift_m`: (2,): from the scene to the map.
+    """
+    step_m = rng.uniform(0.06, 0.2) if scene.road[0].sidewalk_m else rng.uniform(-0.1, 0.1)
+    beside = np.ones(ground.alpha.shape, np.float32)
+    for road in scene.road:
+        outline = shapely.LineString(road.line).buffer(road.width_m / 2, cap_style="flat")
+        rows, columns = ground.raster.cells_of(shapely.get_coordinates(outline.exterior) + shift_m)
+        cv2.fillPoly(beside, [np.rint(np.column_stack([columns, rows])).astype(np.int32)], 0.0)
+    raised = ground.height_m + np.float32(step_m) * cv2.GaussianBlur(beside, (0, 0), BLUR_M / ground.resolution_m)
+    return replace(ground, height_m=raised)
 
 
 def make_map(seed: int) -> RoadMap:
     """Render a road, reconstruct it by its labels and map the ground."""
     with tempfile.TemporaryDirectory() as folder:
-        write_synthetic(draw_scene(seed), Path(folder) / "log", seed=seed)
+        scene = draw_scene(seed)
+        write_synthetic(scene, Path(folder) / "log", seed=seed)
         log = open_log(Path(folder) / "log")
         detector = "labels" if log.cameras else "lidar:labels"
         scenario = reconstruct(log, Config.load(detect={"name": detector}), jobs=1, cache=False).scenario
-        truth = Scenario.load(Path(folder) / "log" / "truth.json").aligned_to(scenario)
-        return RoadMap(map_ground(log, scenario), truth.map_features.markings if truth.map_features else ())
+        truth = Scenario.load(Path(folder) / "log" / "truth.json")
+        moved = truth.aligned_to(scenario)
+        shift_m = truth.shift_to(scenario)
+        ground = raise_roadsides(map_ground(log, scenario), scene, shift_m[:2], np.random.default_rng([seed, 80]))
+        return RoadMap(ground, moved.map_features or MapFeatures(), Area.of(scenario, moved, shift_m))
 
 
-def main(folder: Path, maps: int = 160, first: int = 0, seed: int = 0) -> None:
-    """Make so many maps, from the first index on."""
+def main(folder: Path, maps: int = 160, plain: int = 80, first: int = 0, seed: int = 0) -> None:
+    """Make so many maps of roads, from the first index on, and of plain ground."""
     folder.mkdir(parents=True, exist_ok=True)
-    for index in range(first, first + maps):
-        path = folder / f"{seed}-{index:04d}.pkl"
+    wanted = [(f"{seed}-{index:04d}", index, make_map) for index in range(first, first + maps)]
+    wanted += [(f"{seed}-plain-{index:04d}", index, plain_map) for index in range(plain)]
+    for name, index, made in wanted:
+        path = folder / f"{name}.pkl"
         if path.exists():
             continue
         try:
-            made = plain_map if index % PLAIN_EVERY == PLAIN_EVERY - 1 else make_map
             content = pickle.dumps(made(MAPS_OF_SEED * seed + index), protocol=5)
         except Log2SimError as error:  # a road that the scene file's limits rule out
             print(f"{path.name} left out: {error}", flush=True)

@@ -1,9 +1,9 @@
-"""Fit the weights of the evidence by which markings are judged, on maps of random roads.
+"""Fit the weights of the evidence by which markings and borders of roads are judged, on maps of random roads.
 
-    python tools/fit.py line_maps FOLDER --maps 160
+    python tools/fit.py line_maps FOLDER --maps 160 --plain 80
     python tools/fit.py lines FOLDER ... > weights.py && mv weights.py log2sim/road/
 
-Judges every line and every row of bars that is found in the maps, also the unlikely ones, by how much of it lies on paint, and prints the
+Judges every line, row of bars, symbol and edge that is found in the maps, also the unlikely ones, by how much of it is true, and prints the
 module. Tables go to stderr: each fifth of the maps is rated by weights that fit the others, beside those that are there.
 """
 
@@ -18,34 +18,39 @@ from pathlib import Path
 import numpy as np
 import shapely
 from scipy.spatial import cKDTree
+from shapely.geometry.base import BaseGeometry
 
 from fits.confidence import fit_weights
 from fits.line_maps import RoadMap
 from log2sim.datatypes import Marking
+from log2sim.evaluation.road import MIN_ARROW_OVERLAP
 from log2sim.geometry import Array
-from log2sim.road.lines import dashed_chains, find_lines, touching_chains
-from log2sim.road.markings import find_crosswalks, part_stop_lines
-from log2sim.road.paint import find_pieces, table_of, weighted_sum
-from log2sim.road.ridges import find_ridges
+from log2sim.road.borders import find_edges
+from log2sim.road.markings import MIN_CONFIDENCE, MIN_LINE_M, find_paint, markings_of
+from log2sim.road.paint import table_of, weighted_sum
 from log2sim.road.strokes import Curve
 from log2sim.road.weights import WEIGHTS
 
 FOLDS = 5
 NEAR_M, STEP_M = 0.25, 0.1
 MIN_EFFECT = 0.05  # of a standard deviation of the evidence, in log-odds: what has less is left out
-# Lines that one sensor alone shows have to be as likely as two to one: rings of a LiDAR and textures in pictures differ more than simulated
-# ones do.
-ONE_SENSOR, COST_OF_ONE_SENSOR = ("line, camera", "line, LiDAR", "line, few returns"), 2.0
+# How many missed markings a false one is worth. Lines and borders that one sensor alone shows have to be as likely as two to one: rings of a
+# LiDAR and textures in pictures differ more than simulated ones do. An arrow that is missed is taken for a lane line, several meters long; of
+# a dash that is taken for one little is lost.
+COSTS = {
+    "line, camera": 2.0, "line, LiDAR": 2.0, "line, few returns": 2.0, "border, camera": 2.0, "border, LiDAR": 2.0, "other": 0.25,
+}  # fmt: skip
 # What the evidence can say, at most, by what it means: for paint, against it.
 SIGNS = {
-    "length": 1, "dashes": 1, "contrast": 1, "reflects": 1, "outshone": -1, "varies": -1, "bright_beside": -1, "dull": -1, "crowded": -1,
-    "remnant": -1, "no_lane_line": -1, "wide": 0,
+    "length": 1, "dashes": 1, "contrast": 1, "reflects": 1, "outshone": -1, "varies": -1, "bright_beside": -1, "dull": -1, "unresolved": -1,
+    "crowded": -1, "fainter": -1, "no_lane_line": -1, "wide": 0, "widens": 0, "clear": 1, "filled": 0, "slender": 0, "hidden": -1,
+    "curb": 1,
 }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A line or a row of bars: where, the table of its weights, its evidence, the share of it that is on paint, and its length, m."""
+    """What may be a marking or a border: where, the table of its weights, its evidence, the share of it that is one, and its length, m."""
 
     road_map: str
     table: str
@@ -55,22 +60,36 @@ class Judged:
 
 
 def judged_of(path: Path) -> list[Judged]:
-    """Find lines and bars in a map, and judge them."""
+    """Find what may be markings and borders in a map, and judge it by the truth."""
     road: RoadMap = pickle.loads(path.read_bytes())
-    pieces = find_pieces(road.ground, find_ridges(road.ground))
-    areas, chains = find_crosswalks(road.ground, pieces, touching_chains(pieces))
-    stops, lines = part_stop_lines(find_lines(road.ground, pieces, dashed_chains(pieces, chains)))
+    areas, lines = find_paint(road.ground)
     painted, stop, bars = (
-        _Paint([m for m in road.true if kind in ("", m.kind)]) for kind in ("", "stop_line", "crosswalk")
+        _Paint([m for m in road.true.markings if kind in ("", m.kind)]) for kind in ("", "stop_line", "crosswalk")
     )
-
-    out = [
-        Judged(path.name, table_of(line.pieces), line.evidence, paint.share(_dense(line.xy)), line.length_m)
-        for some, paint in ((stops, stop), (lines, painted))
-        for line in some
-    ]
-    out += [Judged(path.name, table_of(a.pieces, bars=True), a.evidence, bars.share(a.pieces.xy), 1.0) for a in areas]
+    out = []
+    for line in lines:
+        paint = stop if line.kind == "stop_line" else painted
+        table = table_of(line.pieces, line.kind)
+        out.append(Judged(path.name, table, line.evidence, paint.share(_dense(line.xy)), line.length_m))
+    symbols = [_polygon(m.points_m[:, :2]) for m in road.true.markings if m.kind == "other"]
+    for area in areas:
+        right = bars.share(area.pieces.xy)
+        if area.kind == "other":
+            outline = _polygon(area.outline)
+            shared = [outline.intersection(true).area / outline.union(true).area for true in symbols]
+            right = float(max(shared, default=0.0) >= MIN_ARROW_OVERLAP)
+        out.append(Judged(path.name, table_of(area.pieces, area.kind), area.evidence, right, 1.0))
+    markings = markings_of(road.ground, areas, lines, MIN_CONFIDENCE, MIN_LINE_M)
+    if any(m.is_lane_line for m in markings):
+        borders = _Paint(road.true.borders)
+        for edge in find_edges(road.ground, markings):
+            length = float(Curve(edge.xy).s[-1])
+            out.append(Judged(path.name, edge.table, edge.evidence, borders.share(_dense(edge.xy)), length))
     return out
+
+
+def _polygon(outline: Array) -> BaseGeometry:
+    return shapely.make_valid(shapely.Polygon(outline))
 
 
 class _Paint:
@@ -131,14 +150,11 @@ def main(folders: list[Path], jobs: int = 2) -> None:
     with multiprocessing.get_context("fork").Pool(jobs) as pool:
         judged = [row for rows in pool.imap(judged_of, paths) for row in rows]
     print(
-        f'"""Weights of the evidence for markings (`road/paint.py`), by kind of marking and the sensors that saw it.\n\nPrinted by `tools/fit.py lines` on {len(paths)} maps of random roads, `tools/fit.py line_maps`.\n"""\n'
+        f'"""Weights of the evidence for markings and borders of roads, by kind and the sensors that saw it.\n\nPrinted by `tools/fit.py lines` on {len(paths)} maps of random roads and plain ground, `tools/fit.py line_maps`.\n"""\n'
     )
     print("WEIGHTS: dict[str, dict[str, float]] = {")
     for table in WEIGHTS:
-        rows, cost = (
-            [row for row in judged if row.table == table],
-            COST_OF_ONE_SENSOR if table in ONE_SENSOR else 1.0,
-        )
+        rows, cost = [row for row in judged if row.table == table], COSTS.get(table, 1.0)
         folds, odds = np.unique([row.road_map for row in rows], return_inverse=True)[1] % FOLDS, np.zeros(len(rows))
         for fold in range(FOLDS):
             weights = fit_table([row for row, k in zip(rows, folds) if k != fold], cost)
