@@ -30,7 +30,7 @@ WEIGHTS: dict[str, dict[str, float]] = {
         "wide": -4.61,
     },
     "line, LiDAR": {
-        "bias": 0.0411,
+        "bias": -0.652,
         "length": 0.47,
         "dashes": 0.136,
         "contrast": 1.13,
@@ -43,11 +43,11 @@ WEIGHTS: dict[str, dict[str, float]] = {
         "wide": -5.52,
     },
     "line, few returns": {
-        "bias": -2.23,
+        "bias": -2.93,
         "bright_beside": -3.34,
-        "crowded": -0.847,
-        "fainter": -1.09,
-        "wide": -3.36,
+        "crowded": -0.848,
+        "fainter": -1.08,
+        "wide": -3.35,
     },
     "crosswalk, camera": {
         "bias": -2.11,

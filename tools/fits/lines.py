@@ -34,11 +34,11 @@ from log2sim.road.weights import WEIGHTS
 FOLDS = 5
 NEAR_M, STEP_M = 0.25, 0.1
 MIN_EFFECT = 0.05  # of a standard deviation of the evidence, in log-odds: what has less is left out
-# How many missed markings a false one is worth. Lines and borders that one sensor alone shows have to be as likely as two to one: rings of a
-# LiDAR and textures in pictures differ more than simulated ones do. An arrow that is missed is taken for a lane line, several meters long; of
-# a dash that is taken for one little is lost.
+# How many missed markings a false one is worth. Textures in pictures and rings of LiDARs on rough ground differ more than simulated ones do, so
+# lines and borders that one sensor alone shows have to be as likely as two to one, lines of a LiDAR alone as four to one. An arrow that is
+# missed is taken for a lane line, several meters long; of a dash that is taken for one little is lost.
 COSTS = {
-    "line, camera": 2.0, "line, LiDAR": 2.0, "line, few returns": 2.0, "border, camera": 2.0, "border, LiDAR": 2.0, "other": 0.25,
+    "line, camera": 2.0, "line, LiDAR": 4.0, "line, few returns": 4.0, "border, camera": 2.0, "border, LiDAR": 2.0, "other": 0.25,
 }  # fmt: skip
 # What the evidence can say, at most, by what it means: for paint, against it.
 SIGNS = {
