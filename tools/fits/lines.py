@@ -9,9 +9,11 @@ module. Tables go to stderr: each fifth of the maps is rated by weights that fit
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import pickle
 import sys
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +36,7 @@ from log2sim.road.weights import WEIGHTS
 FOLDS = 5
 NEAR_M, STEP_M = 0.25, 0.1
 MIN_EFFECT = 0.05  # of a standard deviation of the evidence, in log-odds: what has less is left out
+MAX_WEIGHT = 8.0  # log-odds: what no simulated marking is like, a real one may be
 # How many missed markings a false one is worth. Textures in pictures and rings of LiDARs on rough ground differ more than simulated ones do, so
 # lines and borders that one sensor alone shows have to be as likely as two to one, lines of a LiDAR alone as four to one. An arrow that is
 # missed is taken for a lane line, several meters long; of a dash that is taken for one little is lost.
@@ -125,6 +128,7 @@ def fit_table(rows: list[Judged], cost: float = 1.0) -> dict[str, float]:
     for _ in range(2):
         x = np.array([[row.evidence.get(name, 0.0) for name in names] for row in rows])
         bias, found = fit_weights(x, right, weight / weight.mean(), [SIGNS[name] for name in names])
+        found = np.clip(found, -MAX_WEIGHT, MAX_WEIGHT)
         table = {"bias": bias - np.log(cost), **dict(zip(names, found.tolist()))}
         names = [n for n, effect in zip(names, np.abs(found) * x.std(axis=0)) if effect > MIN_EFFECT]
     return {name: float(f"{weight:.3g}") for name, weight in table.items()}
@@ -166,8 +170,6 @@ def main(folders: list[Path], jobs: int = 2) -> None:
             np.array([weighted_sum(row.evidence, WEIGHTS[table]) for row in rows]),
         )
         say(table, rows, "fitted to other maps", odds)
-        print(f'    "{table}": {{')
-        for name, value in fit_table(rows, cost).items():
-            print(f'        "{name}": {value:g},')
-        print("    },")
-    print("}")
+        text = f"{json.dumps(table)}: {json.dumps(fit_table(rows, cost))},"
+        print(textwrap.fill(text, 140, initial_indent=4 * " ", subsequent_indent=8 * " "))
+    print("}  # fmt: skip")
