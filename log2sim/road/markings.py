@@ -29,10 +29,7 @@ from log2sim.road.paint import (
     table_of,
     weighted_sum,
 )
-from log2sim.road.ridges import (
-    find_ridges,
-    log_paint,
-)
+from log2sim.road.ridges import find_ridges, log_paint
 from log2sim.road.strokes import Curve, thin, trace
 from log2sim.road.weights import WEIGHTS
 
