@@ -22,7 +22,7 @@ from entry import commands_in, run_named
 from fits import confidence as fit_confidence
 from fits import confidence_logs, late_fusion
 from fits import lines as fit_lines
-from fits.line_maps import RoadMap, draw_scene, plain_map
+from fits.line_maps import EVERYWHERE, RoadMap, draw_scene, plain_map
 from fits.logistic import logistic_regression
 from kitti.boxes import read_tracks
 from kitti.scoring import evaluate
@@ -33,7 +33,7 @@ from profile_ticks import Measured, figures
 from scipy.optimize import minimize
 from worlds import tiny_toml
 
-from log2sim.datatypes import Frame, Marking
+from log2sim.datatypes import Frame, MapFeatures, Marking
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.logs.native.writer import write_log
 
@@ -162,7 +162,7 @@ def test_lines_of_a_map_are_judged_by_its_paint_and_those_of_plain_ground_are_no
     real, removed = line_of(lambda x: 3.0 + 0 * x, 0, 50), line_of(lambda x: -3.0 + 0 * x, 0, 50)
     painter.lines([real, removed], 0.15)
     true = Marking("one", "solid", np.column_stack([real, 0 * real[:, 0]]), 0.15)
-    for name, road in (("road", RoadMap(painter.ground(), (true,))), ("plain", plain_map(5))):
+    for name, road in (("road", RoadMap(painter.ground(), MapFeatures((true,)), EVERYWHERE)), ("plain", plain_map(5))):
         (tmp_path / name).write_bytes(pickle.dumps(road))
     judged = {row.evidence["length"]: row.right for row in fit_lines.judged_of(tmp_path / "road") if row.length_m > 20}
     assert sorted(judged.values()) == pytest.approx([0.0, 1.0], abs=0.05)

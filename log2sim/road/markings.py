@@ -40,6 +40,7 @@ MIN_BARS = 3
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
 STOP_WIDTH_M, STOP_LENGTH_M = (0.22, 0.85), (1.5, 20.0)
+SURE_STOP_M = 6.0  # two lanes: longer ones are no more likely, as streaks of light are as long
 LANE_LINE_WITHIN_M, MIN_STOP_ANGLE_RAD = 10.0, np.deg2rad(60)
 MAX_LANE_LINE_WIDTH_M = 0.35
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
@@ -167,9 +168,9 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
                 cross = chord[0] * tangent[1] - chord[1] * tangent[0]
                 angle = float(np.arctan2(abs(cross), abs(chord @ tangent)))
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
-            stops.append(
-                replace(line, kind="stop_line", evidence=line.evidence | {"no_lane_line": float(angle is None)})
-            )
+            length = min(line.evidence["length"], np.log(SURE_STOP_M))
+            evidence = line.evidence | {"no_lane_line": float(angle is None), "length": float(length)}
+            stops.append(replace(line, kind="stop_line", evidence=evidence))
         else:
             others.append(line)
     return stops, others

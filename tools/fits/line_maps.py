@@ -36,6 +36,9 @@ WITHOUT_CAMERA, WITHOUT_LIDAR, UNMARKED = 0.2, 0.2, 0.15  # shares of maps, of r
 APART_M, ARROW_APART_M = 14.0, 8.0  # vehicles from each other at first, arrows from what is across the road
 
 
+EVERYWHERE = Area(None, None, None, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class RoadMap:
     """A map, what is on the road in truth, and where that counts."""
@@ -248,8 +251,7 @@ def plain_map(seed: int) -> RoadMap:
     intensity = np.full(shape, np.nan) if rng.random() < WITHOUT_LIDAR else returns
     layers = np.clip(image, 0, 255).astype(np.uint8), np.full(shape, 255, np.uint8), np.zeros(shape, np.float32)
     extent = (0.0, PLAIN_M[0], 0.0, PLAIN_M[1])
-    everywhere = Area(None, None, None, 0.0)
-    return RoadMap(GroundMap(*layers, intensity.astype(np.float32), CELL_M, extent), MapFeatures(), everywhere)
+    return RoadMap(GroundMap(*layers, intensity.astype(np.float32), CELL_M, extent), MapFeatures(), EVERYWHERE)
 
 
 def raise_roadsides(ground: GroundMap, scene: Scene, shift_m: Array, rng: np.random.Generator) -> GroundMap:
