@@ -182,7 +182,7 @@ def _step(
     steps: list[NDArray[Any]] = []
     boths: list[NDArray[Any]] = []
     below_differs: NDArray[Any] = np.zeros(shape, bool)
-    above_differs, told = below_differs, below_differs
+    above_differs, compared = below_differs, below_differs
     for k, (values, valid) in enumerate(zip(turned, known, strict=True)):
         if values is None or valid is None:
             steps.append(np.zeros(shape, np.float32))
@@ -195,7 +195,7 @@ def _step(
         steps.append(np.where(both, above - below, 0))
         boths.append(both)
         if k != HEIGHT and np.isfinite(road[k]):
-            told = told | both
+            compared = compared | both
             below_differs = below_differs | (both & (np.abs(below - np.float32(road[k])) > ROAD_TOLERANCE))
             above_differs = above_differs | (both & (np.abs(above - np.float32(road[k])) > ROAD_TOLERANCE))
     surface = np.square(_surface_step(steps[0], steps[1], boths[1]))
@@ -203,7 +203,7 @@ def _step(
     out = (np.zeros(size[::-1], np.float32), np.zeros(size[::-1], np.float32))
     for layer, other, rise in zip(out, (below_differs, above_differs), (height, -height)):
         curb = np.where((rise > CURB_M[0]) & (rise < CURB_M[1]), np.square(steps[HEIGHT]), 0)  # only up, and no wall
-        layer[reach:-reach] = np.where(told & ~other, np.sqrt(surface + curb), 0)
+        layer[reach:-reach] = np.where(compared & ~other, np.sqrt(surface + curb), 0)
     return out
 
 

@@ -239,7 +239,8 @@ BESIDE_M, MAX_BESIDE = (0.45, 1.7), 1
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
 MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
-# Paint of the same time is about as bright; a weaker line so near another is what is left of removed paint.
+# Paint of the same time is about as bright; a fainter line next to another is what is left of removed paint. Contrasts below the least are
+# noise, and a line of less than a third of the contrast is as surely removed as can be.
 MIN_CONTRAST, MAX_FAINTER = 0.02, 1.0  # logarithms
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)

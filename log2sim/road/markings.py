@@ -177,8 +177,8 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
 
 
 def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[PaintedArea], list[PaintedLine]]:
-    """Part arrows, letters and other small paint from lane lines: symbols with their outlines, also unlikely ones, and others."""
-    areas, rest = list[PaintedArea](), []
+    """Part arrows, letters and other small paint from lane lines: outlines of all that may be symbols, and the lines that remain."""
+    areas, remaining = list[PaintedArea](), []
     for line in lines:
         found: list[PaintedArea | None] = []
         if line.dashes <= MAX_SYMBOLS and line.length_m <= MAX_SYMBOL_M + SYMBOL_STEP_M * (line.dashes - 1):
@@ -188,13 +188,13 @@ def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[Pain
         areas += shapes
         # What lies in a row is of one kind.
         if len(shapes) <= len(found) / 2 or sum(area.log_odds for area in shapes) <= 0:
-            rest.append(line)
-    kept = list[PaintedArea]()
+            remaining.append(line)
+    apart = list[PaintedArea]()
     for area in sorted(areas, key=lambda area: -area.log_odds):
         middle = tuple(area.outline.mean(axis=0).tolist())
-        if not any(cv2.pointPolygonTest(o.outline.astype(np.float32), middle, True) > -SAME_SYMBOL_M for o in kept):
-            kept.append(area)
-    return kept, rest
+        if not any(cv2.pointPolygonTest(o.outline.astype(np.float32), middle, True) > -SAME_SYMBOL_M for o in apart):
+            apart.append(area)
+    return apart, remaining
 
 
 def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea | None:
@@ -213,9 +213,8 @@ def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea |
     share = cv2.blur(seen, size)
     road = np.divide(cv2.blur(paint * seen, size), share, out=np.full_like(share, np.inf), where=share > 0.1)
     mask = ((paint > road + 0.4 * expected) & (seen > 0)).astype(np.uint8)
-    labels = cv2.connectedComponents(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((round(FLAKE_M / res) | 1,) * 2)))[
-        1
-    ]
+    closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((round(FLAKE_M / res) | 1,) * 2))
+    labels = cv2.connectedComponents(closed)[1]
     u = np.clip(((xy[:, 0] - x0) / res).astype(int) - columns.start, 0, mask.shape[1] - 1)
     v = np.clip(((y1 - xy[:, 1]) / res).astype(int) - rows.start, 0, mask.shape[0] - 1)
     under = labels[v, u]

@@ -4,8 +4,8 @@
 
 Each road is straight or bent, a street or one side of a motorway, with traffic on either side, lines of any usual width, kind, color and
 wear, removed ones, crosswalks, stop lines, arrows, houses, shadows, sidewalks or grass beside it, in any light and weather; it is rendered,
-and reconstructed by its labels, with one to three cameras and a LiDAR of 16 to 64 lines, or without one of both. Others are of
-plain ground, whose texture is coarser than that of rendered grounds. Files that exist are left as they are.
+and reconstructed by its labels, with one to three cameras and a LiDAR of 16 to 64 lines, or without one of both. Others are
+of plain ground, whose texture is coarser than that of rendered grounds. Files that exist are left as they are.
 """
 
 from __future__ import annotations
@@ -34,8 +34,6 @@ MAPS_OF_SEED = 100_000
 STREET_M, MOTORWAY_M, STEP_M = 200.0, 300.0, 12.0  # to where roads lead both ways, and from point to point
 WITHOUT_CAMERA, WITHOUT_LIDAR, UNMARKED = 0.2, 0.2, 0.15  # shares of maps, of roads
 APART_M, ARROW_APART_M = 14.0, 8.0  # vehicles from each other at first, arrows from what is across the road
-
-
 EVERYWHERE = Area(None, None, None, 0.0)
 
 
@@ -227,7 +225,7 @@ def _shadow(xy: Array, rng: np.random.Generator) -> list[list[float]]:
     return [[float(x), float(y)] for x, y in shapely.MultiPoint(points).convex_hull.exterior.coords[:-1]]
 
 
-BLUR_M = 0.05
+BLUR_M = 0.05  # of a curb in the map: a cell
 PLAIN_M, CELL_M = (60.0, 30.0), 0.05
 # Colors, BGR, of asphalt, gravel, grass, earth and sand; brightness varies by up to this share from grain to grain.
 PLAIN_BGR = ((92, 91, 90), (120, 124, 130), (60, 110, 80), (60, 80, 105), (120, 150, 175))
