@@ -260,5 +260,5 @@ def studio(
         served.serve()
     except KeyboardInterrupt:
         count = len(served.document["corrections"])
-        words = f"{path}: {count} correction{'s' * (count != 1)}"
+        words = f"{path}: {opt.counted(count, 'correction')}"
         opt.say(f"{words}; log2sim correct {scenario} {path} --out corrected.json applies them" if count else words)

@@ -139,13 +139,9 @@ def synth(
                 raise ConfigError(f"{scene}: has no LiDAR, so that nothing is left without pictures")
             cameras = () if no_pictures else loaded.camera
             environment = loaded.environment.model_copy(update=changes)
-            write_synthetic(
-                loaded.model_copy(update={"environment": environment, "camera": cameras}),
-                out,
-                seed=seed,
-                overwrite=overwrite,
-                progress=partial(report_progress, "synthesize"),
-            )
+            lit = loaded.model_copy(update={"environment": environment, "camera": cameras})
+            report = partial(report_progress, "synthesize")
+            write_synthetic(lit, out, seed=seed, overwrite=overwrite, progress=report)
         elif traffic is not None:
             from log2sim.files.processes import default_jobs
             from log2sim.synth.traffic_data import TrafficSettings, write_traffic

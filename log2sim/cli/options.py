@@ -15,7 +15,7 @@ import sys
 import textwrap
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
@@ -260,14 +260,11 @@ class TolerantStream:
     def _give_up(self) -> None:
         """Write nowhere from now on; Python would try again to write what waits when it ends, and fail."""
         stream, self._stream = self._stream, None
-        if stream is None:
-            return
-        try:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno())
-            os.close(nowhere)
-        except (OSError, ValueError):
-            return
+        if stream is not None:
+            with suppress(OSError, ValueError):
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, stream.fileno())
+                os.close(nowhere)
 
 
 @contextmanager
@@ -293,29 +290,23 @@ MIN_COLUMNS = 40
 
 
 def format_rows(rows: Sequence[Sequence[str]], indent: int = 0) -> list[str]:
-    """Format rows in columns, each as wide as its longest entry; the last column goes on below itself on a narrow terminal."""
-    if not rows:
-        return []
-    count = max(len(row) for row in rows)
-    widths = [max(len(row[k]) if k < len(row) else 0 for row in rows) for k in range(count - 1)]
+    """Format rows of equal length in columns, each as wide as its longest entry; the last goes on below itself on a narrow terminal."""
+    widths = [max(map(len, column)) for column in zip(*rows)]
     lines = []
-    for row in rows:
-        start = " " * indent + "".join(f"{cell:<{width}}  " for cell, width in zip(row, widths))
-        last = row[count - 1] if len(row) == count else ""
+    for *cells, last in rows:
+        start = " " * indent + "".join(f"{cell:<{width}}  " for cell, width in zip(cells, widths))
         lines += wrap(start + last, indent=len(start))
     return lines
 
 
-def wrap(line: str, indent: int = 2) -> list[str]:
+def wrap(line: str, indent: int) -> list[str]:
     """Break a line at the width of the terminal, the rest indented; elsewhere, in a pipe or a file, lines stay whole."""
     # Narrower terminals are treated as wider: a word a line reads no better.
     width = max(shutil.get_terminal_size().columns, MIN_COLUMNS) if sys.stdout.isatty() else len(line)
     if len(line) <= width:
         return [line.rstrip()]
     room = " " * min(indent, width // 2)
-    return textwrap.wrap(
-        line, width, subsequent_indent=room, break_long_words=False, break_on_hyphens=False, drop_whitespace=True
-    )
+    return textwrap.wrap(line, width, subsequent_indent=room, break_long_words=False, break_on_hyphens=False)
 
 
 # Kinds of plug-ins that an option takes, and what stands before their names.

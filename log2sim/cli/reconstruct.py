@@ -209,8 +209,7 @@ def reconstruct(
     sequences = [] if sequence is None else ["--sequence", sequence]
     page = str(out.with_suffix(".html"))
     view = shlex.join(["log2sim", "view", str(out), "--log", str(log), *sequences, "-o", page])
-    for line in summarize_run(result, view, out, verbose=verbose):
-        opt.tell(line)
+    opt.tell("\n".join(summarize_run(result, view, out, verbose=verbose)))
 
 
 MAX_NAMED = 5

@@ -155,10 +155,7 @@ CELL_M = 0.06  # edge of a cell, m: pictures on paper and screens show no more o
 
 
 def load_background(
-    path: Path,
-    scenario: Scenario,
-    sequence: str | None,
-    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    path: Path, scenario: Scenario, sequence: str | None, progress: Callable[[str, int, int], None]
 ) -> GroundMap:
     """Return the map of the ground in a PNG that `log2sim map` wrote, or that of a log, without the agents of the scenario.
 

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from log2sim.cli import options as opt
 from log2sim.cli.progress import progress
 from log2sim.errors import ConfigError, ScenarioError
-
-if TYPE_CHECKING:
-    pass
 
 
 def replay(

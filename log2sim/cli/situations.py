@@ -54,8 +54,7 @@ def tag(
          ", ".join(f"{k} {v:.3g}" for k, v in g.quantities.items()))
         for g in shown
     ]  # fmt: skip
-    for line in opt.format_rows([head, *rows]):
-        opt.tell(line)
+    opt.tell("\n".join(opt.format_rows([head, *rows])))
     counts = {name: sum(g.tag == name for g in shown) for name in TAGS}
     opt.tell(", ".join(f"{n} {name}" for name, n in counts.items() if n) or "no tag")
     if out is not None:
@@ -118,8 +117,7 @@ def find(
         )  # fmt: skip
     opt.say_all("left out", index.problems)
     if fields or not condition:
-        for line in opt.format_rows(_overview(index, fields=fields)):
-            opt.say(line)
+        opt.say("\n".join(opt.format_rows(_overview(index, fields=fields))))
         return
     found = ask(index, condition, min_probability=probability)
     if as_json:
@@ -261,14 +259,11 @@ def vary(
         write_json(folder / "logical.json", {**about, **logical.to_dict()})
         if openscenario:
             write_openscenario(base, [base.timings(logical, values[k]) for k in kept], folder / "openscenario")
-    described = logical.to_dict()["parameters"]
-    head = ("parameter", "found from", "to", "5 %", "median", "95 %")
-    shown = [head]
-    for name, p in described.items():
+    shown = [("parameter", "found from", "to", "5 %", "median", "95 %")]
+    for name, p in logical.to_dict()["parameters"].items():
         figures = (p["least"], p["greatest"], *(p["quantiles"][q] for q in ("0.05", "0.5", "0.95")))
         shown.append((name, *(f"{figure:.4g}" for figure in figures)))
-    for line in opt.format_rows(shown):
-        opt.tell(line)
+    opt.tell("\n".join(opt.format_rows(shown)))
     opt.tell(
         f"{out}: {opt.counted(len(kept), 'concrete scenario')} of {count}, by {opt.counted(len(logical.values), 'hit')}; base {chosen['agent']} "
         f"in {chosen['file']} at {chosen['t_s']:.1f} s"
