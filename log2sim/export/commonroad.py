@@ -31,7 +31,6 @@ GOAL_LENGTH_M = 6.0
 GOAL_SIDE_M = 1.0
 GOAL_YAW_RAD = 0.35
 GOAL_SPEED_MPS = 3.0
-UNKNOWN_PLACE = ("-999", "999", "999")  # CommonRoad's values for no GeoNames id, latitude and longitude
 TYPE_OF_CATEGORY = {
     "car": "car", "truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle",
     "bicycle": "bicycle", "pedestrian": "pedestrian", "other": "unknown",
@@ -68,7 +67,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     root.set("date", datetime.fromtimestamp(scenario.t0_ns // NS_PER_S, UTC).date().isoformat())
     root.attrib |= {"author": "log2sim", "affiliation": "", "source": xml_text.escaped(scenario.name)}
     frame = scenario.map
-    place = dict(zip(("geoNameId", "gpsLatitude", "gpsLongitude"), UNKNOWN_PLACE))
+    place = {"geoNameId": "-999", "gpsLatitude": "999", "gpsLongitude": "999"}  # CommonRoad's values for unknown ones
     if frame.latitude_deg is not None and frame.longitude_deg is not None:
         place |= {"gpsLatitude": _decimal(frame.latitude_deg), "gpsLongitude": _decimal(frame.longitude_deg)}
     location = _texts(element("location"), **place)
@@ -152,7 +151,7 @@ def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
     if agent.static and agent.category in STATIC_TYPE:
         obstacle = _texts(element("staticObstacle", id=str(number)), type=STATIC_TYPE[agent.category])
         _shape(obstacle, agent)
-        obstacle.append(_state("initialState", sample_motion(agent, agent.waypoints.t_s[:1]), 0, 0))
+        obstacle.append(_state("initialState", sample_motion(agent, agent.waypoints.t_s[:1]), 0))
         return obstacle
     move = sample_steps(agent, t_s, STEP_S, at_least=2)  # an initial state and a trajectory
     steps = np.flatnonzero(move.valid).tolist()
@@ -160,8 +159,8 @@ def _obstacle(agent: Agent, number: int, t_s: Array) -> Element | None:
         return None
     obstacle = _texts(element("dynamicObstacle", id=str(number)), type=TYPE_OF_CATEGORY[agent.category])
     _shape(obstacle, agent)
-    obstacle.append(_state("initialState", move, steps[0], steps[0]))
-    element("trajectory", obstacle).extend(_state("state", move, k, k) for k in steps[1:])
+    obstacle.append(_state("initialState", move, steps[0]))
+    element("trajectory", obstacle).extend(_state("state", move, k) for k in steps[1:])
     return obstacle
 
 
@@ -174,13 +173,13 @@ def _along(vector: Array, yaw_rad: float) -> float:
     return float(vector[0] * np.cos(yaw_rad) + vector[1] * np.sin(yaw_rad))
 
 
-def _state(tag: str, move: SampledMotion, k: int, step: int) -> Element:
-    """Return the state at index k of a motion; speed and acceleration are along the heading."""
+def _state(tag: str, move: SampledMotion, k: int) -> Element:
+    """Return the state at step k of a motion; speed and acceleration are along the heading."""
     yaw = float(move.yaw_rad[k])
     state = element(tag)
     _point(element("position", state), move.position_m[k, :2])
     speed, acceleration = (_along(v[k], yaw) for v in (move.velocity_mps, move.acceleration_mps2))
-    rows = (("orientation", yaw), ("time", step), ("velocity", speed), ("acceleration", acceleration))
+    rows = (("orientation", yaw), ("time", k), ("velocity", speed), ("acceleration", acceleration))
     for key, value in rows:
         _texts(element(key, state), exact=str(value) if isinstance(value, int) else _decimal(value))
     return state
@@ -190,7 +189,7 @@ def _planning_problem(ego: Agent, number: int, t_s: Array) -> Element:
     """Return the task of the ego: from its first to its last pose, in about the time that it takes."""
     move, last, spare = sample_motion(ego, t_s), len(t_s) - 1, round(GOAL_S / STEP_S)
     problem = element("planningProblem", id=str(number))
-    initial = _state("initialState", move, 0, 0)
+    initial = _state("initialState", move, 0)
     for key in ("yawRate", "slipAngle"):
         _texts(element(key, initial), exact="0")
     problem.append(initial)

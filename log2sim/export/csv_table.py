@@ -18,7 +18,6 @@ COLUMNS = (
     "t_s", "x_m", "y_m", "z_m", "yaw_rad", "speed_mps", "observed", "sigma_xy_m", "sigma_yaw_rad", "sigma_speed_mps",
 )  # fmt: skip
 ABOUT = ("length_m", "width_m", "height_m", "static", "rear_axle_offset_m", "confidence", "doubts")
-HEADER = ("id", "category", *COLUMNS, *ABOUT)
 # Texts that spreadsheets execute as a formula: they begin so and are no number.
 FORMULA = re.compile(r"\s*[=+\-@](?!\d+(\.\d+)?$)")
 
@@ -43,7 +42,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
 
 
 def _rows(scenario: Scenario) -> Iterator[Sequence[Any]]:
-    yield HEADER
+    yield "id", "category", *COLUMNS, *ABOUT
     for agent in scenario.agents:
         w = agent.waypoints
         about = (*agent.size_m, int(agent.static), agent.rear_axle_offset_m, agent.confidence)

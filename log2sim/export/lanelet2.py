@@ -7,6 +7,7 @@ the map is not known, they are around 0, 0.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -107,29 +108,25 @@ class _Draft:
         self.frame = frame
         self.places: dict[int, Array] = {}  # nodes, map frame
         self.parts: dict[str, list[Element]] = {"way": [], "relation": []}
-        self.next_id = 1
-
-    def _number(self) -> int:
-        self.next_id += 1
-        return self.next_id - 1
+        self.ids = itertools.count(1)
 
     def nodes(self, points_m: Array) -> list[int]:
         """Add a node at each point (N, 3); return their numbers."""
-        numbers = [self._number() for _ in points_m]
+        numbers = [next(self.ids) for _ in points_m]
         self.places |= dict(zip(numbers, points_m))
         return numbers
 
     def way(self, points: Array | Sequence[int], **tags: str) -> int:
         """Add a way along points (N, 3), or along nodes; return its number."""
         numbers = self.nodes(points) if isinstance(points, np.ndarray) else points
-        way = element("way", id=str(self._number()))
+        way = element("way", id=str(next(self.ids)))
         for number in numbers:
             element("nd", way, ref=str(number))
         return self._tagged("way", way, tags)
 
     def relation(self, members: Sequence[tuple[str, int, str]], **tags: str) -> int:
         """Add a relation of members, each with its kind, number and role; return its number."""
-        relation = element("relation", id=str(self._number()))
+        relation = element("relation", id=str(next(self.ids)))
         for kind, number, role in members:
             element("member", relation, type=kind, ref=str(number), role=role)
         return self._tagged("relation", relation, tags)
@@ -148,8 +145,7 @@ class _Draft:
         for number, (x, y, _), lat, lon, ele in zip(self.places, points.tolist(), latitude, longitude, height):
             node = element("node", root, id=str(number), lat=f"{lat:.11f}", lon=f"{lon:.11f}")
             _tag(node, {"ele": f"{ele:.4f}", "local_x": f"{x:.4f}", "local_y": f"{y:.4f}"})
-        for item in (*self.parts["way"], *self.parts["relation"]):
-            root.append(item)
+        root.extend((*self.parts["way"], *self.parts["relation"]))
         for item in root:
             item.attrib |= {"version": "1", "visible": "true"}
         return root
@@ -171,10 +167,7 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
             gap = edges[lane.id, "left"][[0, -1]] - edges[beside, theirs][::step][[0, -1]]
             if np.hypot(gap[:, 0], gap[:, 1]).max() <= SHARED_M:
                 same[lane.id, "left"] = (beside, theirs)
-    number_of: dict[Way, list[int]] = {}
-    for key, edge in edges.items():
-        if key not in same:
-            number_of[key] = draft.nodes(edge)
+    number_of = {key: draft.nodes(edge) for key, edge in edges.items() if key not in same}
     # One node where ways meet: which node stands for each, and the middle of all of them.
     stands: dict[int, int] = {}
 
@@ -204,10 +197,8 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
     for number in stands:
         del draft.places[number]
     way_of = {}
-    by_key = {(lane.id, side): (lane, side) for lane in roads for side in ("left", "right")}
-    for key, numbers in number_of.items():
-        lane, side = by_key[key]
-        border = lane.left if side == "left" else lane.right
+    for (name, side), numbers in number_of.items():
+        border = by_id[name].left if side == "left" else by_id[name].right
         item, mark = marks.items.get(border), marks.mark(border)
         if isinstance(item, RoadBorder) and item.kind == "edge":
             tags = {"type": "road_border"}
@@ -215,7 +206,7 @@ def _add_borders(draft: _Draft, roads: Sequence[MapLane], marks: MarkFinder) -> 
             kind, subtype = TYPE_OF_MARK[mark.kind]
             tags = {"type": kind} | ({"subtype": subtype} if subtype else {})
             tags |= {"color": mark.color} if mark.color in ("white", "yellow") else {}
-        way_of[key] = draft.way([root(n) for n in numbers], **tags)
+        way_of[name, side] = draft.way([root(n) for n in numbers], **tags)
     return way_of | {key: way_of[other] for key, other in same.items()}
 
 

@@ -17,12 +17,10 @@ from log2sim.datatypes import Agent, MapFeatures, MapLane, Scenario
 from log2sim.errors import MissingExtra
 from log2sim.export.exporters import Options, SampledMotion, file_name
 from log2sim.export.roads.network import MarkFinder, RoadMark
-from log2sim.export.roads.opendrive import edges_of, lanes
+from log2sim.export.roads.opendrive import LIGHT_HEIGHT_M, LIGHT_WIDTH_M, edges_of, lanes
 from log2sim.export.viewers import agent_steps
 from log2sim.geometry import NS_PER_S, Array
 
-# Length, width and height of a signal head with three lamps of 200 mm (EN 12368); not measured.
-LIGHT_SIZE_M = (0.3, 0.3, 0.9)
 BOUNDARY_TYPE = {"solid": "SOLID_LINE", "broken": "DASHED_LINE", "curb": "CURB", "none": "NO_LINE"}
 BOUNDARY_COLOR = {"white": "WHITE", "yellow": "YELLOW", "standard": "UNKNOWN"}
 # Color and mode by state; OSI has one lamp a light, so that red with yellow is written as yellow.
@@ -147,12 +145,11 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
             t_s = (stamp_ns - scenario.t0_ns) / NS_PER_S
             # The traffic lights of a scenario with their states at a time, numbered from `first` on
             kind = betterosi.TrafficLight.Classification
-            length, width, height = LIGHT_SIZE_M
             out = []
             for number, signal in enumerate(scenario.signals, start=(free + len(painted))):
                 color, mode = LIGHT[str(signal.at(np.array([t_s]))[0])]
                 turn = betterosi.Orientation3d(roll=0.0, pitch=0.0, yaw=float(signal.heading_rad or 0.0))
-                size = betterosi.Dimension3d(length=length, width=width, height=height)
+                size = betterosi.Dimension3d(length=LIGHT_WIDTH_M, width=LIGHT_WIDTH_M, height=LIGHT_HEIGHT_M)
                 out.append(betterosi.TrafficLight(
                     id=betterosi.Identifier(value=number),
                     base=betterosi.BaseStationary(position=_vector(betterosi, signal.position_m), dimension=size, orientation=turn),

@@ -63,14 +63,13 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
 def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
     import rerun
 
-    placement = near_origin(scenario)
-    origin = np.array(placement.origin_m)
-    about = {"scenario": scenario.name, "position_offset_m": placement.origin_m, "map": asdict(scenario.map)}
-    doubtful = {a.id: explain_doubt(a) for a in scenario.doubtful}
+    origin_m = near_origin(scenario).origin_m
+    origin = np.array(origin_m)
+    about = {"scenario": scenario.name, "position_offset_m": origin_m, "map": asdict(scenario.map)}
+    about["doubtful"] = {a.id: explain_doubt(a) for a in scenario.doubtful}
     yield (), None, rerun.ViewCoordinates.columns(xyz=[rerun.ViewCoordinates.RIGHT_HAND_Z_UP])
-    yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps({**about, "doubtful": doubtful}, indent=1)])
-    steps = viewers.agent_steps(scenario)
-    t_ns, moves = steps
+    yield ("about",), None, rerun.TextDocument.columns(text=[json.dumps(about, indent=1)])
+    t_ns, moves = viewers.agent_steps(scenario)
     for agent, move in moves:
         yield from _agent(agent, move, t_ns, origin)
     known: set[str] = set()
@@ -79,8 +78,7 @@ def _parts(scenario: Scenario, log: Log | None) -> Iterator[Part]:
             camera = record.camera
             known.add(camera.name)
             size = [[camera.width_px, camera.height_px]]
-            lens = rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size)
-            yield ("cameras", camera.name), None, lens
+            yield ("cameras", camera.name), None, rerun.Pinhole.columns(image_from_camera=[camera.K], resolution=size)
         stamp = np.array([record.t_ns])
         if isinstance(record, viewers.UnreadableRecord):
             yield ("log", record.stream), stamp, rerun.TextLog.columns(text=[record.reason], level=["WARN"])

@@ -106,7 +106,7 @@ def _cut_at(cuts: list[float], s: float, free: tuple[bool, bool]) -> None:
     nearest = min(range(len(cuts)), key=lambda k: abs(cuts[k] - s))
     if abs(cuts[nearest] - s) <= ALIGNED_M or not cuts[0] < s < cuts[-1]:
         return
-    if s - cuts[0] <= FREE_M and free[0] and len(cuts) > 1:
+    if s - cuts[0] <= FREE_M and free[0]:
         cuts[0] = s
     elif cuts[-1] - s <= FREE_M and free[1]:
         cuts[-1] = s
@@ -356,7 +356,7 @@ def _edges(group: Sequence[MapLane], base: MapLane, reference: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a lane is: in which road, as which lane of it, and whether it leads along it."""
+    """Where a lane is: in which road, and as which lane of it."""
 
     road: int
     lane: int
@@ -458,7 +458,7 @@ def _groups(lanes: Sequence[MapLane], by_id: Mapping[str, MapLane]) -> list[list
                 edge = group[0] if side == "left_lane" else group[-1]
                 name = getattr(edge, side)
                 taken = seen | {member.id for member in group}
-                if name is None or name not in known or name in taken or not _aligned(edge, by_id[name]):
+                if name not in known or name in taken or not _aligned(edge, by_id[name]):
                     break
                 group.insert(0 if side == "left_lane" else len(group), by_id[name])
         seen |= {member.id for member in group}
