@@ -102,9 +102,7 @@ def notebook_html(value: Log | Scenario | Replay) -> str:
             t_ns = value.streams[name].t_ns
             span_s = float(t_ns[-1] - t_ns[0]) / NS_PER_S if len(t_ns) else 0.0
             rate = f" at {(len(t_ns) - 1) / span_s:.1f} Hz" if span_s > 0 else ""
-            size = ""
-            if kind == "camera":
-                size = f", {value.cameras[name].width_px} x {value.cameras[name].height_px} px"
+            size = f", {value.cameras[name].width_px} x {value.cameras[name].height_px} px" if kind == "camera" else ""
             rows.append((name, f"{kind}{size}, {_count(len(t_ns), 'record')}{rate}"))
         if len(kinds) > MAX_SENSORS:
             rows.append(("", f"and {_count(len(kinds) - MAX_SENSORS, 'more sensor')}"))

@@ -14,7 +14,7 @@ from log2sim.edit.corrections import Corrected, correct, load_corrections
 from log2sim.errors import Log2SimError, ScenarioError
 from log2sim.files.documents import check, write_json
 from log2sim.road.ground_map import GroundMap
-from log2sim.visualization.page.document import SCALES, feature_columns, page_document
+from log2sim.visualization.page.document import feature_columns, page_document
 from log2sim.visualization.page.writer import make_page, page_html
 from log2sim.visualization.recording import Recorded
 
@@ -57,12 +57,7 @@ class Studio:
         self._lock = threading.Lock()
         # Pictures and points take long to gather: once, with the corrections of then.
         self._recording: tuple[Corrected, dict[str, Any] | None] | None = None
-        studio = self
-
-        class Handler(_Handler):
-            served = studio
-
-        self._server = ThreadingHTTPServer((HOST, port), Handler)
+        self._server = ThreadingHTTPServer((HOST, port), type("Handler", (_Handler,), {"served": self}))
         self._server.daemon_threads = True
         self.origin = f"http://{HOST}:{self._server.server_address[1]}"
         self.address = f"{self.origin}/{self._token}/"
@@ -93,7 +88,7 @@ class Studio:
                 page = make_page(document, self.result.scenario, self.recorded)
                 self._recording = self.result, document["recording"]
                 return page
-            document |= {"scales": SCALES, "recording": self._recording[1]}
+            document["recording"] = self._recording[1]
             return page_html(document).encode()
 
     def keep(self, body: bytes, version: str | None = None) -> dict[str, Any]:

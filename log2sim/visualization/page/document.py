@@ -242,6 +242,7 @@ def page_document(
             "t0_ns": scenario.t0_ns, "map_offset_m": list(m.offset_m), "log": scenario.name, "categories": list(datatypes.CATEGORIES),
             "paints": {name: list(rgb) for name, rgb in PAINTS.items()}, "corrections": [],
         },
+        "scales": SCALES,
     }  # fmt: skip
 
 
@@ -261,14 +262,12 @@ def _scenario(scenario: datatypes.Scenario) -> Iterator[dict[str, Any]]:
         # How far it can be trusted; what nobody knows is left out.
         points = agent.quality.get("points_median")
         sigmas = {key: getattr(agent.waypoints, key) for key in SIGMAS}
-        low = (
-            ()
-            if agent.doubts or not agent.is_doubtful
-            else (datatypes.Finding("confidence", text=datatypes.explain_doubt(agent)),)
-        )
+        doubts = list(agent.doubts)
+        if not doubts and agent.is_doubtful:
+            doubts.append(datatypes.Finding("confidence", text=datatypes.explain_doubt(agent)))
         entry |= mark | {
             "confidence": round(agent.confidence, 4),
-            "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in (*agent.doubts, *low)],
+            "doubts": [[doubt.sentence, doubt.start_s, doubt.end_s, doubt.kind] for doubt in doubts],
             "doubted": [[t if np.isfinite(t) else None for t in span] for span in shown_spans(agent)],
             **({"points": round(float(points), 1)} if isinstance(points, int | float) else {}),
             **({"source": source} if (source := _source(agent)) else {}),

@@ -17,7 +17,7 @@ from log2sim.errors import ConfigError
 from log2sim.files.documents import refuse_existing, replaced
 from log2sim.localization.choice import localize_like
 from log2sim.road.ground_map import GroundMap
-from log2sim.visualization.page.document import SCALES, page_document
+from log2sim.visualization.page.document import page_document
 from log2sim.visualization.recording import Recorded, recording_document
 
 SUFFIXES = (".html", ".htm")
@@ -78,7 +78,6 @@ def make_page(document: dict[str, Any], scenario: Scenario, recorded: Recorded |
 
     Raises `ConfigError` when nothing fits.
     """
-    document["scales"] = SCALES
     if recorded is not None:
         rest = len(page_html(document).encode()) + MARGIN_BYTES
         if rest >= recorded.max_bytes:

@@ -139,9 +139,8 @@ def write_gif(frames: Iterator[Image], path: Path, fps: float, colors: Sequence[
         for frame in itertools.chain([first], frames):
             now = np.asarray(Pillow.fromarray(frame).quantize(palette=palette, dither=Pillow.Dither.NONE))
             (top, left), shown = (0, 0), now
-            if (
-                before is not None
-            ):  # the part that is not as before, its unchanged pixels transparent: several times smaller
+            # The part that is not as before, its unchanged pixels transparent: several times smaller.
+            if before is not None:
                 changed = now != before
                 rows, columns = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
                 top, bottom = (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 1)

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Wedge
 
 from log2sim import datatypes
-from log2sim.geometry import Array
+from log2sim.geometry import Array, Polyline
 from log2sim.road.ground_map import GroundMap
 from log2sim.simulation.metrics.collisions import REPLAY
 from log2sim.simulation.prediction.prediction import DEFAULT_METHOD, predict_scenario
@@ -324,10 +324,8 @@ class Overlays:
         return self.span or TimeRange(0.0, scenario.duration_s)
 
 
-NO_OVERLAYS = Overlays()
 MAX_NAMED = 5  # doubtful agents whose reasons are in the legend
 LINE_LETTERS, MAX_LINES = 34, 3  # letters that fit into a line of the legend, and lines of one reason
-# Spacing at which the doubtful part of a track is followed.
 MIN_SHOWN_S = 0.5  # a doubt about less time is shown for as much, so that it can be seen
 STRIPES_PT, STRIPE_PT = 3.0, 0.9  # spacing and width of the stripes in boxes
 
@@ -496,15 +494,15 @@ def lane_outline(lane: datatypes.MapLane) -> Array:
 
 def lane_arrows(lane: datatypes.MapLane) -> list[Array]:
     """Return triangles (3, 2), m, along the middle of a lane that show its direction."""
-    xy = lane.points_m[:, :2]
-    traveled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    traveled = Polyline(lane.points_m).s_m
     count = max(int(traveled[-1] // ARROW_EVERY_M), 1)
     if traveled[-1] < 2 * ARROW_M[0]:
         return []
     arrows = []
     for s in (np.arange(count) + 0.5) * traveled[-1] / count:
         tip, tail = (
-            np.array([np.interp(s + d, traveled, column) for column in xy.T]) for d in (ARROW_M[0] / 2, -ARROW_M[0] / 2)
+            np.array([np.interp(s + d, traveled, column) for column in lane.points_m[:, :2].T])
+            for d in (ARROW_M[0] / 2, -ARROW_M[0] / 2)
         )
         ahead = tip - tail
         left = np.array([-ahead[1], ahead[0]]) / max(float(np.hypot(*ahead)), 1e-9) * ARROW_M[1]

@@ -73,16 +73,16 @@ def place_labels(
     """
     # Labels keep clear of boxes, points along the leading tracks, and sensors.
     taken = [_bounds(agent, len(agent.waypoints) // 2) for agent in roles.stationary]
+    tracks = {r.agent.id: viewport.some_points(centers_xy(r.agent), MAX_TRACK_POINTS) for r in roles.movers}
     r = 1.2 * view.m_per_pt
     for role in roles.movers:
         taken.append(_bounds(role.agent, -1))
         if role.leading:
             taken.append(_bounds(role.agent, 0))
-            taken.extend((x - r, y - r, x + r, y + r) for x, y in _points_of(role.agent))
+            taken.extend((x - r, y - r, x + r, y + r) for x, y in tracks[role.agent.id])
     mark = style.SENSOR_PT / 2 * view.m_per_pt
     taken += [(s["x_m"] - mark, s["y_m"] - mark, s["x_m"] + mark, s["y_m"] + mark) for s in sensors]
     room = LabelRoom(view, taken)
-    tracks = {role.agent.id: _points_of(role.agent) for role in roles.movers}
     labels, told = list[MapLabel](), set[str]()
 
     def place_detail(text: str, anchor: Anchor) -> bool:
@@ -90,9 +90,8 @@ def place_labels(
         labels.extend([] if place is None else [MapLabel(text, style.MUTED, place, DETAIL_PT, bold=False)])
         return place is not None
 
-    def gap_m(
-        xy_m: Array, place: Array, half: Array
-    ) -> float:  # from the rectangle of a label to the nearest of points (N, 2)
+    # From the rectangle of a label to the nearest of points (N, 2).
+    def gap_m(xy_m: Array, place: Array, half: Array) -> float:
         return float(np.hypot(*np.maximum(np.abs(xy_m - place) - half, 0.0).T).min(initial=np.inf))
 
     def place_mover(role: AgentRole, text: str) -> Array | None:  # closer to its own track than to any other
@@ -100,12 +99,8 @@ def place_labels(
         others = np.concatenate([np.zeros((0, 2)), *(xy for other, xy in tracks.items() if other != id)])
         half = np.full(2, role.agent.size_m[1] / 2)
         along = [(xy[round(share * (len(xy) - 1))], half) for share in ALONG_TRACK]  # the latest first
-        return room.place(
-            text,
-            MOVER_PT,
-            [_end_of(role.agent), *along],
-            lambda at, h: gap_m(tracks[id], at, h) <= gap_m(others, at, h),
-        )
+        anchors = [_end_of(role.agent), *along]
+        return room.place(text, MOVER_PT, anchors, lambda at, h: gap_m(tracks[id], at, h) <= gap_m(others, at, h))
 
     leading, short_places = [role for role in roles.movers if role.leading], dict[str, Array | None]()
     for role in leading:
@@ -202,12 +197,6 @@ def _end_of(agent: Agent) -> Anchor:
     """Return the last box of a mover."""
     xy_m = centers_xy(agent)[-1]
     return xy_m, np.ptp(viewport.footprints(agent, xy_m, agent.waypoints.yaw_rad[-1])[0], axis=0) / 2
-
-
-def _points_of(agent: Agent) -> Array:
-    """Return points (K, 2) along a track, m."""
-    xy = centers_xy(agent)
-    return np.asarray(xy[np.linspace(0, len(xy) - 1, min(len(xy), MAX_TRACK_POINTS)).round().astype(int)])
 
 
 def _bounds(agent: Agent, k: int) -> Bounds:
@@ -332,11 +321,8 @@ def write_title(layout: FigureLayout, title: str, subtitle: str) -> None:
     """Write the title and a smaller line below it, flush with the map's left edge."""
     height = layout.figure.get_figheight()
     look: dict[str, Any] = {"family": style.FONT, "ha": "left", "va": "baseline", "parse_math": False}
-    x, title, subtitle = (
-        LEFT_IN / layout.width_in,
-        style.printable_label(title, 70),
-        style.printable_label(subtitle, 130),
-    )
+    title, subtitle = style.printable_label(title, 70), style.printable_label(subtitle, 130)
+    x = LEFT_IN / layout.width_in
     layout.figure.text(x, 1 - 0.36 / height, title, fontsize=13, fontweight="bold", color=style.INK, **look)
     layout.figure.text(x, 1 - 0.59 / height, subtitle, fontsize=8, color=style.MUTED, **look)
 
@@ -422,10 +408,9 @@ def draw_scale_and_north(layout: FigureLayout, *, projected: bool) -> None:
     column.text(x + w, y + 0.1, f"{length_m:g} m", ha="center", **look)
     if projected:
         nx, ny = layout.width_in - 0.42, y
-        column.add_patch(Polygon([(nx, ny + 0.4), (nx - 0.1, ny), (nx, ny + 0.09)], fc=style.INK, ec=style.INK, lw=0.8))
-        column.add_patch(
-            Polygon([(nx, ny + 0.4), (nx + 0.1, ny), (nx, ny + 0.09)], fc=style.PAPER, ec=style.INK, lw=0.8)
-        )
+        for aside, face in ((-0.1, style.INK), (0.1, style.PAPER)):
+            corners = [(nx, ny + 0.4), (nx + aside, ny), (nx, ny + 0.09)]
+            column.add_patch(Polygon(corners, fc=face, ec=style.INK, lw=0.8))
         column.text(nx, ny + 0.44, "N", ha="center", **{**look, "fontsize": 8.5, "fontweight": "bold"})
 
 

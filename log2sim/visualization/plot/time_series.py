@@ -47,7 +47,7 @@ class AgentTimeline:
     role: AgentRole
     driver: str
     charts: tuple[Chart, ...]
-    collisions_s: tuple[float, ...] = ()  # start of its collisions that belong to the replay
+    collisions_s: tuple[float, ...]  # start of its collisions that belong to the replay
 
 
 def timeline_of(replay: Any, roles: AgentRoles) -> AgentTimeline | None:

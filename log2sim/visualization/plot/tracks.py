@@ -39,9 +39,9 @@ class AnimatedArtists:
         layout: FigureLayout,
         roles: AgentRoles,
         overlays: layers.Overlays,
-        speed_up: float = 1.0,
-        charts: TimelineCharts | None = None,
-        signals: Sequence[Signal] = (),
+        speed_up: float,
+        charts: TimelineCharts | None,
+        signals: Sequence[Signal],
     ) -> None:
         self.layout, self.roles, self.overlays, self.speed_up, self.charts = layout, roles, overlays, speed_up, charts
         if charts is not None:
@@ -224,7 +224,7 @@ def plot_tracks(
     return film.path
 
 
-def still(scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays = layers.NO_OVERLAYS) -> FigureLayout:
+def still(scenario: Scenario, roles: AgentRoles, overlays: layers.Overlays) -> FigureLayout:
     """Draw a still picture."""
     layout, step_s, _, labels = draw_base(scenario, roles, overlays)
     ax, replay = layout.ax, overlays.replay

@@ -13,6 +13,7 @@ from log2sim.geometry import Array, box_corners_bev
 from log2sim.visualization.plot.style import CROWD_COLOR, INK, MARKERS, PALETTE
 
 MIN_MOVING_M = 1.0  # an agent is stationary when the bounding box of its trajectory has a shorter diagonal
+FEW_POINTS = 24  # points of a trajectory that tell where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +61,9 @@ def assign_view_roles(scenario: Scenario, whole: Scenario | None = None) -> Agen
 def _ranked(scenario: Scenario) -> list[Agent]:
     """Return the agents that move but the ego, the most important first."""
     ego, moving = scenario.ego, [a for a in scenario.others if is_moving(a)]
-
-    def some(agent: Agent) -> Array:
-        xy = centers_xy(agent)
-        return np.asarray(xy[np.linspace(0, len(xy) - 1, 24).round().astype(int)])
-
     if ego is not None:  # by the shortest distance between a few points of both trajectories
-        key = {a.id: float(np.hypot(*(some(a)[:, None] - some(ego)).transpose(2, 0, 1)).min()) for a in moving}
+        some = {a.id: some_points(centers_xy(a), FEW_POINTS) for a in (ego, *moving)}
+        key = {a.id: float(np.hypot(*(some[a.id][:, None] - some[ego.id]).transpose(2, 0, 1)).min()) for a in moving}
     else:
         key = {a.id: -float(np.ptp(centers_xy(a), axis=0).sum()) for a in moving}
     return sorted(moving, key=lambda a: (key[a.id], a.id))
@@ -80,6 +77,11 @@ def is_moving(agent: Agent) -> bool:
 def centers_xy(agent: Agent) -> Array:
     """Return the box centers (T, 2), m, map frame."""
     return np.column_stack([agent.waypoints.x_m, agent.waypoints.y_m])
+
+
+def some_points(xy_m: Array, most: int) -> Array:
+    """Return at most so many of points (N, 2), evenly spaced, with the first and the last."""
+    return np.asarray(xy_m[np.linspace(0, len(xy_m) - 1, min(len(xy_m), most)).round().astype(int)])
 
 
 def paint_of(agent: Agent, otherwise: Any) -> Any:
@@ -142,7 +144,7 @@ def choose_viewport(roles: AgentRoles) -> Viewport:
         away = _distance(kept, np.median(kept, axis=0)[None])
         kept = kept[away <= max(REACH_M, 3 * float(np.percentile(away, 75)))]
     else:
-        few = [p[np.linspace(0, len(p) - 1, min(len(p), 24)).round().astype(int)] for p in movers]
+        few = [some_points(xy, FEW_POINTS) for xy in movers]
         ego = roles.movers[0].is_ego
         core = few[0] if ego else np.median(np.concatenate(few), axis=0)[None]
         everything, away = np.concatenate(movers), _distance(np.concatenate(few), core)
