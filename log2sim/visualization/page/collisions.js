@@ -42,16 +42,5 @@ const placeEventLabels = () => {
 };
 
 // The collisions with when and whose they are; a click shows the moment of one.
-const listCollisions = (events, tracks, show) => {
-  byId("collided").hidden = events.length === 0;
-  byId("collided-count").textContent = `${events.length} collision${events.length === 1 ? "" : "s"}`;
-  byId("collided-agents").replaceChildren(...events.map((event) => {
-    const button = element("button", { type: "button" }), item = element("li");
-    const track = tracks.find((other) => event.agents.includes(other.id));
-    if (track) button.append(mark(track));
-    button.append(element("span", { class: "why" }, describe(event)));
-    button.addEventListener("click", () => show(event));
-    item.append(button);
-    return item;
-  }));
-};
+const listCollisions = () => fillLines("collided", counted(data.events.length, "collision"), data.events.map((event) =>
+  lineOf(tracks.find((track) => event.agents.includes(track.id)), describe(event), () => showEvent(event))));

@@ -44,12 +44,8 @@ const inflate = async (text) => {
 
 // Index of the time nearest to t; -1 when it is farther away than `reach`.
 const nearest = (times, t, reach) => {
-  let low = 0, high = times.length;
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (times[middle] < t) low = middle + 1; else high = middle;
-  }
-  const k = low > 0 && (low === times.length || t - times[low - 1] <= times[low] - t) ? low - 1 : low;
+  const before = lastUntil(times, t), after = before + 1;
+  const k = before >= 0 && (after === times.length || t - times[before] <= times[after] - t) ? before : after;
   return k < times.length && Math.abs(times[k] - t) <= reach ? k : -1;
 };
 

@@ -51,8 +51,7 @@ const drawFeatures = (painter, features, overGround) => {
 
 // The state from the last time that is not after t.
 const stateOf = (signal, t) => {
-  let k = -1;
-  while (k + 1 < signal.t_s.length && signal.t_s[k + 1] <= t + 1e-4) k++;
+  const k = lastUntil(signal.t_s, t + 1e-4);
   return k < 0 ? "unknown" : signal.state[k];
 };
 

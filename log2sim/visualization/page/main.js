@@ -172,8 +172,8 @@ const listen = () => {
     showPointColors();
     list.show();
     listDoubtful();
-    listWarnings(data.warnings, data.warned, showEvent);
-    listCollisions(data.events, tracks, showEvent);
+    listWarnings();
+    listCollisions();
     details.show();
     drawPresence();
     requestDraw();
@@ -201,9 +201,9 @@ const pictures = data.recording?.pictures ? new Pictures(data.recording.pictures
 
 const start = () => {
   const moving = tracks.filter((track) => !track.stationary && !track.ego).length, agents = tracks.length - (ego ? 1 : 0);
-  const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${agents} agent${agents === 1 ? "" : "s"}, ${moving} moving`];
+  const parts = [`${(data.end - data.begin).toFixed(1)} s`, `${counted(agents, "agent")}, ${moving} moving`];
   if (data.warnings.length) parts.push(data.warned);
-  if (data.features.lanes.length) parts.push(`${data.features.lanes.length} lane${data.features.lanes.length === 1 ? "" : "s"}`);
+  if (data.features.lanes.length) parts.push(counted(data.features.lanes.length, "lane"));
   if (doubtful.length) parts.push(`${doubtful.length} doubtful`);
   if (!ego) parts.push("no ego");
   if (data.origin) parts.push(`origin ${data.origin}`);
@@ -229,9 +229,9 @@ const start = () => {
   pictures?.showAhead();
   byId("doubts-toggle").hidden = doubtful.length === 0;
   markEvents();
-  listWarnings(data.warnings, data.warned, showEvent);
+  listWarnings();
   listDoubtful();
-  listCollisions(data.events, tracks, showEvent);
+  listCollisions();
   fillMetrics(data.metrics);
   setRate(0);
   showPlay();

@@ -11,9 +11,8 @@ class Outline {
   constructor([agent, corners, ...values], tracks) {
     this.track = tracks[agent];
     this.path = new Path2D();
-    const [x0, y0, x1, y1] = [[0, Math.min], [1, Math.min], [0, Math.max], [1, Math.max]].map(([axis, most]) =>
-      values.reduce((found, value, k) => (k % 2 === axis ? most(found, value) : found), most === Math.min ? Infinity : -Infinity));
-    Object.assign(this, { x0, y0, x1, y1 });
+    const x = values.filter((_, k) => k % 2 === 0), y = values.filter((_, k) => k % 2 === 1);
+    Object.assign(this, { x0: Math.min(...x), y0: Math.min(...y), x1: Math.max(...x), y1: Math.max(...y) });
     const line = (a, b, c, d) => { this.path.moveTo(a, b); this.path.lineTo(c, d); };
     if (corners) for (const [a, b] of BOX_EDGES) line(values[2 * a], values[2 * a + 1], values[2 * b], values[2 * b + 1]);
     else for (let k = 0; k < values.length; k += 4) line(values[k], values[k + 1], values[k + 2], values[k + 3]);

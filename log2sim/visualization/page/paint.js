@@ -14,11 +14,8 @@ class Painter {
   }
 
   resize() {
-    const ratio = Math.min(window.devicePixelRatio || 1, 2), { clientWidth: width, clientHeight: height } = this.canvas;
-    this.canvas.width = Math.round(width * ratio);
-    this.canvas.height = Math.round(height * ratio);
-    this.ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.view.resize(width, height);
+    scaledContext(this.canvas);
+    this.view.resize(this.canvas.clientWidth, this.canvas.clientHeight);
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.
@@ -259,7 +256,7 @@ class Painter {
 
   // Write a text, of which half the width is known, where no other is; a forced one always.
   write(text, sx, bottom, half, color, forced) {
-    const { ctx, taken } = this;
+    const taken = this.taken;
     if (this.labels === MAX_LABELS) return;
     for (let k = 0; k < 4 * this.labels && !forced; k += 4) {
       if (sx - half < taken[k + 2] && sx + half > taken[k] && bottom - 12 < taken[k + 3] && bottom + 2 > taken[k + 1]) return;
@@ -269,10 +266,16 @@ class Painter {
     taken[k + 1] = bottom - 12;
     taken[k + 2] = sx + half;
     taken[k + 3] = bottom + 2;
+    this.letters(text, sx, bottom, color);
+  }
+
+  // A text with a halo that keeps it readable.
+  letters(text, sx, sy, color) {
+    const ctx = this.ctx;
     ctx.lineWidth = 3;
     ctx.strokeStyle = theme.halo;
-    ctx.strokeText(text, sx, bottom);
+    ctx.strokeText(text, sx, sy);
     ctx.fillStyle = color;
-    ctx.fillText(text, sx, bottom);
+    ctx.fillText(text, sx, sy);
   }
 }

@@ -14,12 +14,8 @@ class Predicted {
 
   // Index of the last prediction up to t; -1 when there is none, or only one made long before.
   find(t) {
-    let low = -1, high = this.t.length;
-    while (high - low > 1) {
-      const middle = (low + high) >> 1;
-      if (this.t[middle] <= t + 1e-4) low = middle; else high = middle;
-    }
-    return low >= 0 && t - this.t[low] < MAX_PREDICTION_AGE_S ? low : -1;
+    const k = lastUntil(this.t, t + 1e-4);
+    return k >= 0 && t - this.t[k] < MAX_PREDICTION_AGE_S ? k : -1;
   }
 }
 

@@ -328,7 +328,7 @@ class Editor {
       const made = build(this.made);
       if (made === null) return;
       this.say("…");
-      const reply = this.entry.address ? await this.ask(made) : null, count = `${made.length} correction${made.length === 1 ? "" : "s"}`;
+      const reply = this.entry.address ? await this.ask(made) : null, count = counted(made.length, "correction");
       done();
       this.made = made;
       byId("studio-reason").value = "";

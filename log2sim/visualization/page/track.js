@@ -13,6 +13,16 @@ const sums = (differences, scale) => {
   return out;
 };
 
+// Index of the last of times in order that is not after t; -1 when all are.
+const lastUntil = (times, t) => {
+  let low = -1, high = times.length;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= t) low = middle; else high = middle;
+  }
+  return low;
+};
+
 // Value between waypoints k and k + 1 by their slopes, straight on over a jump, linear without slopes.
 const between = (values, slopes, k, share, span, jump) => {
   const rise = values[k + 1] - values[k];
@@ -63,15 +73,10 @@ class Track {
   // Index of the last waypoint not after t, starting at the previous result.
   find(t) {
     const times = this.t, n = times.length;
-    let k = this.k;
+    const k = this.k;
     if (times[k] <= t && (k + 1 === n || t < times[k + 1])) return k;
     if (k + 2 < n && times[k + 1] <= t && t < times[k + 2]) return (this.k = k + 1);
-    let low = 0, high = n;
-    while (high - low > 1) {
-      const middle = (low + high) >> 1;
-      if (times[middle] <= t) low = middle; else high = middle;
-    }
-    return (this.k = low);
+    return (this.k = Math.max(lastUntil(times, t), 0));
   }
 
   // Set the state at time t: position by the cubic Hermite spline of log2sim's trajectories, yaw and speed linearly.
@@ -153,7 +158,7 @@ const load = (text) => {
   }));
   const named = (name, id) => (layers[name] ?? []).find((track) => track.id === id) ?? null;
   const warnings = document_.warnings.events.map((warning) => ({
-    ...warning, agents: [warning.agent], driver: layers.replay?.find((track) => track.id === warning.driver),
+    ...warning, agents: [warning.agent], driver: named("replay", warning.driver),
     track: named("replay", warning.agent), shown: named("scenario", warning.agent),
   }));
   const { name, origin, north, metrics, recording, begin_s: begin, end_s: end } = document_;

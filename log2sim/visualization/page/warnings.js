@@ -57,26 +57,12 @@ const drawWarnings = (painter, warnings, t) => {
     ctx.font = theme.names;
     ctx.textAlign = "center";
     ctx.textBaseline = "middle";
-    ctx.lineWidth = 3;
-    ctx.strokeStyle = theme.halo;
     const text = `${boxGap(driver, track).toFixed(1)} m`, length = Math.max(Math.hypot(x - ex, y - ey), 1);
     const side = x < ex ? -1 : 1, tx = (x + ex) / 2 - (side * BESIDE_PX * (y - ey)) / length, ty = (y + ey) / 2 + (side * BESIDE_PX * (x - ex)) / length;
-    ctx.strokeText(text, tx, ty);
-    ctx.fillStyle = theme.warn;
-    ctx.fillText(text, tx, ty);
+    painter.letters(text, tx, ty, theme.warn);
   }
 };
 
 // The warnings with what was predicted; a click shows the moment of one.
-const listWarnings = (warnings, title, show) => {
-  byId("warned").hidden = warnings.length === 0;
-  byId("warned-count").textContent = title;
-  byId("warned-agents").replaceChildren(...warnings.map((warning) => {
-    const button = element("button", { type: "button" }), item = element("li");
-    if (warning.shown) button.append(mark(warning.shown));
-    button.append(element("span", { class: "why" }, warning.brief));
-    button.addEventListener("click", () => show(warning));
-    item.append(button);
-    return item;
-  }));
-};
+const listWarnings = () => fillLines("warned", data.warned, data.warnings.map((warning) =>
+  lineOf(warning.shown, warning.brief, () => showEvent(warning))));
