@@ -14,11 +14,6 @@ class View {
   mx(sx) { return (sx - this.width / 2) / this.scale + this.x; }
   my(sy) { return (this.height / 2 - sy) / this.scale + this.y; }
 
-  resize(width, height) {
-    this.width = width;
-    this.height = height;
-  }
-
   drag(dx, dy) {
     this.x -= dx / this.scale;
     this.y += dy / this.scale;

@@ -15,7 +15,7 @@ class Painter {
 
   resize() {
     scaledContext(this.canvas);
-    this.view.resize(this.canvas.clientWidth, this.canvas.clientHeight);
+    [this.view.width, this.view.height] = [this.canvas.clientWidth, this.canvas.clientHeight];
   }
 
   // shown: which layers and extras; chosen, hovered: tracks of the scenario or null.

@@ -31,7 +31,7 @@ class Points {
     this.decoded = new Decoded(async (k) => this.unpack(await inflate(entry.points[k]), entry.origin_m[k]), () => {}, ready);
   }
 
-  // The columns of `pack`: steps in x and y as planes of bytes, heights, intensities.
+  // The columns of `pack_recording`: steps in x and y as planes of bytes, heights, intensities.
   unpack(bytes, [east, north]) {
     const n = bytes.length / 6, x = new Float32Array(n), y = new Float32Array(n), unit = this.entry.unit_m;
     for (let k = 0, a = 0, b = 0; k < n; k++) {

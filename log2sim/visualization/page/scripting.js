@@ -1,4 +1,12 @@
 // For scripts and tests, and the start of everything.
+
+// The agent of an id as it is at the present time; null when it is absent.
+const presentTrack = (id) => {
+  const track = tracks.find((other) => other.id === id);
+  track?.moveTo(state.t);
+  return track?.present ? track : null;
+};
+
 window.log2sim = {
   get time() { return state.t; },
   set time(t) { seek(t); },
@@ -9,19 +17,11 @@ window.log2sim = {
   corrections: () => editor?.made ?? [],
   // Position of an agent's center on the canvas, CSS pixels; null when it is absent.
   placeOf: (id) => {
-    const track = tracks.find((other) => other.id === id);
-    track?.moveTo(state.t);
-    return track?.present ? [view.sx(track.px), view.sy(track.py)] : null;
+    const track = presentTrack(id);
+    return track && [view.sx(track.px), view.sy(track.py)];
   },
   // Position of a place of the map on the canvas, CSS pixels.
   pixelOf: (x, y) => [view.sx(x), view.sy(y)],
-  // Move the map so that a place is in its middle.
-  lookAt: (x, y) => {
-    [view.x, view.y] = [x, y];
-    requestDraw();
-  },
-  // Where the box that is moved stands in the map, how it is turned, and how far ahead the handle is that turns it.
-  poseOf: () => (editor?.pose ? [editor.pose.x, editor.pose.y, editor.pose.yaw, editor.pose.length / 2 + HANDLE_M] : null),
   // Position of a place of the ground in the picture of a camera, CSS pixels of the window; null where it is not in it.
   inPicture: (name, x, y, up = 0) => {
     const tile = pictures?.tiles.find((other) => other.name === name), surface = editor?.cameras.get(name)?.surface(tile);
@@ -29,11 +29,7 @@ window.log2sim = {
     return pixel ? [pixel[0] + box.left, pixel[1] + box.top] : null;
   },
   // Its heading in rad, counter-clockwise from east; null when it is absent.
-  headingOf: (id) => {
-    const track = tracks.find((other) => other.id === id);
-    track?.moveTo(state.t);
-    return track?.present ? track.pyaw : null;
-  },
+  headingOf: (id) => presentTrack(id)?.pyaw ?? null,
   get pixelsPerMeter() { return view.scale; },
   // For each camera the time of the picture shown, s; null while there is none.
   get pictures() {

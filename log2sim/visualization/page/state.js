@@ -48,7 +48,7 @@ const draw = (now) => {
     if (leader.present) [view.x, view.y] = [leader.px, leader.py];
   }
   painter.paint(data, state.t, state.shown, state.chosen, state.hovered);
-  editor?.paint(painter);
+  editor?.draw(painter.ctx, mapSurface);
   if (state.shown.pictures) pictures?.paint(state.t, state.chosen, state.hovered);
   const text = state.t.toFixed(2);
   if (text !== labelled) {

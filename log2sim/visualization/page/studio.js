@@ -370,15 +370,13 @@ class Editor {
     for (const name of ["length", "width", "height"]) byId(`studio-${name}`).value = track[name].toFixed(2);
   }
 
-  // What is edited, on the map.
-  paint({ ctx }) { this.draw(ctx, mapSurface); }
-
-  // The same in the picture of a tile.
+  // What is edited, in the picture of a tile.
   paintPicture(tile, ctx) {
     const surface = this.cameras.get(tile.name)?.surface(tile);
     if (surface) this.draw(ctx, surface);
   }
 
+  // The same on any surface.
   draw(ctx, surface) {
     if (state.chosen?.present && (this.mode === "move" || this.made.length)) this.drawGhost(ctx, surface, state.chosen.id);
     ctx.setLineDash(TRUTH_DASHES);
