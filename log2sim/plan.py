@@ -187,8 +187,7 @@ def fusion_level(log: Log, config: Config) -> tuple[FusionLevel | None, str]:
         missing = " and ".join(end for end in ENDS if end not in with_lidar)
         return None, f"no LiDAR of {missing}: what their cameras measure is joined as of any"
     if not config.detect.in_sweeps and asked is not FusionLevel.POINTS:
-        reason = f"points: images alone are searched, so that there are no {asked} of LiDARs to join"
-        return FusionLevel.POINTS, reason
+        return FusionLevel.POINTS, f"points: images alone are searched, so that there are no {asked} of LiDARs to join"
     return asked, f"{asked}: cooperation.fusion"
 
 
@@ -351,16 +350,16 @@ def make_plan(log: Log, config: Config, sensors: Sensors, t_ns: NDArray[np.int64
         decisions.append(_decide(Stage.FUSION_WITH_LIDAR, reason, no_camera))
     if why_level:
         decisions.append(Decision(Stage.FUSION_OF_ENDS, level is not None, why_level))
-    smooth, lanes, look = config.smooth.enabled, config.map.lanes, config.appearance
+    look = config.appearance
     decisions += [
         Decision(Stage.TRACKING, True, "identities over time are the result"),
-        _decide(Stage.SMOOTHING, "measured positions are noisy", (not smooth, "smooth.enabled=false")),
+        _decide(Stage.SMOOTHING, "measured positions are noisy", (not config.smooth.enabled, "smooth.enabled=false")),
         Decision(Stage.SMOOTHING_OF_STATIC_AGENTS, False, "a static agent has one pose"),
         Decision(Stage.WAYPOINT_AT_EVERY_TICK, False, "waypoints that interpolation gives back are left out"),
         _decide(
             Stage.LANES,
             f"{' and '.join(ground)} show the ground",
-            (not lanes, "map.lanes=false"),
+            (not config.map.lanes, "map.lanes=false"),
             (not ground, "no sensor is used that shows the ground"),
         ),
         _decide(

@@ -51,12 +51,8 @@ def describe_stage(stage: str) -> str:
 def show_progress(*state: str | int) -> None:
     """Show how far a run is, as what the functions of log2sim take for `progress`.
 
-    A line on the standard output is written anew while a stage goes on, and stays when the stage is done.
-
-    Parameters
-    ----------
-    *state
-        Stage, steps done, all steps, or the last two; with 0 for all of them when a stage of unknown length begins.
+    A line on the standard output is written anew while a stage goes on, and stays when the stage is done. `state`: stage, steps done,
+    all steps, or the last two; with 0 for all of them when a stage of unknown length begins.
 
     Examples
     --------

@@ -36,10 +36,7 @@ def require_cameras(log: Log, asked: Sequence[str]) -> None:
 
 
 def require_overlap(log: Log, scenario: Scenario) -> None:
-    """Require that a log has records during a scenario.
-
-    Raises `LogError` when it has none.
-    """
+    """Raise `LogError` for a log that has no records during a scenario."""
     spans = [(int(s.t_ns[0]), int(s.t_ns[-1])) for s in log.streams.values() if len(s.t_ns)]
     if spans and not any(len(records_within(stream.t_ns, scenario)) for stream in log.streams.values()):
         first, last = min(span[0] for span in spans), max(span[1] for span in spans)
@@ -313,9 +310,9 @@ def point_document(
 ) -> dict[str, Any] | None:
     """Return the points of a log's LiDARs within a budget; None where there are none during the scenario.
 
-    Returns "t_s", "origin_m" and "points" of each moment, the last as base64 of deflated columns, see `pack`; "unit_m",
-    "height_m", the lowest height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and
-    "bytes" as chosen. Raises `ConfigError` when not even one sweep fits.
+    Returns "t_s", "origin_m" and "points" of each moment, the last as `pack_recording` packs them; "unit_m"; "height_m", the lowest
+    height and the step of a byte; "intensity", whether there is any; "cell_m", "rate_hz" and "bytes" as chosen. Raises `ConfigError`
+    when not even one sweep fits.
     """
     lidars = [n for n in log.lidars if n in log.streams and len(records_within(log.streams[n].t_ns, scenario))]
     if not lidars:

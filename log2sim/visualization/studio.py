@@ -26,12 +26,7 @@ HOST = "127.0.0.1"
 class Studio:
     """A scenario with the corrections of a file, which every change of the page is written to.
 
-    Attributes
-    ----------
-    address : str
-        Of the page, with a token that each run makes anew.
-    result : Corrected
-        The scenario with all corrections so far.
+    `address`: of the page, with a token that each run makes anew. `result`: the scenario with all corrections so far.
     """
 
     def __init__(

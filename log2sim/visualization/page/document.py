@@ -190,8 +190,7 @@ def page_document(
         true = truth.aligned_to(scenario).agents
         layers["truth"] = [_entry(a, a.waypoints, stationary=not is_moving(a), static=a.static) for a in true]
     if replay is not None:
-        static = {a.id: a.driver == "static" for a in replay.agents}
-        there = [(a, static[a.id]) for a in replay.agents if len(a.t_s)]
+        there = [(a, a.driver == "static") for a in replay.agents if len(a.t_s)]
         layers["replay"] = [_entry(a, a, stationary=stands, static=stands) for a, stands in there]
     if predict_s is not None:
         predicted = predicted_columns(scenario, predict_s)

@@ -72,7 +72,7 @@ def draw_stationary(ax: Axes, agents: Sequence[datatypes.Agent], view: Viewport)
 
 
 def draw_tracks(
-    ax: Axes, roles: AgentRoles, view: Viewport, step_s: float, *, alpha: float = 1.0, faint: bool = False
+    ax: Axes, roles: AgentRoles, view: Viewport, step_s: float, *, alpha: float, faint: bool = False
 ) -> None:
     """Draw tracks as lines with arrowheads, filled gaps dashed, and time marks.
 
@@ -417,10 +417,8 @@ def draw_road(ax: Axes, scenario: datatypes.Scenario, view: Viewport, *, over_pi
         half = min(np.rad2deg(sensor["fov_rad"]) / 2, 180.0)
         yaw, place = np.rad2deg(sensor["yaw_rad"]), (sensor["x_m"], sensor["y_m"])
         face = "none" if half > 179.9 else to_rgba(SENSOR_COLOR, 0.05)
-        edge = to_rgba(SENSOR_COLOR, 0.3)
-        wedge = Wedge(place, sensor["range_m"], yaw - half, yaw + half, fc=face, ec=edge, lw=0.8)
-        wedge.set_zorder(LANES - 0.2)
-        ax.add_artist(wedge)
+        edge, z = to_rgba(SENSOR_COLOR, 0.3), LANES - 0.2
+        ax.add_artist(Wedge(place, sensor["range_m"], yaw - half, yaw + half, fc=face, ec=edge, lw=0.8, zorder=z))
         ax.plot(*place, zorder=LINES + 3, scalex=False, scaley=False, **SENSOR)
     features = scenario.map_features
     if features is None:

@@ -60,9 +60,9 @@ def place_labels(
     roles: AgentRoles,
     view: Viewport,
     times_step_s: float,
+    sensors: Sequence[Mapping[str, Any]],
     *,
     static: bool = False,
-    sensors: Sequence[Mapping[str, Any]] = (),
 ) -> tuple[list[MapLabel], set[str]]:
     """Find places for the labels of movers and doubtful agents, with `static` of all static ones, and for times along the ego's track.
 
@@ -207,8 +207,7 @@ def _bounds(agent: Agent, k: int) -> Bounds:
 
 # With more leading movers their speeds are in the legend: longer labels would cover the boxes of others.
 MAX_NAMED = 8
-# Where a label may be beside its box, the best first.
-MOVING_SIDES = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, 1), (1, -1), (-1, -1))
+MOVING_SIDES = SIDES[4:] + SIDES[:4]  # in animations, the best first
 GAP_PT = 2.0
 
 
@@ -266,7 +265,7 @@ class FigureLayout:
     figure: Figure
     ax: Axes  # of the map
     view: Viewport  # what the map shows
-    foot_in: float = 0.0  # inch, height below the map for charts
+    foot_in: float  # inch, height below the map for charts
 
     @property
     def width_in(self) -> float:
@@ -282,7 +281,7 @@ class FigureLayout:
 
 
 def make_layout(
-    view: Viewport, legend_rows: int, *, projected: bool, foot_in: float = 0.0, aspect: float | None = None
+    view: Viewport, legend_rows: int, *, projected: bool, foot_in: float, aspect: float | None
 ) -> FigureLayout:
     """Lay out a figure whose map has the proportions of the view within limits, above `foot_in` inches for charts.
 
@@ -299,8 +298,7 @@ def make_layout(
         map_width, map_height = width - LEFT_IN - SIDE_IN - GAP_IN, width * aspect - around
     height = map_height + around
     figure = style.new_figure(width, height)
-    bottom = foot_in + BOTTOM_IN
-    ax = figure.add_axes((LEFT_IN / width, bottom / height, map_width / width, map_height / height))
+    ax = figure.add_axes((LEFT_IN / width, (foot_in + BOTTOM_IN) / height, map_width / width, map_height / height))
     fitted = view.fitted(map_width * 72, map_height * 72)
     ax.set(xlim=(fitted.x0, fitted.x1), ylim=(fitted.y0, fitted.y1), facecolor="#FBFCFD")
     ax.set_aspect("equal", adjustable="box")

@@ -51,10 +51,10 @@ def draw_base(
         static, sensors = overlays.options.label_static, scenario.sensors
         told = leading | {agent.id for agent in roles.stationary}
         layout = lay_out(_legend(scenario, roles, overlays, step_s, told))
-        labels, said = layouts.place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
+        labels, said = layouts.place_labels(roles, layout.view, step_s, sensors, static=static)
         if not told <= said | {agent.id for agent in roles.stationary if not agent.is_doubtful}:
             layout = lay_out(_legend(scenario, roles, overlays, step_s, said))
-            labels, said = layouts.place_labels(roles, layout.view, step_s, static=static, sensors=sensors)
+            labels, said = layouts.place_labels(roles, layout.view, step_s, sensors, static=static)
         rows = _legend(scenario, roles, overlays, step_s, said)
     signals_s = None if moving else span.stop_s
     draw_standing(layout.ax, scenario, roles, layout.view, overlays.background, signals_s=signals_s)
@@ -203,7 +203,7 @@ def plot(
     step_s = viewport.time_step_s(scenario.duration_s, len(roles.movers), _typical_speed(roles), view.m_per_pt)
     draw_standing(ax, scenario, roles, view, background, signals_s=scenario.duration_s)
     draw_moving(ax, roles, view, step_s, truth=aligned, replay=replay)
-    labels, told = layouts.place_labels(roles, view, step_s, sensors=scenario.sensors)
+    labels, told = layouts.place_labels(roles, view, step_s, scenario.sensors)
     layouts.draw_labels(ax, labels)
     ax.set(xlim=(view.x0, view.x1), ylim=(view.y0, view.y1))
     if new if legend is None else legend:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from log2sim.datatypes import GROUP_OF, Agent, Scenario
-from log2sim.geometry import Array, box_corners_bev
+from log2sim.geometry import Array, Polyline, box_corners_bev
 from log2sim.visualization.plot.style import CROWD_COLOR, INK, MARKERS, PALETTE
 
 MIN_MOVING_M = 1.0  # an agent is stationary when the bounding box of its trajectory has a shorter diagonal
@@ -216,8 +216,7 @@ def stripes(corners: Array, spacing_m: float) -> Array:
 
 def arrows(xy_m: Array, view: Viewport) -> list[Array]:
     """Compute arrowheads (4, 2) along positions (T, 2) in the direction of travel, one every 110 points."""
-    steps = np.hypot(*np.diff(xy_m, axis=0).T)
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    arc = Polyline(xy_m).s_m
     length = arc[-1] / view.m_per_pt
     if length < 26:
         return []
