@@ -57,8 +57,7 @@ def export(
     if ego is not None and driver is None:
         loaded = make_ego(loaded, ego)
     chosen = filter_doubtful(loaded, doubtful)
-    opened = open_log(log) if log is not None else None
-    options = Options(revision, map, mode, opened, driver)
+    options = Options(revision, map, mode, None if log is None else open_log(log), driver)
     files = run(chosen, to, out, options, quarantined=doubtful == "all", overwrite=overwrite)
     for file in files:
         opt.tell(f"{file}: written")

@@ -25,8 +25,7 @@ MAX_NOTES = 5
 
 def describe_log(log: Document, *, verbose: bool = False) -> list[str]:
     """Describe a log: a line for each sensor, then the ego, labels, the map, and notes."""
-    seconds = f"{log['duration_s']:.1f} s"
-    lines = [f"{log['name']}: a log in the format {log['format']}, {seconds}", ""]
+    lines = [f"{log['name']}: a log in the format {log['format']}, {log['duration_s']:.1f} s", ""]
     rows = [("sensor", "records", "rate", "gaps", "mount", "")]
     for name, sensor in [*log["cameras"].items(), *log["lidars"].items()]:
         rate, gaps = sensor["rate_hz"], sensor["gaps"]

@@ -37,14 +37,13 @@ def complete(*choices: str) -> Callable[[str], list[str]]:
     return lambda incomplete: [choice for choice in choices if choice.startswith(incomplete)]
 
 
-def complete_plugins(*kinds: str, prefix: str = "") -> Callable[[str], list[str]]:
+def complete_plugins(kind: str, prefix: str = "") -> Callable[[str], list[str]]:
     """Return a function by which a shell completes the name of a plug-in; installed ones are looked up only then."""
 
     def completed(incomplete: str) -> list[str]:
         from log2sim.files.plugins import names
 
-        known = [prefix + name for kind in kinds for name in names(kind)]
-        return [name for name in known if name.startswith(incomplete)]
+        return complete(*(prefix + name for name in names(kind)))(incomplete)
 
     return completed
 

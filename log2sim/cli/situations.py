@@ -140,8 +140,6 @@ def find(
     if open_ is not None:
         if open_ > len(found.rows):
             raise ConfigError(f"--open {open_}: there are {opt.counted(len(found.rows), 'hit')}")
-        # Write the page of a hit's scenario, open it in a browser at the moment, and return its address
-        hit = found.rows[open_ - 1]
         import tempfile
         import webbrowser
         from urllib.parse import quote
@@ -149,6 +147,7 @@ def find(
         from log2sim.datatypes import Scenario
         from log2sim.visualization.page.writer import write_page
 
+        hit = found.rows[open_ - 1]
         page = (
             out.with_name(f"{out.stem}-{open_}.html")
             if out is not None

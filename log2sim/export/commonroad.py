@@ -73,8 +73,7 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
     location = _texts(element("location"), **place)
     if frame.projection is not None:
         x, y, _ = frame.offset_m  # from projected coordinates to those of the file
-        reference = xml_text.escaped(frame.projection)
-        transformation = _texts(element("geoTransformation", location), geoReference=reference)
+        transformation = _texts(element("geoTransformation", location), geoReference=xml_text.escaped(frame.projection))
         shift = {"xTranslation": _decimal(-x), "yTranslation": _decimal(-y), "zRotation": "0", "scaling": "1"}
         _texts(element("additionalTransformation", transformation), **shift)
     root.append(location)

@@ -19,7 +19,6 @@ from log2sim.files.documents import check_folder, refuse_existing
 from log2sim.files.outputs import expect_new, place_all, temporary_beside, unfinished_folder, written_meanwhile
 from log2sim.geometry import Array, whole_kilometers, wrap_angle
 
-__all__ = ["EXTERNAL", "Exporter", "Options", "export", "formats"]
 EXTERNAL = "external"  # as the ego of an export: another program drives it, from its place and speed in the scenario
 
 
@@ -340,8 +339,7 @@ def make_ego(scenario: Scenario, agent: str) -> Scenario:
         raise ConfigError(f"--ego: no agent '{agent}'{plugins.nearest(agent, ids)}; the scenario has {known}")
     if scenario.ego is not None and agent != "ego":
         raise ConfigError(f"--ego {agent}: scenario '{scenario.name}' has an ego already; leave the option out")
-    agents = tuple(replace(a, id="ego") if a.id == agent else a for a in scenario.agents)
-    return replace(scenario, agents=agents)
+    return replace(scenario, agents=tuple(replace(a, id="ego") if a.id == agent else a for a in scenario.agents))
 
 
 def filter_doubtful(scenario: Scenario, choice: str) -> Scenario:

@@ -60,11 +60,10 @@ def write(scenario: Scenario, folder: Path, options: Options) -> None:
             "log2sim_id": xml_text.escaped(signal.id),
         }
         light = draft.way(np.stack([bottom - side, bottom + side]), type="traffic_light", **tags)
-        members = [("way", light, "refers")]
         if not ahead:
             continue
         lines = [number for stop, number in stops if any(_ends_at(lane, stop) for lane in ahead)][:1]
-        members += [("way", number, "ref_line") for number in lines]
+        members = [("way", light, "refers"), *(("way", number, "ref_line") for number in lines)]
         lit |= set(lines)
         rule = draft.relation(members, type="regulatory_element", subtype="traffic_light")
         for lane in ahead:

@@ -54,7 +54,7 @@ PEDESTRIAN_MASS_KG = 75.0
 WHEELBASE_SHARE, TRACK_SHARE = 0.6, 0.85
 
 
-def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external: bool = False) -> None:
+def add_entity(parent: Element, agent: Agent, name: str, minor: int, *, external: bool) -> None:
     """Add the `ScenarioObject` of an agent for revision 1.`minor`; an `external` one is driven from outside."""
     scenario_object = element("ScenarioObject", parent, name=name)
     if agent.category == "pedestrian":
@@ -197,8 +197,7 @@ def _add_group(act: Element, story: AgentStory, minor: int) -> None:
     polyline = element("Polyline", element("Shape", trajectory))
     for row in story.vertices:
         _add_position(element("Vertex", polyline, time=number(row[0], 9)), row)
-    timing = element("TimeReference", follow)
-    element("Timing", timing, domainAbsoluteRelative="absolute", scale="1", offset="0")
+    element("Timing", element("TimeReference", follow), domainAbsoluteRelative="absolute", scale="1", offset="0")
     element("TrajectoryFollowingMode", follow, followingMode="position")
     _add_trigger(event, "StartTrigger", f"{story.name} may move", max(first_s, 0.0), minor)
     if not story.leaves:

@@ -133,8 +133,7 @@ def _add_signals(
             country="OpenDRIVE", type=LIGHT_TYPE, subtype="-1", value="-1", height=number(LIGHT_HEIGHT_M, 2),
             width=number(LIGHT_WIDTH_M, 2), hOffset="0", pitch="0", roll="0",
         )  # fmt: skip
-        at = signal.position_m - placement.origin_m
-        place = {key: number(float(v), DIGITS) for key, v in zip("xyz", at)}
+        place = {key: number(float(v), DIGITS) for key, v in zip("xyz", signal.position_m - placement.origin_m)}
         element("positionInertial", node, **place, hdg=number(float(signal.heading_rad or 0.0), DIGITS))
 
 
@@ -217,8 +216,7 @@ def add_road_file(scenario: Scenario, folder: Path, map_path: Path | None) -> tu
     keys = ("x", "y", "length")
     pieces = root.iter("geometry")
     roads = np.array([[require_number(p.get(key), f"{map_path}: geometry {key}") for key in keys] for p in pieces])
-    firsts = [(a.waypoints.x_m[0], a.waypoints.y_m[0], 0.0, 0.0) for a in scenario.agents]
-    places = placement.forward(np.array(firsts))
+    places = placement.forward(np.array([(a.waypoints.x_m[0], a.waypoints.y_m[0], 0.0, 0.0) for a in scenario.agents]))
     gaps = [(np.hypot(*(roads[:, :2] - place[:2]).T) - roads[:, 2]).min() for place in places]
     if min(gaps) > FAR_M:
         raise ConfigError(
