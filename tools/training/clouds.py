@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,36 +14,7 @@ from log2sim.evaluation.detection.protocols import MIN_POINTS
 from log2sim.geometry import Array
 from log2sim.perception.detect3d.network import MAX_HEIGHT_M, MIN_HEIGHT_M, rasterize
 from log2sim.perception.lidar.cloud import ON_GROUND_M, Cloud, Ground, estimate_ground
-from log2sim.synth.traffic import Mount, TrafficScene, draw_scene
-
-
-@dataclass(frozen=True, eq=False)
-class LabeledCloud:
-    """A cloud and the road users in it, as a network is trained on."""
-
-    xyz_m: NDArray[np.float32]  # (N, 3), m: level frame
-    hit: NDArray[np.int32]  # (N,): index of the object, -1 for the ground
-    category: NDArray[np.str_]  # (M,): of the road users
-    # (M, 7) float64: x, y, z of the center, length, width, height in m, heading in rad, at the mean time of the user's
-    # points
-    boxes: Array
-    points: NDArray[np.int64]  # (M,): number of points on each
-    scene: TrafficScene = field(repr=False)
-
-
-def labeled_cloud(scene: TrafficScene, rng: np.random.Generator) -> LabeledCloud:
-    """Cast a scene and label its road users."""
-    cloud = scene.cast(rng)
-    users = [k for k, o in enumerate(scene.objects) if o.category]
-    count = np.bincount(cloud.hit[cloud.hit >= 0], minlength=len(scene.objects))
-    total_s = np.bincount(cloud.hit[cloud.hit >= 0], cloud.t_s[cloud.hit >= 0], minlength=len(scene.objects))
-    boxes = np.zeros((len(users), 7))
-    for row, k in enumerate(users):
-        item = scene.objects[k]
-        position, yaw = item.pose_at(float(total_s[k] / max(count[k], 1)))
-        boxes[row] = *position[:2], position[2] + item.size_m[2] / 2, *item.size_m, yaw
-    category = np.array([scene.objects[k].category for k in users], dtype="<U16")
-    return LabeledCloud(cloud.xyz_m, cloud.hit, category, boxes, count[users], scene)
+from log2sim.synth.traffic import Mount, draw_scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +45,26 @@ REPORTED_KINDS = frozenset(
 
 
 def draw_example(mount: Mount, seed: tuple[int, ...], without: frozenset[str] = frozenset()) -> Example:
-    """Draw a scene without some kinds, cast it and level its cloud as the pipeline does."""
+    """Draw a scene without some kinds, cast it, level its cloud as the pipeline does, and box the road users that it shows.
+
+    Each box is where its road user is at the mean time of the points on it.
+    """
     rng = np.random.default_rng(seed)
     scene = draw_scene(mount, rng, without=without)
-    labeled = labeled_cloud(scene, rng)
-    cloud, ground = level(labeled.xyz_m, scene.sensor.position_m)
-    seen = labeled.points > 0
-    ignored = (labeled.points < MIN_POINTS) | np.isin(labeled.category, ("bicycle", "other"))
-    truth = SceneBoxes.of(labeled.boxes, labeled.category, points=labeled.points, ignored=ignored).take(seen)
+    returns = scene.cast(rng)
+    cloud, ground = level(returns.xyz_m, scene.sensor.position_m)
+    on_object = returns.hit >= 0
+    count = np.bincount(returns.hit[on_object], minlength=len(scene.objects))
+    total_s = np.bincount(returns.hit[on_object], returns.t_s[on_object], minlength=len(scene.objects))
+    users = [k for k, o in enumerate(scene.objects) if o.category and count[k]]
+    boxes = np.zeros((len(users), 7))
+    for row, k in enumerate(users):
+        item = scene.objects[k]
+        position, yaw = item.pose_at(float(total_s[k] / count[k]))
+        boxes[row] = *position[:2], position[2] + item.size_m[2] / 2, *item.size_m, yaw
+    category, points = np.array([scene.objects[k].category for k in users], dtype="<U16"), count[users]
+    ignored = (points < MIN_POINTS) | np.isin(category, ("bicycle", "other"))
+    truth = SceneBoxes.of(boxes, category, points=points, ignored=ignored)
     return Example(cloud, truth, ground.at(truth.box[:, :2].astype(np.float32)))
 
 

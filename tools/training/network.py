@@ -41,13 +41,13 @@ def widths_of(kernels: Mapping[str, Tensor]) -> Widths:
 class BevNetwork(nn.Module):
     """Anchor-free detector on bird's-eye-view grids, after CenterPoint (Yin et al., CVPR 2021) and PIXOR (Yang et al., CVPR 2018)."""
 
-    def __init__(self, widths: Widths = (16, 32, 48, 64), depths: tuple[int, int, int] = (1, 2, 2)) -> None:
+    def __init__(self, widths: Widths) -> None:
         super().__init__()
         a, b, c, d = widths
         self.stem = nn.Sequential(conv(IN_CHANNELS, a, kernel=6, stride=2), conv(a, a))
-        self.down4 = nn.Sequential(conv(a, b, stride=2), *[conv(b, b) for _ in range(depths[0])])
-        self.down8 = nn.Sequential(conv(b, c, stride=2), *[conv(c, c) for _ in range(depths[1])])
-        self.down16 = nn.Sequential(conv(c, d, stride=2), *[conv(d, d) for _ in range(depths[2])])
+        self.down4 = nn.Sequential(conv(a, b, stride=2), conv(b, b))
+        self.down8 = nn.Sequential(conv(b, c, stride=2), conv(c, c), conv(c, c))
+        self.down16 = nn.Sequential(conv(c, d, stride=2), conv(d, d), conv(d, d))
         self.lateral8, self.lateral4, self.lateral2 = conv(d, c, 1), conv(c, b, 1), conv(b, a, 1)
         self.merge8, self.merge4, self.merge2 = conv(c, c), conv(b, b), conv(a, 32)
         self.head = nn.Conv2d(32, OUT_CHANNELS, 1)
@@ -207,8 +207,8 @@ def targets_of(samples: list[Sample], lows: list[np.ndarray], cells: int, cell_m
             stronger = peak > heat[(k, group, *area)]
             heat[(k, group, *area)][stronger] = peak[stronger]
             near = (peak > MIN_REGRESSED_PEAK) & stronger
-            sizes = np.log([length, width, height]), np.sin(2 * yaw), np.cos(2 * yaw)
-            values = (dx + 0 * dy, dy + 0 * dx, z, *sizes[0], *sizes[1:], s, c)
+            shape = *np.log([length, width, height]), np.sin(2 * yaw), np.cos(2 * yaw)
+            values = (dx + 0 * dy, dy + 0 * dx, z, *shape, s, c)
             for q, value in enumerate(values):
                 box[(k, q, *area)][near] = value[near] if isinstance(value, np.ndarray) else value
             regressed[(k, 0, *area)][near] = 1

@@ -56,7 +56,7 @@ def labeled_by(views: tuple[LogView, ...], xyz: Array) -> NDArray[np.bool_]:
     return np.any([view.shows(xyz) for view in views], axis=0)
 
 
-def read_sweeps(log: Log, every: int = 1) -> list[LogSweep]:
+def read_sweeps(log: Log, every: int) -> list[LogSweep]:
     """Read every n-th sweep of a log that has labels in it.
 
     Raises `LogError` when there is none.
@@ -79,9 +79,8 @@ def read_sweeps(log: Log, every: int = 1) -> list[LogSweep]:
         rows = np.column_stack([boxes.center_m - origin, boxes.size_m, boxes.yaw_rad])
         away = np.hypot(*(rows[:, :2] - cloud.sensor[:2]).T)
         truth = SceneBoxes.of(rows, boxes.category, points=boxes.points, range_m=away)
-        sweep = LogSweep(cloud, truth, _views(log, cloud))
         if len(truth):
-            out.append(sweep)
+            out.append(LogSweep(cloud, truth, _views(log, cloud)))
     if not out:
         raise LogError(f"{log.name}: no sweep with labels")
     return out

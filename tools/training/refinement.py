@@ -105,9 +105,8 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
     if len(truth):
         unclear &= ~matched | truth.ignored[of]
     target = np.zeros((len(some), 7))
-    target[matched] = truth.box[of[matched]] - np.column_stack(
-        [center[matched, :2], example.ground_m[of[matched]], np.zeros((matched.sum(), 4))]
-    )
+    target[matched] = truth.box[of[matched]]
+    target[matched, :3] -= np.column_stack([center[matched, :2], example.ground_m[of[matched]]])
     points = xyz[sampled.point].copy()
     points[:, :2] -= center[sampled.box, :2].astype(np.float32)
     return {
@@ -351,14 +350,8 @@ def finish(
         "points": torch.rand((3, POINTS, POINT_VALUES), generator=generator),
         "box": torch.rand((3, BOX_VALUES), generator=generator),
     }
-    export_checked(
-        network.eval(),
-        path,
-        checked,
-        ("corrections",),
-        {name: {0: "boxes"} for name in (*checked, "corrections")},
-        halved=True,
-    )
+    axes = {name: {0: "boxes"} for name in (*checked, "corrections")}
+    export_checked(network.eval(), path, checked, ("corrections",), axes, halved=True)
     info = {
         "version": VERSION,
         "groups": list(CATEGORIES),
@@ -366,9 +359,8 @@ def finish(
         "card": card,
     }
     describe(path, info, METADATA_KEY)
-    info["calibration"] = calibrate(
-        own, [draw_example(mount, (card["seed"], 1_000_000, k), REPORTED_KINDS) for k in range(examples)]
-    )
+    calibrated = [draw_example(mount, (card["seed"], 1_000_000, k), REPORTED_KINDS) for k in range(examples)]
+    info["calibration"] = calibrate(own, calibrated)
     describe(path, info, METADATA_KEY)
     detector = open_network(own, LidarConfig(), name=mount)
     tested = [draw_example(mount, (card["seed"], 2_000_000, k)) for k in range(examples)]
@@ -388,7 +380,8 @@ def main(
     if not bare.exists():
         shutil.copyfile(first or WEIGHTS / f"{mount}.onnx", bare)
     if only_generate:
-        return generate(mount, bare, out, scenes, seed)
+        generate(mount, bare, out, scenes, seed)
+        return
     generator = Popen([sys.executable, *sys.argv, "--only-generate"])
     try:
         plan = FitPlan(steps, seed, RATE if start is None else START_RATE, out / "refinement.pt", 100)
@@ -409,4 +402,3 @@ def main(
         before = json.loads((start.parent / f"{mount}.boxes.json").read_text())
         card["start"] = {key: value for key, value in before.items() if key != "simulated"}
     finish(mount, bare, out, weights, card, examples)
-    return None

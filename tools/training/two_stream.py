@@ -44,7 +44,7 @@ from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import WEIGHTS, LidarDetector, open_network
 from log2sim.perception.detect3d.network import open_session
 from log2sim.perception.lidar.cloud import Cloud
-from training.export import export_checked
+from training.export import export_checked, group_of
 from training.fitting import FitPlan, fit
 from training.network import conv
 from training.real_logs import LogSweep, LogView, ground_under, labeled_by, read_sweeps
@@ -499,9 +499,7 @@ def compare(searches: dict[str, Search], pairs: Sequence[Pair]) -> dict[str, dic
 
 def truth_of(pair: Pair, kind: str) -> SceneBoxes:
     """Take the true boxes of a class; other vehicles, far ones and such with few points need not be found."""
-    t = pair.truth
-    group = GROUP_OF[kind]
-    t = t.take(np.array([GROUP_OF.get(c) == group for c in t.category.tolist()], bool))
+    t = group_of(pair.truth, GROUP_OF[kind])
     assert t.points is not None
     away = np.hypot(t.box[:, 0], t.box[:, 1])
     return t.ignoring((t.category != kind) | (t.points < MIN_POINTS) | (away >= MAX_RANGE_M))

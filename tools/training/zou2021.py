@@ -1,7 +1,7 @@
 """Train the network of Zou, Guo, Chen and Yuan (2021) for a 16-line LiDAR at the roadside on shards of tools/train.py lidar, and export it.
 
     pip install 'log2sim[train]'
-    python tools/train.py lidar roadside --out DIR --only generate
+    python tools/train.py lidar roadside DIR --only generate
     python tools/train.py zou2021 DIR/data OUT --steps 1500
     log2sim reconstruct LOG --detector lidar:OUT/zou2021.onnx --set lidar.decode=votes
 
