@@ -60,12 +60,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 def log2sim(line: str) -> None:
     """Run a command in the checkout."""
-    subprocess.run(
-        [sys.executable, "-m", "log2sim", *line.split(), "--quiet", "--overwrite"],
-        cwd=ROOT,
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
+    command = [sys.executable, "-m", "log2sim", *line.split(), "--quiet", "--overwrite"]
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
 
 
 def prepare(work: Path) -> Path:
@@ -107,17 +103,13 @@ def screenshots(work: Path, sample: Path, names: set[str]) -> None:
             photograph(browser, "pictures", (work / "view.html").as_uri(), "log2sim.time = 2; log2sim.choose('car-1')")
         if "corrections" in names:
             (work / "none.json").unlink(missing_ok=True)
-            studio = Studio(
-                Scenario.load(sample),
-                work / "none.json",
-                recorded=Recorded(open_log(ROOT / "samples/crossing"), 8_000_000),
-            )
+            recorded = Recorded(open_log(ROOT / "samples/crossing"), 8_000_000)
+            studio = Studio(Scenario.load(sample), work / "none.json", recorded=recorded)
             threading.Thread(target=studio.serve, daemon=True).start()
             front = "[...document.querySelectorAll('#cameras button')].find((b) => b.textContent === 'front').click()"
+            chosen = f"log2sim.time = 1; {front}; log2sim.choose('cyclist-1')"
             move = "document.getElementById('studio-move').click()"
-            photograph(
-                browser, "corrections", studio.address, f"log2sim.time = 1; {front}; log2sim.choose('cyclist-1')", move
-            )
+            photograph(browser, "corrections", studio.address, chosen, move)
             studio.close()
         if "batch" in names:
             if not (work / "batch").is_dir():

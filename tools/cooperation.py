@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from cooperation_worlds import blind_area, curve, hidden_traffic, overlap
-from cooperation_worlds.runs import ALONE, WAYS, prepared
+from cooperation_worlds.runs import ALONE, NAMES, prepared
 from cooperation_worlds.world import disturb, log_of
 from entry import run
 
@@ -22,7 +22,7 @@ from entry import run
 TESTS: dict[str, Any] = {"range": curve, "blind_area": blind_area, "overlap": overlap, "ap": hidden_traffic}
 
 
-def main(test: str, variants: int = 50, seed: int = 0, ways: str = ",".join(WAYS), noise: float = 0.0, delay: bool = True,
+def main(test: str, variants: int = 50, seed: int = 0, ways: str = ",".join(NAMES), noise: float = 0.0, delay: bool = True,
          register: bool = True, every: int = 1) -> None:  # fmt: skip
     """Run a test and print its table."""
     worlds: list[Any] = []

@@ -38,13 +38,9 @@ def main(edges: bool = False) -> None:
 
 def module_graph(package: Path) -> dict[str, set[str]]:
     """Modules of the package and the modules that each imports, lazily or not; names without the package's own."""
-    files = {_name(f, package): f for f in sorted(package.rglob("*.py"))}
+    dotted = {f: ".".join(f.relative_to(package).with_suffix("").parts) for f in sorted(package.rglob("*.py"))}
+    files = {name.removesuffix(".__init__"): f for f, name in dotted.items()}
     return {name: set(_imports(file, files)) - {name} for name, file in files.items()}
-
-
-def _name(file: Path, package: Path) -> str:
-    parts = file.relative_to(package).with_suffix("").parts
-    return ".".join(parts).removesuffix(".__init__")
 
 
 def _imports(file: Path, known: Mapping[str, Path]) -> Iterator[str]:

@@ -98,14 +98,12 @@ def main(only: str = "", tests: list[str] = [], jobs: int = os.cpu_count() or 1)
             command = [sys.executable, "-m", "pytest", "-x", "--no-header", "-p", "no:cacheprovider", *files]
             if tests and jobs > 1:
                 command += ["--numprocesses", str(jobs), "--dist", "loadfile"]
-            run = subprocess.run(
-                command, cwd=checkout, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-            )
+            env = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+            run = subprocess.run(command, cwd=checkout, capture_output=True, text=True, env=env)
             failed = [line.split(" ")[1] for line in run.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
             missed += not failed
-            print(
-                f"{mutant[0]:34} {time.monotonic() - begin:5.0f} s  {failed[0] if failed else 'NOT CAUGHT'}", flush=True
-            )
+            noticed = failed[0] if failed else "NOT CAUGHT"
+            print(f"{mutant[0]:34} {time.monotonic() - begin:5.0f} s  {noticed}", flush=True)
     return min(missed, 1)
 
 

@@ -69,9 +69,8 @@ def rows_of(scene: Scene, seeds: int) -> list[str]:
             told = (findings.offset_s != 0, turn != 0, any((*tilt, *findings.shift_m)))
             late, yaw = found.values[OFFSET] + case.offset_s, found.values[YAW] + np.radians(case.yaw_deg)
             sigma = found.sigma[[OFFSET, YAW]]
-            figures.append(
-                [*told, late, yaw, *sigma, (late / sigma[0]) ** 2, (yaw / sigma[1]) ** 2, found.shows_offset]
-            )
+            nees = (late / sigma[0]) ** 2, (yaw / sigma[1]) ** 2
+            figures.append([*told, late, yaw, *sigma, *nees, found.shows_offset])
         lines.append(line(case.name, np.array(figures, dtype=np.float64)))
     return lines
 

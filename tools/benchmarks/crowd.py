@@ -38,9 +38,8 @@ def main(frames: int = 200, seeds: int = 3, online: bool = False) -> None:
                 seconds += time.process_time() - begin
             score = evaluate(found, labels, "Pedestrian")
             name = f"{count} people, {'stands' if speed_mps == 0 else f'{speed_mps:g} m/s'}"
-            rows.append(
-                [name, *(f"{v:.2f}" for v in score[:6]), *map(str, score[6:]), f"{frames * seeds / seconds:.0f}"]
-            )
+            speed = f"{frames * seeds / seconds:.0f}"
+            rows.append([name, *(f"{v:.2f}" for v in score[:6]), *map(str, score[6:]), speed])
     print(markdown(["crowd", *HEAD[1:], "frames/s"], rows))
 
 
@@ -69,9 +68,8 @@ def make_crowd(count: int, frames: int, speed_mps: float, seed: int) -> tuple[Bo
         sigma_m = 0.08 + 0.002 * at[kept, :1]
         where = np.concatenate([at[kept] + sigma_m * rng.normal(size=(len(kept), 2)), false])
         turned = np.concatenate([yaw[kept] + 0.2 * rng.normal(size=len(kept)), rng.uniform(-3, 3, len(false))])
-        sizes = np.concatenate(
-            [size[kept] * rng.normal(1, 0.04, (len(kept), 3)), np.tile([1.7, 0.6, 0.7], (len(false), 1))]
-        )
+        own = size[kept] * rng.normal(1, 0.04, (len(kept), 3))
+        sizes = np.concatenate([own, np.tile([1.7, 0.6, 0.7], (len(false), 1))])
         score = np.concatenate([rng.normal(2.5 - hidden[kept], 1.0), rng.normal(-0.5, 1.0, len(false))])
         detected.append(_boxes(frame, np.full(len(where), -1), where, turned, sizes, score))
     ego = np.column_stack([speed_mps * PERIOD_S * np.arange(frames), np.zeros((frames, 2))])

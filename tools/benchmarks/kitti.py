@@ -64,11 +64,9 @@ def main(folder: Path, online: bool = False, fit: bool = False, results: Path | 
         print(f"{frames} frames, {frames / seconds:.0f} a second of processor time without reading\n")
     labels = {name: read_tracks(folder / "label_02" / f"{name}.txt") for name in told}
     if fit:
-        for seen in (True, False):
-            print(
-                "detected" if seen else "predicted",
-                weights_of([name for name in LEARNED if name in labels], described, labels, seen=seen),
-            )
+        learned = [name for name in LEARNED if name in labels]
+        for kind, seen in (("detected", True), ("predicted", False)):
+            print(kind, weights_of(learned, described, labels, seen=seen))
         told = {name: told_by_others(name, described, labels, online=online) for name in told}
     scores = {category: evaluate(told, labels, category) for category in CATEGORIES}
     print(markdown(HEAD, [[c, *(f"{v:.2f}" for v in s[:6]), *map(str, s[6:])] for c, s in scores.items()]))

@@ -132,9 +132,8 @@ def lateral_errors(document: dict, camera: Camera, found: PictureMarkings) -> li
                     rows += list(zip(points[inside, 0], error))
     out = []
     for low, high in SPANS_M:
-        error = [e for x, e in rows if low <= x < high]
-        median = f"lateral error {low:.0f}-{high:.0f} m: {np.median(error):.2f} m" if error else ""
-        out.append(median or f"{low:.0f}-{high:.0f} m: none")
+        error, span = [e for x, e in rows if low <= x < high], f"{low:.0f}-{high:.0f} m"
+        out.append(f"lateral error {span}: {np.median(error):.2f} m" if error else f"{span}: none")
     return out
 
 

@@ -153,10 +153,8 @@ def measure(scene: Scene, rig: Rig, folder: Path, seed: int = 1) -> dict[str, An
     write_synthetic(scene, folder, seed=seed)
     log = with_rig(open_log(folder), rig)
     detector = "labels" if log.cameras else "lidar:labels"
-    scenario, truth = (
-        reconstruct(log, Config.load(detect={"name": detector})).scenario,
-        Scenario.load(folder / "truth.json"),
-    )
+    scenario = reconstruct(log, Config.load(detect={"name": detector})).scenario
+    truth = Scenario.load(folder / "truth.json")
     figures = evaluate(scenario, truth)["map_features"] or {}
     return figures | {"standing_out_m": lengths_that_stand_out(map_ground(log, scenario), scenario, truth)}
 
@@ -167,9 +165,8 @@ def summary(all_found: list[dict[str, Any]]) -> str:
 
     def mean(of: str, name: str, length: str) -> float:
         lines = [f[of] for f in all_found if f.get(of)]
-        return sum((line[name] or 0.0) * line[length] for line in lines) / max(
-            sum(line[length] for line in lines), 1e-9
-        )
+        total = sum(line[length] for line in lines)
+        return sum((line[name] or 0.0) * line[length] for line in lines) / max(total, 1e-9)
 
     lines, borders = (
         (mean(of, "precision", "found_m"), mean(of, "recall", "true_m")) for of in ("lane_lines", "borders")

@@ -55,9 +55,8 @@ def scene_of(kind: str, pose: str, *, second: bool) -> Scene:
         return {"waypoints": rows} | ({} if mps else {"wait_s": [[0, 60.0]]})
 
     def agent(name: str, of: str, size_m: tuple[float, float, float], at: Array) -> dict[str, Any]:
-        where = (
-            moving(at - 0.3 * size_m[0] * heading, heading, speed) if speed else {"pose": [*map(float, at), yaw_deg]}
-        )
+        axle = at - 0.3 * size_m[0] * heading
+        where = moving(axle, heading, speed) if speed else {"pose": [*map(float, at), yaw_deg]}
         return {"id": name, "category": of, "size_m": list(size_m)} | where
 
     agents = [agent("target", category, size, center)]

@@ -8,7 +8,7 @@ Needs the packages pypatchworkpp and open3d; what is right is counted where a lo
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -99,16 +99,14 @@ def of_sweeps(path: Path) -> tuple[list[list[Any]], list[list[Any]]]:
         points = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.xyz[rows].astype(np.float64)))
         labels, ms = timed(points.cluster_dbscan, APART_M, CORE_POINTS)
         clusters.setdefault("Open3D, DBSCAN", []).append((ms, *count_clustered(np.array(labels), objects, rows)))
-    about_ground = [
-        [log.name, name, f"{np.median([r[0] for r in of]):.1f}", *(_share([r[k] for r in of]) for k in (1, 2))]
-        for name, of in ground.items()
-    ]
-    about_clusters = []
+    about_ground, about_clusters = [], []
+    for name, of in ground.items():
+        ms, of_bodies, of_all = zip(*of)
+        about_ground.append([log.name, name, f"{np.median(ms):.1f}", _share(of_bodies), _share(of_all)])
     for name, of in clusters.items():
-        own, total = (sum(r[k] for r in of) for k in (1, 2))
-        about_clusters.append(
-            [log.name, name, f"{np.median([r[0] for r in of]):.1f}", f"{own} of {total}" if total else "-"]
-        )
+        ms, own, total = zip(*of)
+        found = f"{sum(own)} of {sum(total)}" if sum(total) else "-"
+        about_clusters.append([log.name, name, f"{np.median(ms):.1f}", found])
     return about_ground, about_clusters
 
 
@@ -116,7 +114,7 @@ def _mean(marked: Array) -> float:
     return float(marked.mean()) if len(marked) else np.nan
 
 
-def _share(values: list[float]) -> str:
+def _share(values: Sequence[float]) -> str:
     known = [value for value in values if np.isfinite(value)]
     return f"{np.mean(known):.3f}" if known else "-"
 
@@ -142,8 +140,7 @@ def main(logs: list[Path], model: Path | None = None) -> None:
     cv2.setNumThreads(1)
     sweeps = [of_sweeps(path) for path in logs]
     pictures = [of_pictures(path, [IMAGE_DETECTOR, *([] if model is None else [str(model)])]) for path in logs]
-    print(
-        markdown(["log", "ground by", "ms", "of bodies called ground", "of all"], [r for of, _ in sweeps for r in of])
-    )
-    print(markdown(["log", "clusters by", "ms", "objects with a cluster"], [r for _, of in sweeps for r in of]))
+    about_ground, about_clusters = ([row for of in about for row in of] for about in zip(*sweeps))
+    print(markdown(["log", "ground by", "ms", "of bodies called ground", "of all"], about_ground))
+    print(markdown(["log", "clusters by", "ms", "objects with a cluster"], about_clusters))
     print(markdown(["log", "detector", "picture, px", "ms"], [r for of in pictures for r in of]))

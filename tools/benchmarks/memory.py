@@ -58,13 +58,8 @@ def measure(path: str, times: int, world: bool) -> dict[str, Any]:
 
 
 def _run(code: str, job: list[Any]) -> Any:
-    ran = subprocess.run(
-        [sys.executable, "-c", code, json.dumps(job)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).parents[1],
-    )
+    command = [sys.executable, "-c", code, json.dumps(job)]
+    ran = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     if ran.returncode:
         raise SystemExit(ran.stderr)
     return json.loads(ran.stdout.splitlines()[-1])

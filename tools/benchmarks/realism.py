@@ -27,10 +27,10 @@ COUNT, HORIZON_S, EVERY_S = 32, 8.0, 8.0
 Results = dict[str, list[Realism]]
 
 
-def moments(scenario: Scenario, every_s: float, horizon_s: float) -> list[float]:
+def moments(scenario: Scenario) -> list[float]:
     """Return times from which agents can be simulated: with a past, and half the horizon at least to compare with."""
     w = max(scenario.agents, key=lambda a: len(a.waypoints)).waypoints
-    wanted = np.arange(w.t_s[0] + HISTORY_S, w.t_s[-1] - min(horizon_s, w.t_s[-1] - w.t_s[0] - HISTORY_S) / 2, every_s)
+    wanted = np.arange(w.t_s[0] + HISTORY_S, w.t_s[-1] - min(HORIZON_S, w.t_s[-1] - w.t_s[0] - HISTORY_S) / 2, EVERY_S)
     # Where others have waypoints, too, so that nothing is taken from later ones.
     rows = np.unique(np.searchsorted(w.t_s, wanted - TICK_S / 4))
     return [float(t) for t in w.t_s[rows]]
@@ -44,7 +44,7 @@ def main(logs: list[Path], each: bool = False) -> None:
         before = {model: len(results) for model, results in found.items()}
         lanes = scenario.map_features.lanes if scenario.map_features else ()
         road = Road(lanes) if lanes else None
-        for now_s in moments(scenario, EVERY_S, HORIZON_S):
+        for now_s in moments(scenario):
             log, now = recorded(scenario, now_s, HORIZON_S)
             who = judged(log, now)
             agents += len(who)

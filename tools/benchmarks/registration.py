@@ -210,10 +210,8 @@ def misplaced(log: Log, pole: str, shift_m: float, turn_deg: float) -> Log:
 def disturbed(log: Log, pole: str, shift_m: float, turn_deg: float, delay_s: float, rng: np.random.Generator) -> Log:
     """Move and turn a LiDAR of the roadside in a random direction, and let its stamps be late."""
     shift, axis = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    error, mount = (
-        exp_of(np.concatenate([shift_m * shift, np.radians(turn_deg) * axis])),
-        log.lidars[pole].mount_T_lidar,
-    )
+    error = exp_of(np.concatenate([shift_m * shift, np.radians(turn_deg) * axis]))
+    mount = log.lidars[pole].mount_T_lidar
     log = remounted(log, pole, transform(error[:3, :3] @ mount[:3, :3], mount[:3, 3] + error[:3, 3]))
     return log.changed(streams={**log.streams, pole: shift_stream(log.streams[pole], round(delay_s * NS_PER_S))})
 

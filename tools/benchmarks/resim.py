@@ -71,9 +71,8 @@ def compare(shots: Shots, sweep: Sweep, rows: Array) -> Figures:
     }  # fmt: skip
     if sweep.intensity is not None and np.isfinite(shots.intensity[near]).any():
         strength[rows] = sweep.intensity
-        figures["intensity"] = float(
-            np.nanmedian(np.abs(strength - shots.intensity)[near]) / np.nanmean(shots.intensity[near])
-        )
+        off = np.nanmedian(np.abs(strength - shots.intensity)[near])
+        figures["intensity"] = float(off / np.nanmean(shots.intensity[near]))
     return figures | chamfer(true, sweep.xyz_m[simulated[rows] < LIMIT_M])
 
 
@@ -172,21 +171,20 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World, first
     out: tuple[list[Figures], list[Figures]] = [], []
 
     all_found: tuple[list[Boxes3D], list[Boxes3D]] = [], []
-    chosen = np.arange(first, len(log.streams[name].t_ns), EVERY)
+    t_ns = log.streams[name].t_ns
+    chosen = np.arange(first, len(t_ns), EVERY)
 
     def boxes(i: int, sweep: Sweep, kept: list[Boxes3D]) -> Array:
-        origin, ground_z = cloud_origin(log, int(log.streams[name].t_ns[i]))
+        origin, ground_z = cloud_origin(log, int(t_ns[i]))
         cloud = assemble_cloud(log, {name: sweep}, origin=origin, ground_z=ground_z, max_range_m=50.0)
         found = detector.detect(cloud)
         kept.append(found)
-        here = log.map_T_sensor(name, log.streams[name].t_ns[i])[0][0][:2, 3]
+        here = log.map_T_sensor(name, t_ns[i])[0][0][:2, 3]
         sure = (found.score > 0.5) & (np.linalg.norm(found.center_m[:, :2] - here, axis=1) < 30)
         return np.column_stack([found.center_m[:, :2], found.size_m[:, :2], found.yaw_rad])[sure]
 
     for i in chosen.tolist():
-        sweep = simulation.cast(
-            name, simulation.shots(name, i), log, int(log.streams[name].t_ns[i]), np.random.default_rng(i)
-        )[0]
+        sweep, _ = simulation.cast(name, simulation.shots(name, i), log, int(t_ns[i]), np.random.default_rng(i))
         recorded = log.streams[name].read(i)
         shots = recorded_shots(log, name, recorded)
         noisy_m = np.random.default_rng(i).normal(shots.range_m, world.models[name].noise_m)
@@ -199,7 +197,7 @@ def boxes_in_sweeps(log: Log, scenario: Scenario, name: str, world: World, first
     rows = [("boxes in sweeps", shares(out[0])), ("noise drawn again", shares(out[1]))]
     for title, found in zip(("recorded sweeps", "simulated sweeps"), all_found):
         if log.labels is not None:
-            detected = DetectedBoxes(log.name, "lidar:vehicle", log.streams[name].t_ns[chosen], tuple(found))
+            detected = DetectedBoxes(log.name, "lidar:vehicle", t_ns[chosen], tuple(found))
             rows.append((title, average_precision(detected, log)))
     return rows
 
@@ -312,9 +310,8 @@ def sweeps_sideways(scene_path: Path, meters: list[float], degrees: list[float])
         true_log = synthesize(scene.model_copy(update={"lidar": lidars}), observe=False)[0].changed(ego=log.ego)
         simulation, figures = Simulation(log, world, truth), []
         for i in range(0, len(log.streams[name].t_ns), EVERY_SIDEWAYS):
-            shots = all_shots(
-                recorded_shots(true_log, name, true_log.streams[name].read(i)), world.models[name].pattern
-            )
+            recorded = recorded_shots(true_log, name, true_log.streams[name].read(i))
+            shots = all_shots(recorded, world.models[name].pattern)
             sweep, rows = simulation.cast(name, shots, true_log, 0, np.random.default_rng(i))
             figures.append(compare(shots, sweep, rows))
         out.append((f"{turned_deg:g} degrees turned" if turned_deg else f"{off_m:g} m sideways", mean(figures)))

@@ -97,7 +97,7 @@ def _controls(maneuver: str, t: Array) -> tuple[Array, Array]:
     raise ValueError(f"unknown maneuver {maneuver!r}; known: {', '.join(MANEUVERS)}")
 
 
-def worlds(sigma_m: float, outlier_share: float = 0.0, seeds: int = 6) -> Iterator[World]:
+def worlds(sigma_m: float, outlier_share: float, seeds: int) -> Iterator[World]:
     """Every maneuver with every seed; outliers are off by a Gaussian of 5 to 20 sigma."""
     for maneuver in MANEUVERS:
         truth = truth_of(maneuver)
@@ -124,7 +124,7 @@ def errors_of(truth: Truth, xy_m: Array, velocity_mps: Array, yaw_rad: Array, cu
     return np.array([rms(off[0]), rms(off[1]), rms(turned[moving]), rms(bent)])
 
 
-def rate_worlds(maneuver: str, rate_hz: int, sigma_m: float, seeds: int = 6) -> Iterator[tuple[Truth, Array, Array]]:
+def rate_worlds(maneuver: str, rate_hz: int, sigma_m: float, seeds: int) -> Iterator[tuple[Truth, Array, Array]]:
     """The truth at 20 Hz, and times (n,) and noisy positions (n, 2) at another rate that divides it, by seed."""
     truth = truth_of(maneuver, 1.0 / RATES_HZ[-1])
     rows = np.arange(0, len(truth.t_s), RATES_HZ[-1] // rate_hz)
@@ -200,14 +200,13 @@ def kalman(t: Array, xy: Array, sigma: float, *, density: float) -> Result:
 def smoothers() -> dict[str, Smoother]:
     gcv = partial(spline, fit=lambda t, z, _: make_smoothing_spline(t, z))
     fixed = partial(spline, fit=lambda t, z, sigma: make_smoothing_spline(t, z, lam=0.1 * np.sqrt(sigma / 0.3)))
+    by_sigma = partial(spline, fit=lambda t, z, sigma: UnivariateSpline(t, z, k=5, s=len(t) * sigma**2))
     out: dict[str, Smoother] = {
         "log2sim": log2sim,
         "raw, differences": partial(filtered, window=0),
         "SciPy make_smoothing_spline, GCV": gcv,
         "SciPy make_smoothing_spline, fixed penalty": fixed,
-        "SciPy UnivariateSpline, s = n sigma^2": partial(
-            spline, fit=lambda t, z, sigma: UnivariateSpline(t, z, k=5, s=len(t) * sigma**2)
-        ),
+        "SciPy UnivariateSpline, s = n sigma^2": by_sigma,
         **{f"SciPy savgol_filter {window}/3": partial(filtered, window=window) for window in (15, 25)},
     }
     if optional("filterpy") is not None:
@@ -313,11 +312,8 @@ def smooth_told(
         if k:
             mean, covariance = mean @ step.T, step @ covariance @ step.T + unit * np.tile(by_axis[:, k - 1], (1, 3, 3))
         predicted.append((mean, covariance))
-        gain = (
-            covariance[:, :, :2]
-            @ np.linalg.inv(covariance[:, :2, :2] + sigma_m**2 * np.eye(2))
-            * valid[:, k, None, None]
-        )
+        precision = np.linalg.inv(covariance[:, :2, :2] + sigma_m**2 * np.eye(2))
+        gain = covariance[:, :, :2] @ precision * valid[:, k, None, None]
         mean = mean + np.einsum("bij,bj->bi", gain, xy[:, k] - mean[:, :2])
         covariance = covariance - gain @ covariance[:, :2]
         filtered.append((mean, covariance))
@@ -327,20 +323,15 @@ def smooth_told(
         mean = m + np.einsum("bij,bj->bi", gain, mean - ahead)
         covariance = c + gain @ (covariance - spread) @ np.swapaxes(gain, 1, 2)
         smoothed.append((mean, covariance))
-    return tuple(
-        np.stack(columns[::-1], axis=1) for columns in zip(*((m[:, :2], c[:, 0, 0] + c[:, 1, 1]) for m, c in smoothed))
-    )  # type: ignore[return-value]
+    means, covariances = (np.stack(columns[::-1], axis=1) for columns in zip(*smoothed))
+    return means[..., :2], covariances[..., 0, 0] + covariances[..., 1, 1]
 
 
 def cramer_rao_m(density: float, sigma_m: float) -> float:
     """Least root mean square position error of any estimator of motions with white jerk that knows its density and the noise."""
-    told = (
-        np.full((1, FRAMES - 1, 2), density**2),
-        np.zeros(FRAMES),
-        np.zeros((1, FRAMES, 2)),
-        np.ones((1, FRAMES), bool),
-    )
-    return float(np.sqrt(smooth_told(*told, sigma_m)[1].mean()))
+    densities, valid = np.full((1, FRAMES - 1, 2), density**2), np.ones((1, FRAMES), bool)
+    variance = smooth_told(densities, np.zeros(FRAMES), np.zeros((1, FRAMES, 2)), valid, sigma_m)[1]
+    return float(np.sqrt(variance.mean()))
 
 
 def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, float, float]:
@@ -349,7 +340,7 @@ def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, f
     Of the motions with white jerk those that have the maneuver's: the densities with which the smoother that is told them errs least on
     the maneuver itself, constant along and across, or in proportion to the mean of the squared true jerk within some second.
     """
-    cases = [world for world in worlds(sigma_m, seeds=seeds) if world.maneuver == maneuver]
+    cases = [world for world in worlds(sigma_m, 0.0, seeds) if world.maneuver == maneuver]
     truth = cases[0].truth
     velocity = truth.velocity_mps
     jerk = np.gradient(np.gradient(velocity, PERIOD_S, axis=0), PERIOD_S, axis=0)[1:]
@@ -364,9 +355,8 @@ def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, f
     bounds = []
     for family in families:
         rows, n = np.repeat(np.arange(len(cases)), len(family)), len(family)
-        found, variance = smooth_told(
-            np.tile(family, (len(cases), 1, 1)), truth.yaw_rad, xy[rows], valid[rows], sigma_m
-        )
+        densities = np.tile(family, (len(cases), 1, 1))
+        found, variance = smooth_told(densities, truth.yaw_rad, xy[rows], valid[rows], sigma_m)
         off = ((found - truth.xy_m) ** 2).sum(axis=2).mean(axis=1).reshape(-1, n).mean(axis=0)
         bounds.append(float(np.sqrt(variance.mean(axis=1).reshape(-1, n).mean(axis=0)[np.argmin(off)])))
     ours = [log2sim(ALL_S[w.valid], w.xy_m[w.valid], sigma_m)[0] - truth.xy_m for w in cases]

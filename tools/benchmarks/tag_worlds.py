@@ -143,9 +143,8 @@ def _on_road(s: np.ndarray, d: np.ndarray, bend: float) -> tuple[np.ndarray, np.
     at = np.arange(-300.0, 1200.0, 0.1)
     curvature = np.sin(2 * np.pi * at / 500.0) / 300.0 if bend == WINDING else np.full(len(at), bend)
     heading = np.cumsum(curvature) * 0.1
-    x, y, h = (
-        np.interp(s, at, c) for c in (np.cumsum(np.cos(heading)) * 0.1, np.cumsum(np.sin(heading)) * 0.1, heading)
-    )
+    middle = np.cumsum(np.cos(heading)) * 0.1, np.cumsum(np.sin(heading)) * 0.1
+    x, y, h = (np.interp(s, at, c) for c in (*middle, heading))
     return x - d * np.sin(h), y + d * np.cos(h)
 
 
@@ -162,13 +161,13 @@ def _map_lanes(bend: float, sign: float) -> tuple[MapLane, ...]:
 
 
 def _agent(id: str, x: np.ndarray, y: np.ndarray, t: np.ndarray, speed: np.ndarray | None, rate_hz: float, noise_m: float,
-           rng: np.random.Generator, category: str = "car", size: tuple = CAR, begin_s: float = 0.0) -> Agent:  # fmt: skip
+           rng: np.random.Generator, category: str = "car", size: tuple = CAR) -> Agent:  # fmt: skip
     yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
     pace = np.hypot(np.gradient(x, t), np.gradient(y, t)) if speed is None else speed
     moves = pace > 0.05
     yaw = np.interp(t, t[moves], yaw[moves]) if moves.any() else np.zeros(len(t))
     at = np.arange(0.0, t[-1] + 1e-9, 1.0 / rate_hz)
-    n = len(at := at[at >= begin_s])
+    n = len(at)
     columns = [np.interp(at, t, c) for c in (x, y, yaw, pace)]
     known = {}
     if noise_m:
@@ -223,14 +222,14 @@ class Stage:
         return np.arange(0.0, self.duration_s + FINE_S / 2, FINE_S)
 
     def add(self, id: str, line: np.ndarray, speed: np.ndarray | float, start_m: float = 0.0, category: str = "car",
-            size: tuple = CAR, begin_s: float = 0.0) -> np.ndarray:  # fmt: skip
+            size: tuple = CAR) -> np.ndarray:  # fmt: skip
         """Add an agent and return its stations; the route is long enough for it."""
         pace = np.broadcast_to(np.asarray(speed, dtype=float), self.t.shape)
         s = start_m + np.concatenate([[0.0], np.cumsum((pace[1:] + pace[:-1]) / 2) * FINE_S])
         assert s[-1] <= (len(line) - 1) * 0.05 + 0.1, id
         x, y = along(line, s)
         y = -y if self.mirrored else y
-        agent = _agent(id, x, y, self.t, pace.copy(), self.rate_hz, self.noise_m, self.rng, category, size, begin_s)
+        agent = _agent(id, x, y, self.t, pace.copy(), self.rate_hz, self.noise_m, self.rng, category, size)
         if not pace.any():
             heading = np.arctan2(*((line[1] - line[0]) * [1, -1 if self.mirrored else 1])[::-1])
             w = agent.waypoints
@@ -401,10 +400,8 @@ def oncoming(stage: Stage) -> World:
     meet = back + rng.uniform(1.5, 2.5)
     at = x0 + v * meet
     stage.add("ego", route([(at + w * meet, 1.75), (at - 300, 1.75)], 5.0), w)
-    follows, times = (
-        ("cut_in", "cut_out", "approaching", "near_miss", "following"),
-        (1, 2, 3.25, beside, back - 1, back, back + 2),
-    )
+    follows = ("cut_in", "cut_out", "approaching", "near_miss", "following")
+    times = (1, 2, 3.25, beside, back - 1, back, back + 2)
     events = [
         Event("overtaking", "car-1", "car-2", beside), Event("oncoming_in_lane", "car-1", "ego", back - 1.0, sure=meet - back < 4.0),
         *maybe(("oncoming_in_lane", "near_miss", "crossing_path"), "car-1", "ego", (beside, back, meet)),

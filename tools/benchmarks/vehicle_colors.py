@@ -97,9 +97,8 @@ def street(light: str, weather: str, k: int) -> tuple[Log, Scenario]:
         {"id": name, "category": "car", "color": list(STREET[name][k]), "pose": [9.0 * i, -5.2 if i % 2 else 5.2, 0.0]}
         for i, name in enumerate(names)
     ]
-    environment = {"light": light, "weather": weather} | {"fog": {"visibility_m": 100}, "rain": {"rain_mm_h": 5}}.get(
-        weather, {}
-    )
+    strength = {"fog": {"visibility_m": 100}, "rain": {"rain_mm_h": 5}}.get(weather, {})
+    environment = {"light": light, "weather": weather} | strength
     camera = {"name": "front", "position_m": [1.6, 0, 1.5], "fov_deg": 75, "size_px": [640, 400], "rate_hz": 2}
     table = {
         "name": "street", "duration_s": 8.0, "environment": environment, "agent": cars, "camera": [camera],

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from kitti.boxes import Boxes, View, in_map, read_tracks, read_view
+from kitti.boxes import in_map, read_tracks, read_view
 
 from log2sim.datatypes import EGO, Agent, EgoVehicle, Scenario, Waypoints
 from log2sim.evaluation.metrics.truth import is_static, speed_along, truth_from_log
@@ -88,17 +88,12 @@ def kitti_tracking(folder: Path) -> Iterator[tuple[str, Scenario]]:
         view, rows = read_view(folder / "calib" / labels.name, motion, frames), read_tracks(labels)
         rows = rows.take(np.isin(rows.category, list(CATEGORY_OF)) & (rows.frame < frames))
         kind = np.array([CATEGORY_OF[name] for name in rows.category.tolist()])
-        agents = [
-            _labeled(f"{of}-{number}", of, rows.take((rows.track_id == number) & (kind == of)), view)
-            for number, of in dict.fromkeys(zip(rows.track_id.tolist(), kind.tolist()))
-        ]
+        agents = []
+        for number, of in dict.fromkeys(zip(rows.track_id.tolist(), kind.tolist())):
+            own = rows.take((rows.track_id == number) & (kind == of))
+            size = tuple(np.median(own.size_hwl_m[:, ::-1], axis=0).tolist())
+            agents.append(_agent(f"{of}-{number}", of, size, own.frame * PERIOD_S, *in_map(own, view)))
         yield labels.stem, Scenario(labels.stem, 0, frames * PERIOD_S, (_kitti_ego(view.map_T_cam), *agents))
-
-
-def _labeled(name: str, kind: str, rows: Boxes, view: View) -> Agent:
-    """An agent from its labels."""
-    size = tuple(np.median(rows.size_hwl_m[:, ::-1], axis=0).tolist())
-    return _agent(name, kind, size, rows.frame * PERIOD_S, *in_map(rows, view))
 
 
 def _kitti_ego(map_T_cam: np.ndarray) -> Agent:

@@ -210,15 +210,14 @@ def figures(rows: dict[str, list[BoxesOfSweep]]) -> dict[str, Any]:
     ap: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
     recall: dict[str, dict[str, float]] = {"seen": {}, "hidden": {}}
     for way, of_way in rows.items():
-        for kind in KINDS:
-            criterion = Criterion("iou_bev", IOU[kind])
-            found, truth = (SceneBoxes.join([sweep[kind][k] for sweep in of_way]) for k in (0, 1))
-            ap[kind][way] = precision_recall(found, match_detections(found, truth, criterion)).average()
-        found, truth = (SceneBoxes.join([sweep["vehicle"][k] for sweep in of_way]) for k in (0, 1))
+        tables = {kind: [SceneBoxes.join([sweep[kind][k] for sweep in of_way]) for k in (0, 1)] for kind in KINDS}
+        for kind, (found, truth) in tables.items():
+            matches = match_detections(found, truth, Criterion("iou_bev", IOU[kind]))
+            ap[kind][way] = precision_recall(found, matches).average()
+        found, truth = tables["vehicle"]
         hidden = np.concatenate([sweep["vehicle"][2] for sweep in of_way])
-        right = match_detections(
-            found.take(found.score >= REPORTED_SCORE), truth, Criterion("iou_bev", IOU["vehicle"])
-        ).truth
+        sure = found.take(found.score >= REPORTED_SCORE)
+        right = match_detections(sure, truth, Criterion("iou_bev", IOU["vehicle"])).truth
         got = np.isin(np.arange(len(truth)), right[right >= 0])
         for name, of in (("seen", ~hidden), ("hidden", hidden)):
             counted = ~truth.ignored & of

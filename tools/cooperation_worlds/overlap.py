@@ -88,7 +88,7 @@ def _drawn(out: Builder) -> World:
     return out.world(DURATION_S, "target")
 
 
-MATCH_M = 2.5
+MATCH_M, MIN_SCORE = 2.5, 0.3
 MARGIN_S = 0.15  # at both ends of the log, where a sweep may be missing
 # From here on a difference of IoU is more than the noise of a few sweeps.
 WORSE_BY = 0.01
@@ -123,19 +123,18 @@ def of_scenario(world: World, log: Log, way: str) -> Array:
     return best
 
 
-def from_boxes(world: World, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D], min_score: float = 0.3) -> Array:
+def from_boxes(world: World, t_ns: NDArray[np.int64], boxes: Sequence[Boxes3D]) -> Array:
     """Overlap and IoU (F, 2) of the best-scored box at the target's place in each sweep, each at the box's own time."""
     category = world.target_actor.spec.category
     out = []
     for stamp, found in zip(t_ns, boxes):
         t_s = (found.t_ns - world.scene.start_ns) / NS_PER_S
-        inside = MARGIN_S <= (stamp - world.scene.start_ns) / NS_PER_S <= world.scene.duration_s
-        if not inside:
+        if not MARGIN_S <= (stamp - world.scene.start_ns) / NS_PER_S <= world.scene.duration_s:
             continue
         truth = target_boxes(world, t_s)
         group = np.array([GROUP_OF[c] == GROUP_OF[category] for c in found.category], bool)
         away = np.linalg.norm(found.center_m[:, :2] - truth[:, :2], axis=1)
-        near = group & (away < MATCH_M) & (found.score >= min_score)
+        near = group & (away < MATCH_M) & (found.score >= MIN_SCORE)
         if not near.any():
             out.append(np.zeros(2))
             continue
@@ -172,15 +171,6 @@ def table(_: Sequence[World], rows: dict[str, list[tuple[Array, Array]]]) -> str
             overlap, iou = np.nanmean(m, axis=0)
             gains = iou - best_on_average, np.nanmean(m[:, 1] - better)
             worse = int(np.sum(m[:, 1] < better - WORSE_BY))
-            lines.append(
-                [
-                    NAMES[way],
-                    of,
-                    f"{share:.2f}",
-                    f"{overlap:.3f}",
-                    f"{iou:.3f}",
-                    *(f"{g:+.3f}" for g in gains),
-                    str(worse),
-                ]
-            )
+            measures = [f"{share:.2f}", f"{overlap:.3f}", f"{iou:.3f}", *(f"{g:+.3f}" for g in gains)]
+            lines.append([NAMES[way], of, *measures, str(worse)])
     return markdown(HEAD, lines)

@@ -16,9 +16,9 @@ from log2sim.evaluation.detection.detect_log import detect_log
 from log2sim.geometry import NS_PER_S
 from log2sim.pipeline import reconstruct, start
 
+# Ways of perceiving: an end alone, or both at a level of fusion.
+NAMES = {"vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes"}
 ALONE = ("vehicle", "road")
-LEVELS = ("points", "boxes")
-WAYS = (*ALONE, *LEVELS)
 # Both LiDARs stand level, so both are searched by the network for such ones, as the ends are where their boxes are joined.
 DETECTOR = "lidar:vehicle"
 ROUNDED_S = 0.06  # a tick is there until its neighbors are
@@ -74,6 +74,3 @@ def agents_near(scenario: Scenario | None, category: str) -> list[Agent]:
     """Agents of the group of a category, without the ego."""
     agents = () if scenario is None else scenario.agents
     return [a for a in agents if a.id != "ego" and GROUP_OF[a.category] == GROUP_OF[category]]
-
-
-NAMES = {"vehicle": "vehicle alone", "road": "road alone", "points": "both, points", "boxes": "both, boxes"}

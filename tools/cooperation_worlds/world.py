@@ -111,9 +111,8 @@ def cast(
         part = box((*-half, 0.0), (*half, house.size_m[2]), Material.WALL)
         solids.append(Solid((part,), np.array([*house.center, 0.0]), float(np.deg2rad(house.yaw_deg)), np.zeros(2)))
     solids += world.things
-    returns = cast_polytopes(
-        model_of(spec), sensor, solids, _ground(world.seed), rng, ReturnModel(spec.noise_m, spec.dropout)
-    )
+    noise = ReturnModel(spec.noise_m, spec.dropout)
+    returns = cast_polytopes(model_of(spec), sensor, solids, _ground(world.seed), rng, noise)
     hit = returns.hit
     if spec.mount == "ego":
         # The ego does not see itself; its place among the hits stays free.
@@ -184,12 +183,11 @@ class Builder:
 
     def drive_ego(self, waypoints: Any) -> None:
         """Let the ego, a car of random shape, drive along waypoints (W, 3: x, y, speed) of its box's center at time 0."""
-        (length, width, height), parts = draw_user("car", self.rng)[1]
-        while length > 5.2 or height > VEHICLE_HEIGHT_M - 0.1:
-            (length, width, height), parts = draw_user("car", self.rng)[1]
+        size, parts = self.draw_shape("car")
+        while size[0] > 5.2 or size[2] > VEHICLE_HEIGHT_M - 0.1:
+            size, parts = self.draw_shape("car")
         self.parts["ego"] = parts
-        size = _rounded((length, width, height))
-        self.ego = {"waypoints": waypoints, "size_m": size, "rear_axle_offset_m": round(0.3 * length, 3)}
+        self.ego = {"waypoints": waypoints, "size_m": _rounded(size), "rear_axle_offset_m": round(0.3 * size[0], 3)}
 
     def add(self, name: str, shape: Shape, category: str, **place: Any) -> None:
         """Add a road user of a shape, parked at `pose` (x, y, degrees) or moving along `waypoints`."""
@@ -311,11 +309,11 @@ def disturb(log: Log, seed: int, share: float, *, delayed: bool) -> Log:
 ALONG, ACROSS, UP = (-0.8, 0.0, 0.8), (-0.8, 0.0, 0.8), (0.15, 0.4, 0.65, 0.9)
 
 
-def visible_share(world: World, lidar: str, t_s: Array, target: str = "") -> Array:
+def visible_share(world: World, lidar: str, t_s: Array) -> Array:
     """Share (T,) of points in the target's box that lie within the range of a LiDAR and that no other box hides, at times (T,)."""
     moving, spec = world.moving, next(s for s in world.scene.lidar if s.name == lidar)
     seen = {actor.spec.id: actor for actor in moving.seen_from(spec.mount)}
-    actor = seen.pop(target or world.target)
+    actor = seen.pop(world.target)
     stamps = world.scene.start_ns + np.rint(np.asarray(t_s) * 1e9).astype(np.int64)
     eye = (moving.map_T_mount(spec.mount, stamps) @ mount_T_lidar(spec))[:, :3, 3]
     shares = np.array([(x, y, z) for x in ALONG for y in ACROSS for z in UP])

@@ -149,9 +149,9 @@ def farthest_m(a: Scenario, b: Scenario, shift_m: tuple[float, ...] = (0.0, 0.0)
     return float(max(apart))
 
 
-def same(result: Result, within_m: float, shift_m: tuple[float, ...] = (0.0, 0.0), found: str = "") -> Outcome:
+def same(result: Result, within_m: float, shift_m: tuple[float, ...] = (0.0, 0.0)) -> Outcome:
     error = farthest_m(sound().scenario, result.scenario, shift_m)
-    return Outcome(error <= within_m, found or ("the same" if error <= within_m else "another scenario"), None, error)
+    return Outcome(error <= within_m, "the same" if error <= within_m else "another scenario", None, error)
 
 
 def refused(run: Callable[[], object], words: str) -> Outcome:
@@ -165,7 +165,6 @@ def refused(run: Callable[[], object], words: str) -> Outcome:
 
 def known_and_finite(result: Result, least_agents: int) -> tuple[bool, str]:
     agents = result.scenario.others
-    finite = all(
-        np.isfinite(getattr(a.waypoints, k)).all() for a in result.scenario.agents for k in ("x_m", "y_m", "yaw_rad")
-    )
+    ways = [a.waypoints for a in result.scenario.agents]
+    finite = all(np.isfinite(getattr(way, k)).all() for way in ways for k in ("x_m", "y_m", "yaw_rad"))
     return finite and len(agents) >= least_agents, f"{len(agents)} agents"

@@ -184,10 +184,8 @@ def probabilities(agents: Sequence[Rated], tables: tuple[Weights, Weights]) -> t
 
 def terms_of(a: Rated, kind: str, confidence: float) -> dict[str, float]:
     """Return the means of the terms of a variance at a confidence."""
-    return {
-        n: v * ((1 - confidence) ** 2 if n in ("wrong", "standing", "moving") else 1.0)
-        for n, v in a.terms[kind].items()
-    }
+    wrong = (1 - confidence) ** 2
+    return {n: v * (wrong if n in ("wrong", "standing", "moving") else 1.0) for n, v in a.terms[kind].items()}
 
 
 def fit_variances(terms: Array, squared: Array, least: Array) -> Array:
@@ -363,11 +361,8 @@ def module_text(command: str, agents: Sequence[Rated]) -> str:
     for name, table in (("THERE", there), ("RIGHT", right), ("VARIANCES", variances)):
         lines.append(f"{name} = {{")
         for key, weights in table.items():
-            lines += [
-                f"    {key!r}: {{",
-                *(f"        {n!r}: {float(f'{w:.3g}')}," for n, w in weights.items()),
-                "    },",
-            ]
+            rows = (f"        {n!r}: {float(f'{w:.3g}')}," for n, w in weights.items())
+            lines += [f"    {key!r}: {{", *rows, "    },"]
         lines.append("}")
     lines.append(f"CONFIDENCE = {dict.fromkeys(CONFIDENCE, (0.0, 1.0))}")
     return "\n".join(lines).replace("'", '"')

@@ -106,9 +106,8 @@ class Case:
     truth: Scenario
 
     def second(self) -> Any:
-        return infer_scenario(
-            replace(self.run, clock=StageClock(), plan=self.run.plan.only_agents()), self.observations
-        )
+        run = replace(self.run, clock=StageClock(), plan=self.run.plan.only_agents())
+        return infer_scenario(run, self.observations)
 
 
 @dataclass(frozen=True)
@@ -250,10 +249,8 @@ class MistakenDetector:
             size = np.array(TYPICAL_SIZE_M[str(categories[0])]) * np.exp(rng.normal(0, SEEN_SIZE_SIGMA, 3))
             size = np.clip(size, MIN_SIZE_M[str(categories[0])], MAX_SIZE_M[str(categories[0])])
             # Fronts face -y of the thing; the box is laid against what is seen of them.
-            along, depth = (
-                rng.uniform(-0.4, 0.4) * thing.size_m[0],
-                size[1] / 2 - 0.2 if thing.kind == "building" else 0.0,
-            )
+            along = rng.uniform(-0.4, 0.4) * thing.size_m[0]
+            depth = size[1] / 2 - 0.2 if thing.kind == "building" else 0.0
             c, s = np.cos(thing.yaw_rad), np.sin(thing.yaw_rad)
             at = thing.position_m + np.array([c * along - s * depth, s * along + c * depth, size[2] / 2])
             slides = thing.kind in SLIDING and rng.random() < SLIDING_SHARE

@@ -58,10 +58,8 @@ def _features(boxes: Boxes3D, images: Measurements, pairs: Pairs, truth: Scenari
         at_s = np.array([(int(boxes.t_ns[row]) - truth.t0_ns) / NS_PER_S])
         for agent in truth.others:
             state = agent.at(at_s)
-            near = (
-                np.hypot(state.x_m - boxes.center_m[row, 0], state.y_m - boxes.center_m[row, 1]) < MAX_OFFSET_M[group]
-            )
-            right[n] |= bool(state.valid[0] and near[0] and GROUP_OF[agent.category] == group)
+            (away_m,) = np.hypot(state.x_m - boxes.center_m[row, 0], state.y_m - boxes.center_m[row, 1])
+            right[n] |= bool(state.valid[0] and away_m < MAX_OFFSET_M[group] and GROUP_OF[agent.category] == group)
     return x, right
 
 

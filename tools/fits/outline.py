@@ -116,9 +116,8 @@ def measured(seen: Seen, rng: np.random.Generator) -> Outline | None:
         kept &= (seen.xyz[:, 0] > edge) if rng.random() < 0.5 else (seen.xyz[:, 0] < edge)
     if rng.random() < HIDDEN_SHARE:
         kept &= z > rng.uniform(0.3, 0.8) * box[2]
-    return outline_of(
-        np.column_stack([rotate(seen.xyz[:, :2] - shift, -yaw), z])[kept], box, rotate(seen.view_m - shift, -yaw)
-    )
+    xyz = np.column_stack([rotate(seen.xyz[:, :2] - shift, -yaw), z])[kept]
+    return outline_of(xyz, box, rotate(seen.view_m - shift, -yaw))
 
 
 def report(name: str, odds: np.ndarray) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import VEHICLE, Measurements, seen_from
+from log2sim.datatypes import VEHICLE, Detections, Measurements, seen_from
 from log2sim.files.arrays import Columns
 from log2sim.geometry import Array, apply, box_corners, inverse, rotation_from_quaternion, transform, upright_box_iou
 from log2sim.logs.kitti import labels
@@ -167,34 +167,27 @@ def in_map(boxes: Boxes, view: View) -> tuple[Array, Array]:
 
 def to_measurements(boxes: Boxes, view: View) -> Measurements:
     """Boxes as measurements in the map; `points`, which the tracker does not read, is the row."""
-    n = len(boxes)
+    n, height_m = len(boxes), boxes.size_hwl_m[:, 0]
     map_center, yaw_rad = in_map(boxes, view)
     sigma = SIGMA_M + SIGMA_PER_M * np.hypot(boxes.bottom_m[:, 0], boxes.bottom_m[:, 2])
     half_m = boxes.size_hwl_m[:, :0:-1] / 2
-    return Measurements(
+    category = np.array([CATEGORY_OF[c] for c in boxes.category.tolist()], dtype="<U16")
+    found = Detections(boxes.box_px, 1 / (1 + np.exp(-boxes.score)), category)
+    return replace(
+        Measurements.unplaced(found, t_ns=0, camera="image_02", sensor_m=np.zeros(3)),
         t_ns=boxes.frame * PERIOD_NS,
-        category=np.array([CATEGORY_OF[c] for c in boxes.category.tolist()], dtype="<U16"),
-        score=1 / (1 + np.exp(-boxes.score)),
-        camera=np.full(n, "image_02", dtype="<U16"),
-        box_px=boxes.box_px,
-        truncated=np.zeros(n, dtype=bool),
         ends_visible=np.ones((n, 2), dtype=bool),
         low_m=-half_m,
         high_m=half_m,
-        bottom_m=map_center[:, 2] - boxes.size_hwl_m[:, 0] / 2,
-        top_m=map_center[:, 2] + boxes.size_hwl_m[:, 0] / 2,
+        bottom_m=map_center[:, 2] - height_m / 2,
+        top_m=map_center[:, 2] + height_m / 2,
         center_m=map_center,
         yaw_rad=yaw_rad,
         covariance=sigma[:, None, None] ** 2 * np.eye(2),
         points=np.arange(n),
-        source=np.full(n, "lidar", dtype="<U16"),
-        cluster=(np.zeros((0, 3)),) * n,
+        source=np.full(n, "lidar"),
         sensor_m=map_center,
-        height_px_m=boxes.size_hwl_m[:, 0],
-        box_center_m=np.full((n, 3), np.nan),
-        box_size_m=np.full((n, 3), np.nan),
-        box_yaw_rad=np.full(n, np.nan),
-        heading_score=np.full(n, np.nan),
+        height_px_m=height_m,
         seen_by=seen_from(VEHICLE, n),
     )
 

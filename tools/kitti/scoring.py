@@ -176,8 +176,7 @@ def recall_thresholds(scores: Array, truths: int) -> list[tuple[float, float]]:
 def count(scene: Scene, match: Index, threshold: float) -> Counts:
     """Errors at one threshold, from the found box of every label, `match` (A,)."""
     there = scene.score >= threshold
-    used = np.zeros(len(scene.found), dtype=bool)
-    used[match[match >= 0]] = True
+    used = np.isin(np.arange(len(scene.found)), match)
     overlap = np.zeros(len(scene.found))
     chosen = match[scene.row] == scene.col
     overlap[scene.col[chosen]] = scene.iou[chosen]
@@ -212,12 +211,9 @@ def _breaks(scene: Scene, match: Index) -> tuple[int, int]:
 
 def _hota(scene: Scene, match: Index, threshold: float) -> float:
     """HOTA over the labels that count and the found boxes that are neither excused nor on others."""
-    there = scene.score >= threshold
-    on_ignorable = np.zeros(len(scene.found), dtype=bool)
-    on_ignorable[match[scene.ignorable & (match >= 0)]] = True
-    used = np.zeros(len(scene.found), dtype=bool)
-    used[match[match >= 0]] = True
-    there &= ~on_ignorable & (used | ~scene.excused)
+    rows = np.arange(len(scene.found))
+    on_ignorable, used = np.isin(rows, match[scene.ignorable]), np.isin(rows, match)
+    there = (scene.score >= threshold) & ~on_ignorable & (used | ~scene.excused)
     frames = int(max(scene.truth.frame.max(initial=-1), scene.found.frame.max(initial=-1))) + 1
     truth_there = np.zeros((int(scene.truth.track_id.max(initial=-1)) + 1, frames), dtype=bool)
     other_there = np.zeros((int(scene.found.track_id.max(initial=-1)) + 1, frames), dtype=bool)

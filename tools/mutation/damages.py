@@ -697,14 +697,10 @@ def _changed(rng: Rng, message: Any) -> Changed:
     elif isinstance(old, float):
         value = pick(rng, EXTREMES)
     elif isinstance(old, (bool, int, str)):
-        words, numbers = (
-            ("", "x", "/" * 500, "../..", "\u0663", "base_link", "map"),
-            (0, 1, -1, 2**31 - 1, -(2**31), 2**32 - 1, 65535),
-        )
-        value, visible = (
-            not old if isinstance(old, bool) else pick(rng, words if isinstance(old, str) else numbers),
-            False,
-        )
+        words = ("", "x", "/" * 500, "../..", "\u0663", "base_link", "map")
+        numbers = (0, 1, -1, 2**31 - 1, -(2**31), 2**32 - 1, 65535)
+        value = not old if isinstance(old, bool) else pick(rng, words if isinstance(old, str) else numbers)
+        visible = False
     else:
         return None
     return replace(message, **{name: value}), f"{name} is {str(value)[:30]!r}", visible

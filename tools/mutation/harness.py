@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,14 +94,11 @@ class Harness:
         out = path.parents[len(path.relative_to(self.folder / "case").parts) - 1] / "out"
         sound, before = self._sound_outcome(kind, index), self._files_outside()
         os.chdir(self.folder / "case")
-        ran, why = in_a_process(
-            lambda: run_commands(kind, path, out, commands_for(kind, path, out, index), done.allowed), TIME_LIMIT_S
-        )
+        commands = commands_for(kind, path, out, index)
+        ran, why = in_a_process(lambda: run_commands(kind, path, out, commands, done.allowed), TIME_LIMIT_S)
         ran = ran or Ran(killed=why, seconds=TIME_LIMIT_S)
-        changed = sorted({name for name, _ in before ^ self._files_outside()})
-        verdict, reason = judge(
-            ran, sound, [f"made or changed outside: {name}" for name in changed], visible=done.visible
-        )
+        changed = sorted({f"made or changed outside: {name}" for name, _ in before ^ self._files_outside()})
+        verdict, reason = judge(ran, sound, changed, visible=done.visible)
         return Row(index, kind, f"{name}: {done.what}", done.visible, verdict, reason, ran.seconds, ran.peak_bytes)
 
     def make(self, index: int) -> tuple[Path, str, Damage]:
@@ -135,15 +132,6 @@ class Harness:
 
 def kind_of(index: int) -> str:
     return CYCLE[index % len(CYCLE)]
-
-
-def indices(count: int, only: Sequence[str] = (), start: int = 0) -> Iterator[int]:
-    """The first so many indices, of these kinds."""
-    while count:
-        if not only or kind_of(start) in only:
-            yield start
-            count -= 1
-        start += 1
 
 
 def judge(ran: Ran, sound: Outcome, changed: Sequence[str], *, visible: bool) -> tuple[str, str]:

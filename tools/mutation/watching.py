@@ -214,11 +214,8 @@ class Watch:
         if not os.path.isabs(text) and inner:
             return
         # The place of a link that is changed is what matters, not what it leads to.
-        real = (
-            os.path.join(os.path.realpath(os.path.dirname(text) or "."), os.path.basename(text))
-            if writes
-            else os.path.realpath(text)
-        )
+        folder, name = os.path.split(text)
+        real = os.path.join(os.path.realpath(folder or "."), name) if writes else os.path.realpath(text)
         allowed = self._writable if writes else self._readable
         if not any(real == folder or real.startswith(folder + os.sep) for folder in allowed):
             self._forbid(f"{event} {'writes' if writes else 'reads'} {real}")

@@ -144,11 +144,8 @@ def draw_paint(name: str, rng: np.random.Generator) -> NDArray[np.float64]:
         (L, chroma, hue) = (rng.uniform(*span) for span in PAINTS[name])
         lab = np.array([L, chroma * np.cos(np.radians(hue)), chroma * np.sin(np.radians(hue))])
         linear = linear_of_lab(lab[None])[0]
-        if (
-            linear.min() > -0.01
-            and linear.max() < 1
-            and (name == "brown" or COLOR_NAMES[int(name_indices(lab))] == name)
-        ):
+        called = name == "brown" or COLOR_NAMES[int(name_indices(lab))] == name
+        if linear.min() > -0.01 and linear.max() < 1 and called:
             return lab
 
 
@@ -261,9 +258,8 @@ def draw_world(rng: np.random.Generator, name: str | None = None, light: str | N
         color *= np.where(rng.random() < 0.3, np.array([0.5, 1.0, 0.8]), 1.0)
         low = (up > 0) & (up < tall[None])
         sky[low] = np.broadcast_to(color[None] * on_ground * 0.6, sky.shape)[low]
-    illuminant = (sky[above].mean(axis=0) + 0.5 * sunny + lamp) / max(
-        float((sky[above].mean(axis=0) + 0.5 * sunny + lamp).mean()), 1e-4
-    )
+    arriving = sky[above].mean(axis=0) + 0.5 * sunny + lamp
+    illuminant = arriving / max(float(arriving.mean()), 1e-4)
     # Cameras correct the color of the light whole, in part or, fixed to that of the sun, not at all: streets in the shade are bluish then.
     strength = rng.uniform()
     white = illuminant**-strength * tint(SUN_K) ** (strength - 1)
@@ -332,17 +328,15 @@ def draw_view(world: World, shape: Shape, rng: np.random.Generator) -> NDArray[n
         albedo += np.clip(dirty, 0, 0.8)[..., None] * (np.array([0.11, 0.15, 0.18], np.float32) - albedo)
     color = albedo * (lit + direct)
     if world.flakes:
-        soft = cv2.GaussianBlur(
-            sky, (0, 0), FLAKE_LOBE_RAD / np.sqrt(2) / np.pi * ROWS, borderType=cv2.BORDER_REPLICATE
-        )
+        sigma = FLAKE_LOBE_RAD / np.sqrt(2) / np.pi * ROWS
+        soft = cv2.GaussianBlur(sky, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
         glint = np.exp(2 / FLAKE_LOBE_RAD**2 * ((mirrored * world.toward_sun).sum(-1) - 1)) * in_sun
         lobe = FLAKE_LOBE_RAD**2 * facing[..., None] * _look_up(soft, mirrored) + glint[..., None] * world.sun
         at_45 = np.exp(-((np.radians(45) / FLAKE_LOBE_RAD) ** 2))
         color += world.flakes * body[..., None] * (base * lobe - at_45 * color)
     coat = 0.045 + 0.955 * (1 - facing) ** 5
-    shine = np.where(shape.gloss > 0.05, coat * np.where(shape.gloss > 0.25, 1.3, 1.0), 0.0) * (
-        1 - 0.8 * min(2 * world.dirt, 1)
-    )
+    clean = 1 - 0.8 * min(2 * world.dirt, 1)
+    shine = np.where(shape.gloss > 0.05, coat * np.where(shape.gloss > 0.25, 1.3, 1.0), 0.0) * clean
     half_sun = np.clip((mirrored * world.toward_sun).sum(-1), 0, 1) ** 300 * 30
     color += shine[..., None] * (_look_up(sky, mirrored) + half_sun[..., None] * world.sun)
     color += shape.glow * rng.choice([0.0, 0.5, 3.0])
@@ -387,9 +381,8 @@ def _taken(picture: Values, mean_light: Values, world: World, rng: np.random.Gen
         wide, tall = int(side * rng.uniform(0.05, 0.4)), int(side * rng.uniform(0.2, 1))
         u = int(rng.choice([0, side - wide])) if wide > side // 8 else int(rng.integers(0, side))
         v = int(rng.choice([0, side - tall]))
-        picture[v : v + tall, u : u + wide] = (
-            np.exp(rng.normal(-2, 0.9)) * np.exp(rng.normal(0, 0.3, 3)) * 2 * mean_light
-        )
+        color = np.exp(rng.normal(-2, 0.9)) * np.exp(rng.normal(0, 0.3, 3)) * 2 * mean_light
+        picture[v : v + tall, u : u + wide] = color
     horizon = world.sky[ROWS // 2 : ROWS // 2 + 3].mean(axis=(0, 1))
     picture = picture + world.haze * (horizon - picture)
     # Light that a lens and a windshield scatter over the whole picture, of good lenses one to three percent (ISO 9358): it tints what is black.
@@ -413,9 +406,8 @@ def _taken(picture: Values, mean_light: Values, world: World, rng: np.random.Gen
     x = x + rng.normal(0, rng.choice([0.004, 0.01, 0.03 if world.light in ("night", "dusk") else 0.015]), x.shape)
     out = np.clip(np.round(x * 255), 0, 255).astype(np.uint8)
     if rng.random() < 0.8:
-        out = cv2.imdecode(
-            cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 97))])[1], cv2.IMREAD_COLOR
-        )
+        data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(35, 97))])[1]
+        out = cv2.imdecode(data, cv2.IMREAD_COLOR)
     if rng.random() < 0.25:  # the edge of the camera's picture cuts the context off
         cut = int(size * rng.uniform(0.03, 0.14))
         out = cv2.copyMakeBorder(out[:, cut:], 0, 0, cut, 0, cv2.BORDER_REPLICATE)

@@ -104,20 +104,18 @@ def fit(paths: list[Path], out: Path, steps: int, seed: int) -> nn.Module:
         x = jittered(np.roll(x, shift, axis=(1, 2)), rng)
         out = network(torch.from_numpy(np.ascontiguousarray(x.transpose(0, 3, 1, 2))))
         truth = torch.from_numpy(name[rows])
-        named = nn.functional.cross_entropy(out[:, : len(COLOR_NAMES)], truth)
-        away = nn.functional.smooth_l1_loss(
-            out[:, len(COLOR_NAMES) :], torch.from_numpy((lab[rows] / LAB_SCALE).astype(np.float32))
-        )
-        right = (out[:, : len(COLOR_NAMES)].argmax(dim=1) == truth).float().mean()
+        logits, color = out[:, : len(COLOR_NAMES)], out[:, len(COLOR_NAMES) :]
+        named = nn.functional.cross_entropy(logits, truth)
+        away = nn.functional.smooth_l1_loss(color, torch.from_numpy((lab[rows] / LAB_SCALE).astype(np.float32)))
+        right = (logits.argmax(dim=1) == truth).float().mean()
         return named + LAB_WEIGHT * away, {"names": named.item(), "lab": away.item(), "right": right.item()}
 
     networks = list[nn.Module]()
     for k in range(NETWORKS):
         torch.manual_seed(seed + k)
         network = Names().to(memory_format=torch.channels_last)
-        network.load_state_dict(
-            fitting.fit(network, step_loss, FitPlan(steps, seed + k, RATE, out / f"colors-{k}.pt", 100))
-        )
+        plan = FitPlan(steps, seed + k, RATE, out / f"colors-{k}.pt", 100)
+        network.load_state_dict(fitting.fit(network, step_loss, plan))
         networks.append(network)
     return Mean(networks).eval()
 

@@ -145,12 +145,7 @@ class Pool:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        mount: str,
-        rounds: Sequence[Round],
-        own: Sequence[Path] = (),
-        generator: Popen[bytes] | None = None,
+        self, folder: Path, mount: str, rounds: Sequence[Round], own: Sequence[Path], generator: Popen[bytes] | None
     ) -> None:
         self._generator = generator
         self._own = [Shard(path) for path in own]

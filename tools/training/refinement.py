@@ -301,9 +301,8 @@ def overlap_of(out: Tensor, target: Tensor, size: Tensor) -> Tensor:
     for axis in range(2):
         true, away = size[:, axis], (out[:, axis] - target[:, axis]).abs()
         own = true * (out[:, 3 + axis] - target[:, 3 + axis]).clamp(-2, 2).exp()
-        shared = shared * (torch.minimum(true / 2, away + own / 2) - torch.maximum(-true / 2, away - own / 2)).clamp(
-            min=0
-        )
+        low, high = torch.maximum(-true / 2, away - own / 2), torch.minimum(true / 2, away + own / 2)
+        shared = shared * (high - low).clamp(min=0)
         area = area * own
     aligned = (out[:, 6:8] * target[:, 6:8]).sum(1) / out[:, 6:8].norm(dim=1).clamp(min=1e-3)
     return shared / (area + size.prod(1) - shared).clamp(min=1e-3) * aligned.clamp(0, 1)

@@ -302,9 +302,8 @@ def encode(boxes: Array, anchors: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
     turn = wrap_angle(2 * (boxes[:, 6] - anchors[:, 6])) / 2
-    return np.column_stack(
-        [(boxes[:, :3] - anchors[:, :3]) / diagonal, np.log(boxes[:, 3:6] / anchors[:, 3:6]), turn]
-    ).astype(np.float32)
+    shift, log_size = (boxes[:, :3] - anchors[:, :3]) / diagonal, np.log(boxes[:, 3:6] / anchors[:, 3:6])
+    return np.column_stack([shift, log_size, turn]).astype(np.float32)
 
 
 def decode(goal: NDArray[np.floating], anchors: NDArray[np.float32]) -> Array:
@@ -540,9 +539,8 @@ def main(
     pairs = read_pairs(data)
     held = max(1, round(len(pairs) * TEST_SHARE))
     path = train([p.in_picture_only() for p in pairs[:-held]], out, steps=steps, seed=seed)
-    tests = {"simulated": pairs[-held:]} | {
-        n: read_pairs(Path(log), EVERY) for n, log in (t.split("=", 1) for t in test)
-    }
+    others = (t.split("=", 1) for t in test)
+    tests = {"simulated": pairs[-held:]} | {name: read_pairs(Path(log), EVERY) for name, log in others}
     lidar = open_network(WEIGHTS / "vehicle.onnx", LidarConfig(min_score=MIN_SCORE), name="lidar:vehicle")
     searches = {"two-stream": search_by_network(path), "`lidar:vehicle`": search_by_lidar(lidar)}
     columns, rows = [(kind, str(c)) for kind, criteria in CRITERIA.items() for c in criteria], []
