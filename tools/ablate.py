@@ -141,7 +141,6 @@ def main(
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
-    """Rows of the file."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
@@ -269,7 +268,6 @@ def stage_of(module: str) -> str:
 
 
 def variations(config: Config) -> Iterator[Variation]:
-    """Everything that can be changed."""
     for module in method_modules():
         stage = stage_of(module.__name__)
         yield from map(switched_off, constants_in(module, stage))

@@ -24,7 +24,6 @@ TESTS: dict[str, Any] = {"range": curve, "blind_area": blind_area, "overlap": ov
 
 def main(test: str, variants: int = 50, seed: int = 0, ways: str = ",".join(NAMES), noise: float = 0.0, delay: bool = True,
          register: bool = True, every: int = 1) -> None:  # fmt: skip
-    """Run a test and print its table."""
     worlds: list[Any] = []
     rows: dict[str, list[Any]] = {way: [] for way in ways.split(",")}
     for k in range(seed, seed + variants):

@@ -21,7 +21,6 @@ COMMANDS = (
 
 
 def main() -> None:
-    """Run the commands, then print the stages."""
     for command in COMMANDS:
         print(f"$ log2sim {' '.join(command)}", flush=True)
         subprocess.run([sys.executable, "-m", "log2sim", *command, "--overwrite"], cwd=ROOT, check=True)

@@ -91,7 +91,6 @@ def measure(path: Path, config: Config) -> tuple[Measured, Schedule]:
 
 
 def profile(path: Path, detectors: Sequence[str], repeats: int) -> Iterator[tuple[list[str], str]]:
-    """Figures of a log with each detector."""
     log, threads = open_log(path), sorted({1, len(os.sched_getaffinity(0))})
     configs: dict[str, Config] = {}
     for detector in detectors:
@@ -131,7 +130,6 @@ def figures(log: str, detector: str, runs: list[Measured], floors: dict[int, lis
 
 
 def main(logs: list[Path], detector: list[str] = list(DETECTORS), repeats: int = 3) -> None:
-    """Print the tables of logs."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         print("OPENBLAS_NUM_THREADS is not 1: times will swing", file=sys.stderr)
     found = [one for path in logs for one in profile(path, detector, repeats)]

@@ -89,7 +89,6 @@ def tables(found: list[tuple[bool, dict[str, Any]]]) -> str:
 
 
 def main(folders: list[Path], without: list[str] = [], jobs: int = 2) -> None:
-    """Measure and print."""
     paths = sorted(path for folder in folders for path in folder.glob("*.pkl"))
     if not paths:
         raise SystemExit(f"{', '.join(map(str, folders))}: no first passes; `tools/fit.py confidence_logs` makes them")

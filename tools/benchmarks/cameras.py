@@ -17,7 +17,6 @@ SHARES = ("invented", "wrong_speed", "backwards", "wrong")
 
 
 def main(logs: list[str]) -> None:
-    """Print one row a log."""
     rows = []
     for path in logs:
         log, truth = synthesize(load_scene(path)) if path.endswith(".toml") else (open_log(path), None)

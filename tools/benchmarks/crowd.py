@@ -26,7 +26,6 @@ MISSED, FALSE_A_FRAME, HIDDEN_SHARE = 0.1, 0.5, 0.5
 
 
 def main(frames: int = 200, seeds: int = 3, online: bool = False) -> None:
-    """Print the figures of each density."""
     rows = []
     for count in PEOPLE:
         for speed_mps in (0.0, 2.0):

@@ -296,7 +296,6 @@ def table(cases: dict[str, Case]) -> str:
 
 
 def tables() -> str:
-    """All tables."""
     import cv2
 
     cv2.setNumThreads(1)

@@ -50,7 +50,6 @@ PENALTY, CONSTANT_PENALTY = 1.0, 0.01
 
 
 def main(folder: Path, online: bool = False, fit: bool = False, results: Path | None = None) -> None:
-    """Print the figures of all sequences."""
     if results is not None:
         told = {path.stem: read_tracks(path) for path in sorted(results.glob("*.txt"))}
     else:

@@ -85,7 +85,6 @@ CASES = (
 
 
 def with_rig(log: Log, rig: str) -> Log:
-    """Leave out sensors."""
     if rig == "all":
         return log
     left_out = log.lidars if rig == "cameras" else log.cameras
@@ -185,7 +184,6 @@ def count(all_found: list[dict[str, Any]], kind: str) -> str:
 
 
 def row(case: Case, found: dict[str, Any]) -> list[str]:
-    """A row of the table."""
     lines, borders, lanes = (found.get(name) or {} for name in ("lane_lines", "borders", "lanes"))
     shown_m, matched_m = found["standing_out_m"]
     return [

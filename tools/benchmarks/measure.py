@@ -32,7 +32,6 @@ COLUMNS = ("rows", "found", "median m", "RMSE m", "depth m", "size m", "yaw deg"
 
 
 def main(logs: list[Path]) -> None:
-    """Print one table a log."""
     for path in logs:
         log = open_log(path)
         truth = Scenario.load(path / "truth.json") if (path / "truth.json").exists() else truth_from_log(log)

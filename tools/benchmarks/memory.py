@@ -66,7 +66,6 @@ def _run(code: str, job: list[Any]) -> Any:
 
 
 def main(log: Path, times: list[int] = [1, 4, 16], world: bool = False) -> None:
-    """Print the table."""
     runs = [measure(str(log.resolve()), count, world) for count in times]
     peaks = [{stage["stage"]: float(stage["peak_memory_mib"]) for stage in run["stages"]} for run in runs]
     names = dict.fromkeys(name for of_run in peaks for name in of_run)

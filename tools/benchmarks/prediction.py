@@ -138,7 +138,6 @@ def _stroll(rng: np.random.Generator) -> Course:
 
 
 def true_scenario(found: list[Course]) -> Scenario:
-    """The scenario of the truth."""
     return _scenario([_agent(k, c, c.xy_m, c.speed_mps, c.yaw_rad, np.zeros(len(c.xy_m))) for k, c in enumerate(found)])
 
 

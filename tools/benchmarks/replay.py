@@ -27,7 +27,6 @@ SPEED_HEAD = ["model", "agents", "us a step", "agents x steps a second", "times 
 
 
 def main(scenarios: list[Path]) -> None:
-    """Print both tables."""
     head = ["scenario", "dt ms", "followers", *(key.replace("_", " ") for key in LIMITS), "agents beyond a limit"]
     print(markdown(head, [tracking_row(path, dt_s) for path in scenarios for dt_s in STEPS_S]))
     rows = [speed_row(count, model) for model in MODELS for count in COUNTS]

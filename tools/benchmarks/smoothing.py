@@ -158,7 +158,6 @@ def log2sim(t: Array, xy: Array, sigma: float) -> Result:
 
 
 def spline(t: Array, xy: Array, sigma: float, *, fit: Callable[[Array, Array, float], Any]) -> Result:
-    """A spline of SciPy."""
     splines = [fit(t, z, sigma) for z in xy.T]
     values = [np.column_stack([s.derivative(k)(ALL_S) if k else s(ALL_S) for s in splines]) for k in range(3)]
     return of_derivatives(*values)
@@ -228,7 +227,6 @@ def measure(sigma: float, outliers: float, seeds: int) -> dict[str, list[float]]
 
 
 def tables() -> str:
-    """All tables."""
     warnings.simplefilter("ignore")
     cases = {"0.1 m": (0.1, 0.0), "0.3 m": (0.3, 0.0), "0.6 m": (0.6, 0.0), "0.3 m, 3 % outliers": (0.3, 0.03)}
     found = {name: measure(*case, seeds=8) for name, case in cases.items()}

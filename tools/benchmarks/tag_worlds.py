@@ -218,7 +218,6 @@ class Stage:
 
     @property
     def t(self) -> np.ndarray:
-        """The fine times."""
         return np.arange(0.0, self.duration_s + FINE_S / 2, FINE_S)
 
     def add(self, id: str, line: np.ndarray, speed: np.ndarray | float, start_m: float = 0.0, category: str = "car",

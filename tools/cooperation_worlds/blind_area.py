@@ -37,7 +37,6 @@ HIDING_HEIGHT_M = 2.2  # the LiDAR on the roof looks over what is lower
 
 
 def draw(seed: int) -> World:
-    """Draw a variant that keeps what the test promises."""
     return first_that_keeps("blind_area", 2, seed, _drawn, keeps_promise)
 
 

@@ -30,7 +30,6 @@ FROM_M, TO_M = 46.0, 13.0  # distances between ego and target that a variant cov
 
 
 def draw(seed: int) -> World:
-    """Draw a variant that keeps what the test promises."""
     return first_that_keeps("range", 1, seed, _drawn, keeps_promise)
 
 

@@ -64,7 +64,6 @@ class HiddenTraffic:
 
     @cached_property
     def log(self) -> Log:
-        """The log of all sweeps."""
         height = float(self.run.scene.sensor.position_m[2])
         ego_T_lidar = transform(np.eye(3), np.array([REAR_AXLE_TO_LIDAR_M, 0.0, height]))
         map_T_pole = transform(self.place.rotation, self.place.position_m)
@@ -227,7 +226,6 @@ def figures(rows: dict[str, list[BoxesOfSweep]]) -> dict[str, Any]:
 
 
 def table(_: Sequence[HiddenTraffic], rows: dict[str, list[BoxesOfSweep]]) -> str:
-    """The figures, by way."""
     found = figures(rows)
     lines = [[kind, *(cell(ap[w] and 100 * ap[w], 1) for w in rows)] for kind, ap in found["ap"].items()]
     lines += [[f"recall, vehicles {what}", *(cell(of[w]) for w in rows)] for what, of in found["recall"].items()]

@@ -34,7 +34,6 @@ MIN_VIEW_ANGLE_RAD = np.deg2rad(50)  # between the views of both ends, at the ta
 
 
 def draw(seed: int) -> World:
-    """Draw a variant that keeps what the test promises."""
     return first_that_keeps("overlap", 3, seed, _drawn, keeps_promise)
 
 

@@ -52,12 +52,10 @@ class World:
 
     @property
     def moving(self) -> MovingScene:
-        """The scene in motion."""
         return MovingScene.of(self.scene)
 
     @property
     def target_actor(self) -> Actor:
-        """The target in motion."""
         return next(a for a in self.moving.actors if a.spec.id == self.target)
 
     def distances_m(self, t_s: Array) -> Array:
@@ -196,7 +194,6 @@ class Builder:
         self.agents.append({"id": name, "category": category, "size_m": _rounded(size), **place})
 
     def draw_shape(self, category: str) -> Shape:
-        """Draw the shape of a road user."""
         return draw_user(category, self.rng)[1]
 
     def scatter(self, line: Any, edge_m: float) -> None:

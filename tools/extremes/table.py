@@ -90,7 +90,6 @@ def small_log() -> Log:
 
 @lru_cache
 def files_of_small_log() -> dict[str, bytes]:
-    """Everything in the folder of the small log."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "log"
         write_log(small_log(), folder)

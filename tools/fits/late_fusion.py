@@ -63,11 +63,6 @@ def _features(boxes: Boxes3D, images: Measurements, pairs: Pairs, truth: Scenari
     return x, right
 
 
-def loss_of(x: Array, right: NDArray[np.bool_], w: Array) -> float:
-    """Negative log-likelihood of weights (4,)."""
-    return float(np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (x @ w)).sum())
-
-
 def main(scenes: list[Path], images: str = "ssd-mobilenet-v2", sweeps: str = "lidar:vehicle", seed: int = 1) -> None:
     """Print the weights for a detector in images and one in sweeps."""
     x, right = (np.concatenate(part) for part in zip(*(pairs_of(scene, images, sweeps, seed) for scene in scenes)))
@@ -75,5 +70,6 @@ def main(scenes: list[Path], images: str = "ssd-mobilenet-v2", sweeps: str = "li
     weights = logistic_regression(x, right, PRIOR_SIGMA**-2, before)
     print(f"{len(x)} pairs, {int(right.sum())} right; seed {seed}")
     for name, w in (("independent", before), ("fitted", weights)):
-        print(f"{name:12s} loss a pair {loss_of(x, right, w) / max(len(x), 1):.4f}")
+        loss = np.logaddexp(0.0, np.where(right, -1.0, 1.0) * (x @ w)).sum()
+        print(f"{name:12s} loss a pair {loss / max(len(x), 1):.4f}")
     print(PairWeights(*(round(float(w), 2) for w in weights)))

@@ -221,7 +221,6 @@ def calibrate(path: Path, examples: list[Example]) -> dict[str, list[float]]:
 
 
 def group_of(boxes: SceneBoxes, group: str) -> SceneBoxes:
-    """Take the boxes of one group of categories."""
     return boxes.take(np.array([GROUP_OF.get(str(c)) == group for c in boxes.category], bool))
 
 
@@ -250,7 +249,6 @@ def found_boxes(boxes: Boxes3D) -> SceneBoxes:
 
 
 def report(detector: LidarDetector, examples: list[Example], *, range_m: float) -> dict[str, Any]:
-    """Evaluate a detector on examples."""
     found = [found_boxes(detector.detect(e.cloud)) for e in examples]
     out: dict[str, Any] = {"scenes": len(examples), "score": SCORE, "max_range_m": range_m}
     totals = np.zeros(3)

@@ -90,7 +90,6 @@ def fit(network: nn.Module, step_loss: StepLoss, plan: FitPlan) -> dict[str, Ten
 
 
 def rate_at(step: int, plan: FitPlan) -> float:
-    """Return the learning rate of a step."""
     warm = min(1.0, step / plan.warm_up_steps + 0.05)
     return plan.peak_rate * warm * (0.5 + 0.5 * math.cos(math.pi * step / plan.steps)) + LAST_RATE
 

@@ -175,7 +175,6 @@ def checkpoint_path(out: Path, number: int) -> Path:
 
 
 def shard_name(mount: str, seed: int, number: int) -> str:
-    """Name a file of samples."""
     return f"{mount}-{seed}-{number:04d}.npz"
 
 
@@ -272,7 +271,6 @@ def main(
     mount: Mount, out: Path, data: list[Path] = [], scenes: int | None = None, steps: int | None = None, seed: int = 1, every: int = 1,
     only: str = "", start: Path | None = None, examples: int = 150, blend: Path | None = None, share: float = 0.5,
 ) -> None:  # fmt: skip
-    """Run the steps that are asked for."""
     out.mkdir(parents=True, exist_ok=True)
     rounds: Sequence[Round] = ROUNDS[mount]
     if steps or scenes is not None:

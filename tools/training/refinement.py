@@ -124,7 +124,6 @@ def rows_of(detector: NetworkDetector, example: Example) -> dict[str, NDArray[An
 
 
 def shard_path(out: Path, mount: str, seed: int, shard: int) -> Path:
-    """Name a file of boxes."""
     return out / "data" / f"boxes-{mount}-{seed}-{shard:04d}.npz"
 
 
@@ -372,7 +371,6 @@ def main(
     mount: Mount, out: Path, scenes: int = 8000, steps: int = 20_000, seed: int = 47, first: Path | None = None,
     start: Path | None = None, examples: int = 150, only_generate: bool = False,
 ) -> None:  # fmt: skip
-    """Generate, fit and export."""
     out.mkdir(parents=True, exist_ok=True)
     # Without the second stage that may be there already.
     bare = out / "first.onnx"
