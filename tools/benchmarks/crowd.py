@@ -89,7 +89,7 @@ def _boxes(
     bottom = np.column_stack([right, np.full(n, HEIGHT_M), at[:, 0]])
     zero = np.zeros(n)
     return Boxes(
-        np.full(n, frame), number, np.full(n, "Pedestrian", dtype="<U16"), zero, zero.copy(), zero,
+        np.full(n, frame), number, np.full(n, "Pedestrian", dtype="<U16"), zero, zero.copy(),
         np.column_stack([u - half, high, u + half, low]), size, bottom, -yaw - np.pi / 2, score,
     )  # fmt: skip
 

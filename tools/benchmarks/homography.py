@@ -28,7 +28,7 @@ GROUND_NOISE_M = 0.05
 NEAR_M = (6.0, 8.0, 10.0, 15.0, 20.0, 25.0)
 FAR_M = (30.0, 40.0, 50.0, 60.0)
 HALF_TRACK_M = 0.9
-TICK_S = 0.1
+TICK_S, TICKS = 0.1, 40
 CAR_HEIGHT_M, HEIGHT_SPREAD_M = 1.5, 0.12
 
 
@@ -40,7 +40,6 @@ class Case:
     outliers: float = 0.3
     cars: int = 10
     nod_deg: float = 0.0
-    ticks: int = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ def make_stream(case: Case, seed: int) -> Stream:
     speed = rng.uniform(-3.0, 3.0, case.cars)
     looks = np.tile(CAR_HEIGHT_M / rng.normal(CAR_HEIGHT_M, HEIGHT_SPREAD_M, case.cars), 2)
     uv, xy, by_size, clean, poses = [], [], [], [], []
-    for _ in range(case.ticks):
+    for _ in range(TICKS):
         x = x + speed * TICK_S
         left = (x < 6.0) | (x > 62.0)
         x = np.where(left, rng.uniform(6.0, 60.0, case.cars), x)
@@ -100,7 +99,7 @@ def make_stream(case: Case, seed: int) -> Stream:
         by_size.append(feet * looks[:, None])
         xy.append(ground)
         clean.append(~np.isin(np.arange(len(feet)), wrong))
-    tick = np.repeat(np.arange(case.ticks), 2 * case.cars)
+    tick = np.repeat(np.arange(TICKS), 2 * case.cars)
     return Stream(
         np.concatenate(uv), np.concatenate(xy), np.concatenate(by_size), tick, np.concatenate(clean), np.array(poses)
     )
@@ -236,7 +235,7 @@ def measure(case: Case) -> dict[str, Array]:
 
 def answers(stream: Stream, case: Case) -> dict[str, tuple[Array, float]]:
     """What each method makes of one stream: `ground_H_image` of each tick (T, 3, 3), and seconds."""
-    each = [stream.tick == t for t in range(case.ticks)]
+    each = [stream.tick == t for t in range(TICKS)]
     out = {
         "log2sim time-aware": ours(stream, "time-aware", REPEATS),
         "log2sim calibrated": ours(stream, "calibrated", REPEATS, K=K),
@@ -252,10 +251,10 @@ def answers(stream: Stream, case: Case) -> dict[str, tuple[Array, float]]:
         out[f"{name}, each frame"] = timed(partial(by_frames, single, stream, each), 1)
         if name != "scikit-image ransac":  # minutes: its full SVD grows with the square of the correspondences
             found, seconds = timed(partial(pooled, stream.xy, stream.uv), REPEATS)
-            out[f"{name}, pooled"] = np.repeat(found[None], case.ticks, axis=0), seconds
+            out[f"{name}, pooled"] = np.repeat(found[None], TICKS, axis=0), seconds
     most_likely = limit(stream, case.noise_px)
     out["limit of each frame"] = np.array([limit(stream, case.noise_px, rows=r) for r in each]), float("nan")
-    out["limit of the stream"] = np.repeat(most_likely[None], case.ticks, axis=0), float("nan")
+    out["limit of the stream"] = np.repeat(most_likely[None], TICKS, axis=0), float("nan")
     return out
 
 
@@ -268,14 +267,14 @@ def by_frames(method: Callable[[Array, Array], Array], stream: Stream, each: lis
 def best_thresholds() -> dict[str, tuple[float, float]]:
     """Each peer's best threshold, for frames and pooled, on a stream that is not in the tables: 1 px, 30 % outliers."""
     stream, out = make_stream(Case(), 999), {}
-    each = [stream.tick == t for t in range(40)]
+    each = [stream.tick == t for t in range(TICKS)]
     for name, (peer, choices) in peers().items():
         best = [choices[0]] * 2 if len(choices) == 1 else []
         for rows in (each, [slice(None)]) if not best else ():
             off = []
             for threshold in choices:
                 found = np.array([asked(peer, threshold, stream.xy[r], stream.uv[r]) for r in rows])
-                found = np.broadcast_to(found, (40, 3, 3))
+                found = np.broadcast_to(found, (TICKS, 3, 3))
                 near, far = (np.nanmedian(errors_m(found, stream, r)) for r in (NEAR_M, FAR_M))
                 off.append(float(near / 0.06 + far / 0.12))
             best.append(choices[int(np.argmin(off))])

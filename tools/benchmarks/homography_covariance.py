@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.homography import Array, Case, K, camera, make_stream, mapped, probes
+from benchmarks.homography import TICKS, Array, Case, K, camera, make_stream, mapped, probes
 from benchmarks.table import markdown
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import EstimationOptions, estimate_homography
@@ -40,7 +40,7 @@ def nees(case: Case, seed: int, method: str) -> Array:
     fit = estimate_homography(data, options, rng=np.random.default_rng(0))
     ground, out = probes(RANGES_M), []
     uv, near = mapped(camera(), ground), ground[:, 0] < 25
-    for tick in range(case.ticks if case.nod_deg else 1):
+    for tick in range(TICKS if case.nod_deg else 1):
         h, covariance = fit.at_tick(tick), fit.covariance_at(tick)
         if h is None or covariance is None:
             continue

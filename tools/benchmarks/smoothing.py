@@ -47,11 +47,10 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One case: positions `xy_m` (T, 2) with noise of `sigma_m`, of which those that are `valid` (T,) were seen."""
+    """One case: positions `xy_m` (T, 2) with noise, of which those that are `valid` (T,) were seen."""
 
     maneuver: str
     seed: int
-    sigma_m: float
     truth: Truth
     xy_m: Array
     valid: NDArray[np.bool_]
@@ -108,7 +107,7 @@ def worlds(sigma_m: float, outlier_share: float, seeds: int) -> Iterator[World]:
             xy = truth.xy_m + rng.normal(0.0, sigma_m, (FRAMES, 2))
             wrong = rng.random(FRAMES) < outlier_share
             xy[wrong] += rng.normal(0.0, sigma_m, (int(wrong.sum()), 2)) * rng.uniform(5.0, 20.0, (int(wrong.sum()), 1))
-            yield World(maneuver, seed, sigma_m, truth, xy, valid)
+            yield World(maneuver, seed, truth, xy, valid)
 
 
 def errors_of(truth: Truth, xy_m: Array, velocity_mps: Array, yaw_rad: Array, curvature_1pm: Array) -> Array:

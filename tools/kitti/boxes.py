@@ -35,8 +35,8 @@ Mask = NDArray[np.bool_]
 class Boxes(Columns):
     """3D boxes (N,) of one sequence, one row a box and frame, in the rectified camera's frame (x right, y down, z forward).
 
-    `frame`, `track_id` (N,) int64, `category` (N,) str as KITTI spells it, `truncation`, `occlusion` (N,), `alpha` (N,)
-    rad, `box_px` (N, 4), `size_hwl_m` (N, 3) height, width, length, `bottom_m` (N, 3) middle of the lower face, `yaw_rad`
+    `frame`, `track_id` (N,) int64, `category` (N,) str as KITTI spells it, `truncation`, `occlusion` (N,), `box_px`
+    (N, 4), `size_hwl_m` (N, 3) height, width, length, `bottom_m` (N, 3) middle of the lower face, `yaw_rad`
     (N,) about the y axis (rotation_y), `score` (N,), NaN where there is none.
     """
 
@@ -45,7 +45,6 @@ class Boxes(Columns):
     category: NDArray[np.str_]
     truncation: Array
     occlusion: Array
-    alpha: Array
     box_px: Array
     size_hwl_m: Array
     bottom_m: Array
@@ -58,8 +57,8 @@ def read_detections(path: Path) -> Boxes:
     rows = np.array(path.read_text().replace(",", " ").split(), np.float64).reshape(-1, 15)
     category, none = np.array([DETECTION_TYPES[int(t)] for t in rows[:, 1]], dtype="<U16"), np.full(len(rows), -1.0)
     return Boxes(
-        rows[:, 0].astype(np.int64), none.astype(np.int64), category, none, none, rows[:, 14], rows[:, 2:6], rows[:, 7:10],
-        rows[:, 10:13], rows[:, 13], rows[:, 6],
+        rows[:, 0].astype(np.int64), none.astype(np.int64), category, none, none, rows[:, 2:6], rows[:, 7:10], rows[:, 10:13],
+        rows[:, 13], rows[:, 6],
     )  # fmt: skip
 
 
@@ -69,7 +68,7 @@ def read_tracks(path: Path) -> Boxes:
     rows = np.array([[*w[:2], *w[3:17], w[17] if len(w) == 18 else "nan"] for w in words], np.float64).reshape(-1, 17)
     return Boxes(
         rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), np.array([w[2] for w in words], dtype="<U16"), rows[:, 2], rows[:, 3],
-        rows[:, 4], rows[:, 5:9], rows[:, 9:12], rows[:, 12:15], rows[:, 15], rows[:, 16],
+        rows[:, 5:9], rows[:, 9:12], rows[:, 12:15], rows[:, 15], rows[:, 16],
     )  # fmt: skip
 
 
@@ -195,19 +194,11 @@ def to_measurements(boxes: Boxes, view: View) -> Measurements:
 def from_map(center_m: Array, size_m: Array, yaw_rad: Array, frame: NDArray[np.int64], view: View) -> dict[str, Array]:
     """Columns of `Boxes`, but for those in the image, for boxes (N,) given in the map: length, width, height and yaw about z."""
     cam_T_map = inverse(view.map_T_cam)[frame]
-    center = apply(cam_T_map, center_m)
-    ahead = np.einsum(
-        "nij,nj->ni", cam_T_map[:, :3, :3], np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), 0 * yaw_rad])
-    )
-    bottom = center.copy()
+    bottom = apply(cam_T_map, center_m)
     bottom[:, 1] += size_m[:, 2] / 2
-    yaw = np.arctan2(-ahead[:, 2], ahead[:, 0])
-    return {
-        "alpha": np.mod(yaw - np.arctan2(center[:, 0], center[:, 2]) + np.pi, 2 * np.pi) - np.pi,
-        "size_hwl_m": size_m[:, ::-1],
-        "bottom_m": bottom,
-        "yaw_rad": yaw,
-    }
+    course = np.column_stack([np.cos(yaw_rad), np.sin(yaw_rad), 0 * yaw_rad])
+    ahead = np.einsum("nij,nj->ni", cam_T_map[:, :3, :3], course)
+    return {"size_hwl_m": size_m[:, ::-1], "bottom_m": bottom, "yaw_rad": np.arctan2(-ahead[:, 2], ahead[:, 0])}
 
 
 def project(boxes: Boxes, P: Array) -> Array:
