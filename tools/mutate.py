@@ -44,9 +44,8 @@ def table(rows: list[Row]) -> str:
         if of_kind := [row for row in rows if kind in (row.kind, "all")]:
             counts = Counter(row.verdict for row in of_kind)
             longest, peak = max(row.seconds for row in of_kind), max(row.peak_bytes for row in of_kind) / 2**20
-            lines.append(
-                [kind, *(str(counts[c]) for c in (*GOOD, *BAD)), str(len(of_kind)), f"{longest:.1f}", f"{peak:.0f}"]
-            )
+            verdicts = [str(counts[c]) for c in (*GOOD, *BAD)]
+            lines.append([kind, *verdicts, str(len(of_kind)), f"{longest:.1f}", f"{peak:.0f}"])
     return markdown(["kind", *GOOD, *BAD, "inputs", "longest s", "peak MiB"], lines)
 
 

@@ -163,8 +163,7 @@ def truth_at(view: HiddenTraffic, stamp_ns: int, kind: str) -> tuple[SceneBoxes,
     of = [scene.objects[k] for k in rows]
     boxes = [[*o.position_m[:2], o.position_m[2] + o.size_m[2] / 2, *o.size_m, o.yaw_rad] for o in of]
     boxes = np.array(boxes).reshape(-1, 7)
-    ego = _ego_xy(scene)
-    away = np.hypot(*(boxes[:, :2] - ego).T)
+    away = np.hypot(*(boxes[:, :2] - _ego_xy(scene)).T)
     few = (vehicle + road)[rows] < MIN_POINTS
     return SceneBoxes.of(boxes, range_m=away, ignored=few | (away > REACH_M)), vehicle[rows] < MIN_POINTS
 
@@ -180,8 +179,7 @@ def found_at(view: HiddenTraffic, stamp_ns: int, found: Boxes3D, kind: str) -> S
         if users:
             k = min(users, key=lambda k: float(np.hypot(*(then.objects[k].position_m - boxes[row, :3])[:2])))
             boxes[row, :3] += now.objects[k].position_m - then.objects[k].position_m
-    ego = _ego_xy(now)
-    away = np.hypot(*(boxes[:, :2] - ego).T)
+    away = np.hypot(*(boxes[:, :2] - _ego_xy(now)).T)
     # The pole sees the ego, which is no other road user; far ones do not count.
     kept = np.array([_is(c, kind) for c in found.category], bool) & (away < REACH_M) & (away > 1.5)
     return SceneBoxes.of(boxes[kept], found.category[kept], found.score[kept], range_m=away[kept])
