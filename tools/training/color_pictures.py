@@ -144,8 +144,8 @@ def draw_paint(name: str, rng: np.random.Generator) -> NDArray[np.float64]:
         (L, chroma, hue) = (rng.uniform(*span) for span in PAINTS[name])
         lab = np.array([L, chroma * np.cos(np.radians(hue)), chroma * np.sin(np.radians(hue))])
         linear = linear_of_lab(lab[None])[0]
-        called = name == "brown" or COLOR_NAMES[int(name_indices(lab))] == name
-        if linear.min() > -0.01 and linear.max() < 1 and called:
+        possible = linear.min() > -0.01 and linear.max() < 1
+        if possible and (name == "brown" or COLOR_NAMES[int(name_indices(lab))] == name):
             return lab
 
 
