@@ -35,13 +35,12 @@ def run_cell(source: str, names: dict[str, Any]) -> Any:
 
 def shown(value: Any) -> dict[str, Any]:
     """Return what a notebook keeps of a value: the first representation that there is, as media type and data."""
+    text = {"text/plain": lines_of(repr(value))}
     png = getattr(value, "_repr_png_", lambda: None)()
     if png is not None:
-        return {"image/jpeg": as_jpeg(png), "text/plain": lines_of(repr(value))}
+        return {"image/jpeg": as_jpeg(png), **text}
     page = getattr(value, "_repr_html_", lambda: None)()
-    if page is not None:
-        return {"text/html": lines_of(page), "text/plain": lines_of(repr(value))}
-    return {"text/plain": lines_of(repr(value))}
+    return text if page is None else {"text/html": lines_of(page), **text}
 
 
 def as_jpeg(png: bytes) -> str:

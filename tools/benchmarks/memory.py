@@ -157,9 +157,6 @@ def _labels(labels: Labels, late_ns: list[int], steps: list[Array]) -> Labels:
 
 
 def _image_labels(labels: ImageLabels, late_ns: list[int]) -> ImageLabels:
-    times = len(late_ns)
-    return ImageLabels(
-        np.concatenate([labels.t_ns + late for late in late_ns]),
-        np.concatenate([labels.box_px] * times),
-        np.concatenate([labels.category] * times),
-    )
+    rows = np.tile(np.arange(len(labels.t_ns)), len(late_ns))
+    t_ns = np.concatenate([labels.t_ns + late for late in late_ns])
+    return ImageLabels(t_ns, labels.box_px[rows], labels.category[rows])

@@ -151,8 +151,8 @@ def of_derivatives(xy: Array, velocity: Array, acceleration: Array) -> Result:
     return xy, velocity, np.arctan2(velocity[:, 1], velocity[:, 0]), across / speed**3
 
 
-def log2sim(t: Array, xy: Array, sigma: float) -> Result:
-    found = smooth_track(t, xy, sigma_m=sigma, at_s=ALL_S)
+def log2sim(t: Array, xy: Array, sigma: float, at_s: Array = ALL_S) -> Result:
+    found = smooth_track(t, xy, sigma_m=sigma, at_s=at_s)
     return found.xy_m, found.velocity_mps, found.yaw_rad, found.curvature_1pm
 
 
@@ -255,12 +255,10 @@ def by_rate(seeds: int) -> str:
             off, verdicts = [], []
             for name in MANEUVERS:
                 for truth, t_s, xy_m in rate_worlds(name, rate_hz, sigma_m, seeds):
-                    path = smooth_track(t_s, xy_m, sigma_m=sigma_m, at_s=truth.t_s)
-                    estimate = path.xy_m, path.velocity_mps, path.yaw_rad, path.curvature_1pm
-                    off.append(errors_of(truth, *estimate))
+                    off.append(errors_of(truth, *log2sim(t_s, xy_m, sigma_m, truth.t_s)))
             for truth, t_s, xy_m in rate_worlds(QUEUE, rate_hz, sigma_m, seeds):
-                path = smooth_track(t_s, xy_m, sigma_m=sigma_m, at_s=truth.t_s)
-                verdicts.append(standing_verdicts(truth, path.velocity_mps))
+                _, velocity_mps, _, _ = log2sim(t_s, xy_m, sigma_m, truth.t_s)
+                verdicts.append(standing_verdicts(truth, velocity_mps))
             cells.append(errors_text(np.median(off, axis=0)))
             cells += [f"{100 * share:.0f} %" for share in np.mean(verdicts, axis=0)]
         rows.append(cells)
@@ -363,7 +361,7 @@ def maneuver_bounds(maneuver: str, sigma_m: float, seeds: int) -> tuple[float, f
 def drawn_error_m(density: float, sigma_m: float, seeds: int) -> float:
     """Root mean square position error of log2sim on motions with white jerk."""
     step, added = white_jerk(density)
-    factor, t_s, squares = np.linalg.cholesky(added), np.arange(FRAMES) * PERIOD_S, []
+    factor, squares = np.linalg.cholesky(added), []
     for seed in range(seeds):
         rng = np.random.default_rng([seed, int(10 * density)])
         state = np.array(START_SIGMAS)[:, None] * rng.normal(size=(3, 2)) + [[0, 0], [START_MPS, 0], [0, 0]]
@@ -372,8 +370,8 @@ def drawn_error_m(density: float, sigma_m: float, seeds: int) -> float:
             state = step @ state + factor @ rng.normal(size=(3, 2))
             xy.append(state[0])
         truth = np.array(xy)
-        found = smooth_track(t_s, truth + rng.normal(0, sigma_m, truth.shape), sigma_m=sigma_m, at_s=t_s)
-        squares.append(np.mean(np.sum((found.xy_m - truth) ** 2, axis=1)))
+        found = log2sim(ALL_S, truth + rng.normal(0, sigma_m, truth.shape), sigma_m)[0]
+        squares.append(np.mean(np.sum((found - truth) ** 2, axis=1)))
     return float(np.sqrt(np.mean(squares)))
 
 
