@@ -132,17 +132,17 @@ TRIM = 0.01
 TOP_QUANTILE = 0.98
 
 
-def fit_extents(points: Array, typical: Array, known_yaw_rad: float | None = None) -> tuple[float, Array, Array]:
+def fit_extents(points: Array, typical: Array, known_yaw_rad: float = np.nan) -> tuple[float, Array, Array]:
     """Fit the length axis and the extents of points seen from the origin.
 
     `points`: (n, 2), m: relative to the viewpoint. `typical`: (3,), m: size of the category, to tell the length from the
-    width. `known_yaw_rad`: rough yaw from elsewhere, used instead.
+    width. `known_yaw_rad`: rough yaw from elsewhere, used instead; NaN where there is none.
 
     Returns `yaw_rad`: up to half turns at best without a known one; `low`, `high`: (2,), m: ends along the length and the
     width axis, relative to the viewpoint.
     """
-    known = np.array([np.nan if known_yaw_rad is None else known_yaw_rad])
-    yaw, low, high = fit_extents_of_clusters(points, np.array([len(points)]), typical[None], known)
+    count, known = np.array([len(points)]), np.array([known_yaw_rad])
+    yaw, low, high = fit_extents_of_clusters(points, count, typical[None], known)
     return float(yaw[0]), low[0], high[0]
 
 
@@ -160,10 +160,15 @@ def fit_extents_of_clusters(
     if not known.all():
         yaw[~known] = fit_yaws(xy_m[~of_known], count[~known])[0]
     low, high = extents_of_clusters(xy_m, count, yaw)
-    for k in np.flatnonzero(~known).tolist():
-        if axes_swapped(high[k] - low[k], -(low[k] + high[k]) / 2, typical[k]):
-            yaw[k] += np.pi / 2
-            low[k], high[k] = [low[k, 1], -high[k, 0]], [high[k, 1], -low[k, 0]]
+    # A side too long for a width is the length. If both are short, the side that faces the sensor is a front or rear.
+    size, middle = high - low, np.abs(low + high)
+    is_long = size.max(axis=1) > MAX_WIDTH_FACTOR * typical[:, 1]
+    swapped = ~known & np.where(is_long, size[:, 1] > size[:, 0], middle[:, 1] > middle[:, 0])
+    yaw[swapped] += np.pi / 2
+    low[swapped], high[swapped] = (
+        np.column_stack([low[swapped, 1], -high[swapped, 0]]),
+        np.column_stack([high[swapped, 1], -low[swapped, 0]]),
+    )
     return yaw, low, high
 
 
@@ -286,19 +291,6 @@ def rotate(xy: Array, angle_rad: Array | float) -> Array:
     out = np.empty((*np.shape(first), 2), dtype=np.result_type(first))
     out[..., 0], out[..., 1] = first, x * s + y * c
     return out
-
-
-def axes_swapped(extents_m: Array, sensor: Array, typical: Array) -> bool:
-    """Decide whether a fitted yaw is along the width of the object instead of its length.
-
-    `extents_m`: (2,): along and across the fitted yaw. `sensor`: (2,) or (K, 2), m: viewpoints along and across the yaw,
-    relative to the middle of the extents. `typical`: (3,), m: size of the category.
-    """
-    # A side too long for a width is the length. If both are short, the side that faces the sensor is a front or rear.
-    if extents_m.max() > MAX_WIDTH_FACTOR * typical[1]:
-        return bool(extents_m[1] > extents_m[0])
-    along, across = np.median(np.abs(np.atleast_2d(sensor)), axis=0)
-    return bool(across > along)
 
 
 def swapped_log_odds(extents_m: Array, whole: NDArray[np.bool_], sigma_m: Array, category: str) -> float:

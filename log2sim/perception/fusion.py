@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S
 from log2sim.perception.boxes import fit_extents, place_boxes, provisional_sizes, rotate, top_of
+from log2sim.perception.detect.layouts import groups_of
 
 # Clusters are one object when this share of the points of either is inside the extents of the other.
 MIN_SHARED_POINTS = 0.4
@@ -46,8 +47,7 @@ def fuse_tick(measurements: Measurements, *, across: bool = True) -> Measurement
     )
     rows = measurements.take(order)
     # Pairs (M, M) of one group are gated: by distance if both have points, else by the covariances of two cameras.
-    group = np.array([GROUP_OF[c] for c in rows.category.tolist()], dtype=str)
-    with_points, placed = _has_points(rows), rows.source != ""
+    group, with_points, placed = groups_of(rows.category), _has_points(rows), rows.source != ""
     reach = provisional_sizes(rows).sum(axis=1) / 2
     dx, dy = (rows.center_m[:, None, axis] - rows.center_m[:, axis] for axis in range(2))
     near = np.hypot(dx, dy) <= reach[:, None] + reach
@@ -83,7 +83,7 @@ def fuse_tick(measurements: Measurements, *, across: bool = True) -> Measurement
             others = [k for k in range(len(leaders)) if k not in joined]
             out = Measurements.join([out.take(others), *joined.values()]).take(np.argsort([*others, *joined]))
     # People whose points are inside a vehicle's extents are dropped.
-    group, with_points = np.array([GROUP_OF[c] for c in out.category.tolist()], dtype=str), _has_points(out)
+    group, with_points = groups_of(out.category), _has_points(out)
     drop, length_m = np.zeros(len(out), dtype=bool), provisional_sizes(out)[:, 0]
     people, vehicles = (np.flatnonzero((group == name) & with_points) for name in ("pedestrian", "vehicle"))
     apart = out.center_m[people, None, :2] - out.center_m[vehicles, :2]
@@ -117,9 +117,9 @@ def _join(rows: Measurements, row: Measurements, merged: list[int]) -> Measureme
         timed = np.column_stack([points, np.zeros(len(points))]) if points.shape[1] == 3 else points
         parts.append(timed + np.array([0.0, 0.0, 0.0, late_s]))
     cluster = np.concatenate(parts)
-    xy, box_yaw = cluster[:, :2] - row.sensor_m[0, :2], float(row.box_yaw_rad[0])
+    xy = cluster[:, :2] - row.sensor_m[0, :2]
     typical = np.array(TYPICAL_SIZE_M[str(row.category[0])])
-    yaw, low, high = fit_extents(xy, typical, None if np.isnan(box_yaw) else box_yaw)
+    yaw, low, high = fit_extents(xy, typical, float(row.box_yaw_rad[0]))
     return place_boxes(replace(
         row, cluster=(cluster,), yaw_rad=np.array([yaw]), low_m=low[None], high_m=high[None],
         top_m=np.array([top_of(cluster[:, 2])]),
