@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import FIRST_SPEED_MPS, GROUP_OF, GROUPS, ROAD, Boxes3D, Log, Measurements, end_of, seen_from
+from log2sim.datatypes import FIRST_SPEED_MPS, ROAD, Boxes3D, Log, Measurements, end_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import corner_correction, oriented_covariance, real_ends, rotate
+from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector
@@ -115,7 +116,7 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     low, high = corner_correction(rows.low_m, rows.high_m, real, size[mine, 1])
     length = (high - low)[:, 0]
     is_whole = (
-        (_groups(boxes.take(mine)) == "vehicle")
+        (groups_of(boxes.category[mine]) == "vehicle")
         & real[:, 0].all(axis=1)
         & (rows.points >= MIN_WHOLE_POINTS)
         & (np.abs(length / boxes.size_m[mine, 0] - 1) <= MAX_LENGTH_SHARE)
@@ -170,7 +171,7 @@ class SeenBoxes:
     @classmethod
     def of(cls, boxes: Boxes3D, sensor_m: Array) -> Self:
         """Estimate the errors of boxes (M,) that were seen from a sensor at (3,), m, map frame."""
-        group = [GROUP_OF[str(c)] for c in boxes.category]
+        group = groups_of(boxes.category)
         of_sides = np.array([SIDE_WEIGHTS.get(g, SIDE_WEIGHTS["vehicle"]) for g in group]).reshape(-1, 1, 1, 7)
         side = np.exp((of_sides * side_terms(boxes, sensor_m)).sum(axis=-1))
         yaw = yaw_sigma(group, _terms_of(boxes, sensor_m))
@@ -219,7 +220,7 @@ def match_by_covariance(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     reach = (one.boxes.size_m[:, 0] + other.boxes.size_m[:, 0]) / 2
     near = (squared <= CHI2_2DOF_99) & (np.hypot(away[:, 0], away[:, 1]) <= reach)
     overlap = rectangle_iou(one.rectangles, other.rectangles) >= MIN_GROUP_IOU
-    allowed = (near | overlap) & (_groups(one.boxes) == _groups(other.boxes))
+    allowed = (near | overlap) & (groups_of(one.boxes.category) == groups_of(other.boxes.category))
     return _best(i, j, np.minimum(squared, CHI2_2DOF_99), allowed)
 
 
@@ -238,10 +239,6 @@ def _touching(a: SeenBoxes, b: SeenBoxes) -> Pairs:
     return i, j
 
 
-def _groups(boxes: Boxes3D) -> NDArray[np.str_]:
-    return np.array([GROUP_OF[str(c)] for c in boxes.category], dtype="<U16")
-
-
 def motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
     """Return the covariances (P, 2, 2) of what objects move between the times of boxes a and b, row by row the same objects.
 
@@ -254,12 +251,12 @@ def motion_covariance(a: SeenBoxes, b: SeenBoxes) -> Array:
 
 def first_speeds(boxes: Boxes3D) -> Array:
     """Return the standard deviations (M,) of the speeds of objects of which no more is known than their group, m/s."""
-    return np.array([FIRST_SPEED_MPS[GROUP_OF[str(c)]] for c in boxes.category], dtype=np.float64)
+    return np.array([FIRST_SPEED_MPS[group] for group in groups_of(boxes.category)], dtype=np.float64)
 
 
 def is_walking(boxes: Boxes3D) -> NDArray[np.bool_]:
     """Mark the boxes (M,) of objects that move in any direction, and whose axes say little."""
-    return np.array([GROUP_OF[str(c)] in ("pedestrian", "other") for c in boxes.category], dtype=bool)
+    return np.isin(groups_of(boxes.category), ("pedestrian", "other"))
 
 
 ROUNDS = 4
@@ -320,15 +317,15 @@ CHI2_5DOF_999 = 20.5
 # What was too far off to match at first does once others have shown the offset.
 OFFSET_ROUNDS = 2
 
-Merge = Callable[[SeenBoxes, SeenBoxes], SeenBoxes]
-
 
 @dataclass(frozen=True)
 class Method:
     """How boxes of two ends are joined."""
 
     match: Callable[[SeenBoxes, SeenBoxes], Pairs]  # of two sets of boxes, which belong together
-    merge: Merge  # of two sets of P boxes that belong together row by row, the joined ones
+    merge: Callable[
+        [SeenBoxes, SeenBoxes], SeenBoxes
+    ]  # of two sets of P boxes that belong together row by row, the joined ones
     # Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
     # pose
     refines: bool
@@ -349,9 +346,7 @@ def fuse_boxes(a: SeenBoxes, b: SeenBoxes, method: Method) -> SeenBoxes:
     rest_a, rest_b = (np.setdiff1d(np.arange(len(seen)), taken) for seen, taken in ((a, i), (b, j)))
     parts = [method.merge(a.take(i), b.take(j)), a.take(rest_a), b.take(rest_b)]
     out = join([part for part in parts if len(part)])
-    names = tuple(GROUPS)
-    group = np.array([names.index(GROUP_OF[str(c)]) for c in out.boxes.category], dtype=np.intp)
-    return out.take(suppress(out.rectangles, out.boxes.score, group))
+    return out.take(suppress(out.rectangles, out.boxes.score, groups_of(out.boxes.category)))
 
 
 def join(parts: list[SeenBoxes]) -> SeenBoxes:
@@ -548,7 +543,7 @@ def align_parts(cloud: Cloud, before: Sequence[Boxes3D]) -> Cloud:
 def moving_boxes(earlier: Boxes3D, later: Boxes3D) -> tuple[Boxes3D, Array]:
     """Return the boxes (M,) of the later moment that moved along their axis since the earlier one, and their speeds (M,), m/s."""
     a, b = (
-        found.take(np.isin(_groups(found), ("vehicle", "two_wheeler")) & (found.score >= MIN_MOVED_SCORE))
+        found.take(np.isin(groups_of(found.category), ("vehicle", "two_wheeler")) & (found.score >= MIN_MOVED_SCORE))
         for found in (earlier, later)
     )
     if not len(a) or not len(b):

@@ -38,6 +38,7 @@ from log2sim.files.packing import digest_of
 from log2sim.files.processes import map_in_processes
 from log2sim.files.stages import StageClock, usable_threads
 from log2sim.geometry import Array, inverse, line_stamps_ns
+from log2sim.perception.boxes import subsample
 from log2sim.perception.cooperative import align_parts
 from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.detect3d.detectors import LidarDetector
@@ -476,13 +477,12 @@ class FirstPass:
             seen = project_points(view, cloud.origin, cloud.columns.take(cloud.ground_sample, axis=1))
             if not len(seen.index):
                 continue
-            count = min(MAX_GROUND_POINTS_PER_FRAME, len(seen.index))
-            some = np.linspace(0, len(seen.index) - 1, count).round().astype(np.intp)
+            some = subsample(np.arange(len(seen.index)), MAX_GROUND_POINTS_PER_FRAME)
             uv = np.stack([seen.u, seen.v], axis=1)[some].astype(np.float64)
             points = cloud.xyz[cloud.ground_sample[seen.index[some]]].astype(np.float64) + cloud.origin
             ego_T_map = inverse(base_poses(self.log, line_stamps_ns(sensor, view.t_ns, uv)))
             xy = ((ego_T_map[:, :3, :3] @ points[:, :, None])[:, :, 0] + ego_T_map[:, :3, 3])[:, :2]
-            number = np.full(count, tick, dtype=np.int64)
+            number = np.full(len(some), tick, dtype=np.int64)
             out.ground[sensor.name] = Correspondences(undistorted_pixels(sensor, uv), xy, number)
         return out
 

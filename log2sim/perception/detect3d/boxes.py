@@ -25,7 +25,7 @@ MAX_OVERLAP_OF_SMALLER = 0.5
 MIN_DISTANCE_WIDTHS = 0.5
 
 
-def suppress(boxes: Array, score: Array, group: NDArray[np.intp], *, across: bool = True) -> NDArray[np.intp]:
+def suppress(boxes: Array, score: Array, group: NDArray[Any], *, across: bool = True) -> NDArray[np.intp]:
     """Choose the boxes that no stronger chosen one excludes.
 
     `boxes`: (M, 5): x, y, length, width, yaw. `score`: (M,). `group`: (M,): boxes of one group exclude each other by IoU and by

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array, Camera, apply_homography, inverse, shift_poses
+from log2sim.perception.boxes import subsample
 from log2sim.perception.homography.correspondences import Correspondences
 from log2sim.perception.homography.estimate import (
     FOOT_SIGMA_M,
@@ -355,7 +356,7 @@ def fit_feet(
             own = np.flatnonzero((rows.camera == k) & np.isfinite(linear.squared))
             if len(own) < 2:
                 continue
-            some = own[np.linspace(0, len(own) - 1, min(len(own), MAX_CANDIDATES)).round().astype(np.intp)]
+            some = subsample(own, MAX_CANDIDATES)
             # Rotations about x and y of the camera alone: two equations of a foot, two unknowns.
             slope = linear.slope[some][:, :, 2:4]
             usable = np.abs(np.linalg.det(slope)) > 1e-9

@@ -22,6 +22,7 @@ from log2sim.perception.boxes import (
     subsample,
     upper_median,
 )
+from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.projection import ProjectedPoints, View
 
@@ -240,7 +241,7 @@ def place_few_points(seen: Shown, columns: dict[str, Any], rows: Index, boxes_px
     A body is where two or more points inside its box have a depth at which the box is as high as a person. Points that go
     on at that depth on both sides of the box or above it belong to a wall, a fence or a pole.
     """
-    small = np.array([GROUP_OF[c] in GROUPS_OF_FEW_POINTS for c in columns["category"][rows].tolist()], dtype=bool)
+    small = np.isin(groups_of(columns["category"][rows]), GROUPS_OF_FEW_POINTS)
     wanted = rows[small & (columns["source"][rows] == "") & ~columns["truncated"][rows]]
     extended = rows[np.isfinite(columns["low_m"][rows, 0])]
     u, v, depth, index = seen.visible.u, seen.visible.v, seen.visible.depth, seen.points[seen.visible.index]

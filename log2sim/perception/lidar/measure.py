@@ -47,6 +47,7 @@ from log2sim.perception.boxes import (
     sort_clusters,
     upper_median,
 )
+from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
@@ -225,7 +226,7 @@ def match_boxes(boxes: Boxes3D, images: Measurements, frame: Index, views: Seque
         of_frame = np.flatnonzero(frame == k)
         iou[:, of_frame] = box_iou(np.nan_to_num(projected.box_px), images.box_px[of_frame])
     # Categories of one group may be of one object, and those that are confused with each other.
-    a, b = (np.array([GROUP_OF[str(c)] for c in of.category], dtype="<U16") for of in (boxes, images))
+    a, b = groups_of(boxes.category), groups_of(images.category)
     allowed = [(a[:, None] == one) & (b == other) for one, other in RELATED_GROUPS]
     iou[~np.logical_or.reduce([a[:, None] == b, *allowed])] = 0.0
     pairs = np.argwhere(iou >= MIN_IOU)
