@@ -259,20 +259,16 @@ def cell_count(size: tuple[int, int]) -> int:
     return sum((size[0] // s) * (size[1] // s) for s in STRIDES)
 
 
-# YOLOX before decoding: (1, cells, 5 + C), offsets in cells, logarithms of sizes, objectness, class scores.
-
-
 def _from_yolox(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Decode rows (1, cells, 5 + C): offsets in cells, logarithms of sizes, objectness, class scores (YOLOX)."""
     raw = largest_output(outputs)[0]
     if len(raw) != cell_count(size):
         raise ConfigError(f"layout yolox: expected {cell_count(size)} rows for an input of {size}; found {len(raw)}")
     row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
     # Cells are numbered row by row, those of fine strides first.
     grids = [np.mgrid[: size[1] // s, : size[0] // s][::-1].reshape(2, -1).T for s in STRIDES]
-    cell, stride = (
-        np.concatenate(grids).astype(np.float64),
-        np.repeat(np.array(STRIDES, float), [len(g) for g in grids]),
-    )
+    cell = np.concatenate(grids).astype(np.float64)
+    stride = np.repeat(np.array(STRIDES, float), [len(g) for g in grids])
     picked = raw[row].astype(np.float64)
     with np.errstate(over="ignore"):  # an infinite size is dropped with the other boxes that are not finite
         extent = np.exp(picked[:, 2:4]) * stride[row, None]
@@ -280,10 +276,8 @@ def _from_yolox(outputs: Outputs, size: Size, classes: Classes, min_score: float
     return Candidates(corners_from_centers(np.concatenate([center, extent], axis=1)), score, category)
 
 
-# Decoded rows (1, N, 5 + C): center, size in px of the input, objectness, class scores (YOLOv5, v6, v7, YOLOX).
-
-
 def _from_rows(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Take rows (1, N, 5 + C): center, size in px of the input, objectness, class scores (YOLOv5, v6, v7, YOLOX)."""
     raw = largest_output(outputs)[0]
     row, score, category = classes.best(raw[:, 5:] * raw[:, 4:5], min_score)
     return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
@@ -293,29 +287,23 @@ def _count_in_rows(outputs: Outputs) -> int:
     return int(largest_output(outputs).shape[2]) - 5
 
 
-# YOLOv8, v9, 11, 12: columns (1, 4 + C, N) of center, size in px of the input, and class scores.
-
-
 def _from_yolov8(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Take columns (1, 4 + C, N): center, size in px of the input, class scores (YOLOv8, v9, 11, 12)."""
     raw = largest_output(outputs)[0].T
     row, score, category = classes.best(raw[:, 4:], min_score)
     return Candidates(corners_from_centers(raw[row, :4].astype(np.float64)), score, category)
 
 
-# YOLOv10 and other end-to-end exports: rows (1, N, 6) of u0, v0, u1, v1 in px of the input, score, class id.
-
-
 def _from_yolov10(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Take rows (1, N, 6): u0, v0, u1, v1 in px of the input, score, class id (YOLOv10, other end-to-end exports)."""
     raw = largest_output(outputs)[0].astype(np.float64)
     category = classes.categories_of(raw[:, 5])
     keep = (raw[:, 4] >= min_score) & (category != "")
     return Candidates(raw[keep, :4], raw[keep, 4], category[keep])
 
 
-# TensorFlow object detection API: boxes v0, u0, v1, u1 in 0-1, classes as COCO ids from 1, already suppressed.
-
-
 def _from_tf_od(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Decode TensorFlow's object detection API: boxes v0, u0, v1, u1 in 0-1, classes as COCO ids from 1, suppressed."""
     score = required_output(outputs, "detection_scores")[0].astype(np.float64)
     number = find_output(outputs, "num_detections")
     count = len(score) if number is None else min(len(score), int(number.ravel()[0]))
@@ -323,9 +311,6 @@ def _from_tf_od(outputs: Outputs, size: Size, classes: Classes, min_score: float
     category = classes.categories_of(required_output(outputs, "detection_classes")[0, :count])
     keep = (score[:count] >= min_score) & (category != "")
     return Candidates(from_normalized(box[keep], size), score[:count][keep], category[keep])
-
-
-# The same family before its suppression: `boxes` (1, N, 4) as above and `scores` (1, N, C) after the sigmoid.
 
 
 def _is_tf_od_raw(outputs: Outputs, shape: tuple[int, int], cells: int) -> bool:
@@ -336,6 +321,7 @@ def _is_tf_od_raw(outputs: Outputs, shape: tuple[int, int], cells: int) -> bool:
 
 
 def _from_tf_od_raw(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Decode that API before its suppression: `boxes` (1, N, 4) likewise, and `scores` (1, N, C) after the sigmoid."""
     row, score, category = classes.best(required_output(outputs, "scores")[0], min_score)
     box = required_output(outputs, "boxes")[0][row].astype(np.float64)
     return Candidates(from_normalized(box, size), score, category)
@@ -346,10 +332,8 @@ def from_normalized(box_vuvu: Array, size: Size) -> Array:
     return box_vuvu.reshape(-1, 4)[:, [1, 0, 3, 2]] * np.array([*size, *size], dtype=np.float64)
 
 
-# RT-DETR: boxes as center and size in 0-1; (1, 300, 4 + C) with scores, or `pred_boxes` and `logits` apart.
-
-
 def _from_rt_detr(outputs: Outputs, size: Size, classes: Classes, min_score: float) -> Candidates:
+    """Decode RT-DETR: center and size in 0-1; (1, 300, 4 + C) with scores, or `pred_boxes` and `logits` apart."""
     box, class_scores = _rt_detr_parts(outputs)
     row, score, category = classes.best(class_scores, min_score)
     scaled = corners_from_centers(box[row].astype(np.float64)) * np.array([*size, *size], dtype=np.float64)
