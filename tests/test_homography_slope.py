@@ -44,7 +44,7 @@ class Drive:
     def fit(self) -> HomographyFit:
         none = Correspondences.join([])
         fit, _ = fit_camera(self.data, none, EstimationOptions(), rng=np.random.default_rng(0))
-        return fit_slope(fit, self.data, K, self.poses, 4.0, 0.2)
+        return fit_slope(fit, self.data, K, self.poses)
 
     def ground(self, tick: int, xy: np.ndarray) -> np.ndarray:
         """Points (N, 3) of the ground; once the ego is past the bend, it sees the other plane behind it alone."""

@@ -14,14 +14,13 @@ from log2sim.geometry import Array, Camera, ground_homography, inverse, line_sta
 from log2sim.perception.first_pass import Observations, base_poses
 from log2sim.perception.homography.correspondences import Correspondences, feet_of_boxes, undistorted_pixels
 from log2sim.perception.homography.estimate import (
-    FOOT_SIGMA_M,
     FOOT_SIGMA_PX,
     MAX_CONDITION,
     STREAM_METHODS,
     EstimationOptions,
     fit_camera,
 )
-from log2sim.perception.homography.fit import HomographyFit, refused_fit
+from log2sim.perception.homography.fit import HomographyFit
 from log2sim.perception.homography.place import place_obstacle, spanned_height_m
 from log2sim.perception.homography.rig import SAMPLES, Rig, RigFit, fit_rig
 from log2sim.perception.homography.slope import fit_slope, slope_homography
@@ -105,7 +104,7 @@ def fit_homographies(
         # A second plane of the road, by the feet of obstacles where they were many.
         stamps = {k: m.t_ns[m.camera == name] for k, m in enumerate(observed.measurements)}
         map_T_base = {k: base_poses(log, t_ns[:1])[0] for k, t_ns in stamps.items() if len(t_ns)}
-        fit = fit_slope(one.fit, feet[name], one.camera.K, map_T_base, FOOT_SIGMA_PX, FOOT_SIGMA_M)
+        fit = fit_slope(one.fit, feet[name], one.camera.K, map_T_base)
         out[name] = replace(one, fit=fit)
     return out
 
@@ -159,9 +158,8 @@ def calibrated_homography(log: Log, camera: Camera) -> HomographyFit | None:
         found.append(h / np.linalg.norm(h[2]))
     h = found[0]
     by_tilt = np.array([f - h for f in found[1:]]).reshape(2, 9)
-    s = np.linalg.svd(h, compute_uv=False)
-    fit = HomographyFit(True, "", h, refused_fit("", 0).inliers, float("nan"), float(s[0] / s[-1]))
-    return replace(fit, covariance=by_tilt.T @ by_tilt)
+    s, no_rows = np.linalg.svd(h, compute_uv=False), np.zeros(0, dtype=bool)
+    return HomographyFit(True, "", h, no_rows, float("nan"), float(s[0] / s[-1]), covariance=by_tilt.T @ by_tilt)
 
 
 def place_by_homography(

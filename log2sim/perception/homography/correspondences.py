@@ -178,10 +178,8 @@ def foot_points(camera: Camera, measured: Measurements, ego_T_map: Array, tick: 
     boxes = measured.box_px[rows]
     feet = undistorted_pixels(camera, feet_of_boxes(boxes))
     # Where their heights in the image and average heights put them; NaN for boxes without height.
-    height_m, height_px = (
-        np.array([TYPICAL_SIZE_M[str(c)][2] for c in measured.category[rows]]),
-        boxes[:, 3] - boxes[:, 1],
-    )
+    height_m = np.array([TYPICAL_SIZE_M[str(c)][2] for c in measured.category[rows]])
+    height_px = boxes[:, 3] - boxes[:, 1]
     ego_T_cam = camera.mount_T_cam if camera.mount == "ego" else ego_T_map.reshape(-1, 4, 4)[0] @ camera.mount_T_cam
     depth = camera.K[1, 1] * height_m / np.where(height_px > 0, height_px, np.nan)
     rays = np.column_stack([(feet - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], np.ones(len(feet))])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from log2sim.files.arrays import Columns
 from log2sim.geometry import CHI2_2DOF_99, Array
 from log2sim.perception.homography.correspondences import Correspondences
-from log2sim.perception.homography.estimate import MIN_FEET
+from log2sim.perception.homography.estimate import FOOT_SIGMA_M, FOOT_SIGMA_PX, MIN_FEET
 from log2sim.perception.homography.fit import HomographyFit, RoadSlope, by_elements
 from log2sim.perception.homography.normalized import TRUNCATED_VARIANCE_SHARE, scale_free_basis, scaled
 from log2sim.perception.homography.pitch_roll import (
@@ -64,22 +64,18 @@ class _Planes:
         return np.array([np.cos(self.direction_rad), np.sin(self.direction_rad), -self.offset_m])
 
 
-def fit_slope(
-    fit: HomographyFit, data: Correspondences, K: Array, map_T_base: dict[int, Array], sigma_px: float, sigma_m: float
-) -> HomographyFit:
+def fit_slope(fit: HomographyFit, data: Correspondences, K: Array, map_T_base: dict[int, Array]) -> HomographyFit:
     """Fit two planes instead of one to correspondences, and keep them if they lower errors at places that are held out.
 
-    `K`: (3, 3). `map_T_base`: (4, 4) by tick, of the frame of the ground positions; ticks without a pose are left out.
-    `sigma_px`, `sigma_m`: standard deviations of the correspondences up to a common factor.
+    `data`: of feet. `K`: (3, 3). `map_T_base`: (4, 4) by tick, of the frame of the ground positions; ticks without a pose are
+    left out.
     """
     known = np.isin(data.tick, list(map_T_base)) & np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1)
     if not fit.ok or np.count_nonzero(known) < MIN_FEET:
         return fit
     data = data.take(known)
-    rows, start = (
-        _rows(fit, data, map_T_base, sigma_px, sigma_m),
-        _Planes(np.asarray(np.linalg.inv(fit.ground_H_image), dtype=np.float64)),
-    )
+    rows = _rows(fit, data, map_T_base)
+    start = _Planes(np.asarray(np.linalg.inv(fit.ground_H_image), dtype=np.float64))
     cell = np.floor(rows.xy_map / CELL_M).astype(np.int64)
     place, parity = np.unique(cell, axis=0, return_inverse=True)[1].ravel(), cell.sum(axis=1) % 2
     if np.bincount(parity, minlength=2).min() < MIN_FEET // 4:
@@ -152,9 +148,7 @@ def image_of_up(image_H_ground: Array, K: Array) -> Array:
     return np.asarray(K @ np.cross(x, y) / np.sqrt(np.linalg.norm(x) * np.linalg.norm(y)))
 
 
-def _rows(
-    fit: HomographyFit, data: Correspondences, map_T_base: dict[int, Array], sigma_px: float, sigma_m: float
-) -> _Rows:
+def _rows(fit: HomographyFit, data: Correspondences, map_T_base: dict[int, Array]) -> _Rows:
     uv = data.uv if fit.per_tick is None else stabilized(data, fit).uv
     poses = np.array([map_T_base[t] for t in data.tick.tolist()])
     xy1 = np.column_stack([data.xy_ego, np.ones(len(data))])
@@ -162,7 +156,7 @@ def _rows(
     q = xy1 @ h.T
     depth = np.where(q[:, 2:] > 0, q[:, 2:], np.inf)
     by_ground = (h[:2, :2] - (q[:, :2] / depth)[:, :, None] * h[2, :2]) / depth[:, :, None]
-    covariance = sigma_px**2 * np.eye(2) + sigma_m**2 * by_ground @ by_ground.swapaxes(1, 2)
+    covariance = FOOT_SIGMA_PX**2 * np.eye(2) + FOOT_SIGMA_M**2 * by_ground @ by_ground.swapaxes(1, 2)
     xy_map = (poses[:, :2, :2] @ data.xy_ego[:, :, None])[:, :, 0] + poses[:, :2, 3]
     return _Rows(uv, xy1, xy_map, poses[:, :2, 3], np.linalg.inv(np.linalg.cholesky(covariance)))
 
