@@ -36,7 +36,7 @@ from log2sim.perception.detect.detectors import (
     create_detector,
 )
 from log2sim.perception.detect.onnx_detector import OnnxDetector
-from log2sim.perception.detect3d.detectors import PREFIX, CheckedLidarDetector, LidarDetector, create_lidar_detector
+from log2sim.perception.detect3d.detectors import CheckedLidarDetector, LidarDetector, create_lidar_detector
 
 KEY_BYTES = 16
 MAX_NAME_CHARACTERS = 48
@@ -367,7 +367,7 @@ def check_detectors(config: Config) -> None:
         else:
             create_image_detector(log, config)
     for name in sorted(sweeps - {"", AUTO}):
-        plain = name.removeprefix(PREFIX)
+        plain = name.removeprefix(LIDAR_PREFIX)
         if plain != name and _is_of_another_package("lidar_detector", plain):
             plugins.load("lidar_detector", plain)
         else:

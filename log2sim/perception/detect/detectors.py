@@ -272,7 +272,6 @@ class LabelDetector:
     """Detector that returns the labels of a log; it never decodes an image."""
 
     log: Log
-    min_score: float = 0.0
     name: str = "labels"
     default_min_score: float = 0.0
 

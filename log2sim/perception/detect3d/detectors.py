@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.config import LidarConfig
+from log2sim.config import LIDAR_PREFIX, LidarConfig
 from log2sim.datatypes import GROUPS, Boxes3D, Log
 from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
@@ -92,8 +92,8 @@ def describe_weakness(name: str) -> str:
 
     The figures are those of the JSON file next to its second stage.
     """
-    file = WEIGHTS / f"{name.removeprefix('lidar:')}.boxes.json"
-    if not name.startswith("lidar:") or name.endswith(".onnx") or not file.is_file():
+    file = WEIGHTS / f"{name.removeprefix(LIDAR_PREFIX)}.boxes.json"
+    if not name.startswith(LIDAR_PREFIX) or name.endswith(".onnx") or not file.is_file():
         return ""
     card = json.loads(file.read_text(encoding="utf-8"))["simulated"]
     groups = {group: card[group] for group in GROUPS if group in card}
@@ -127,9 +127,9 @@ class NetworkDetector:
 
     name: str
     network: Network
-    decode: Literal["centers", "votes"]  # "centers" or "votes": see `LidarConfig`
+    decode: Literal["centers", "votes"]  # see `LidarConfig`
     range_m: float  # largest distance from the sensor along x and along y, m
-    min_score: float | None  # or None: lowest score of a box; None for the network's own of each group
+    min_score: float | None  # lowest score of a box; None for the network's own of each group
     refinement: Refinement | None = None  # second stage, for boxes at centers
 
     @property
@@ -181,10 +181,8 @@ class NetworkDetector:
                 # Points are counted, which takes longest, for those alone that reach the least score with as many as they may
                 # hold, or with none.
                 counts, reach = np.rint(np.expm1(3 * grid[3])), bounding_reach(boxes.size_m, boxes.yaw_rad)
-                most, range_m = (
-                    most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach),
-                    ranges_m(boxes, sensors),
-                )
+                most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
+                range_m = ranges_m(boxes, sensors)
                 best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))
                 least = self._least(boxes)
                 boxes = boxes.take(best >= (least if self.refinement is None else np.minimum(least, MIN_FIRST_SCORE)))
@@ -256,7 +254,6 @@ def open_shipped(name: str, settings: LidarConfig) -> NetworkDetector:
     return open_network(path, settings, name=f"lidar:{name}")
 
 
-PREFIX = "lidar:"
 MEMBERS = ("name", "detect")
 
 
@@ -287,19 +284,19 @@ def create_lidar_detector(name: str, log: Log, settings: LidarConfig) -> LidarDe
     Raises `ConfigError`: an unknown name, or a file that is no usable network; `MissingExtra`: the detector's package is
     not installed.
     """
-    if not name.startswith(PREFIX):
+    if not name.startswith(LIDAR_PREFIX):
         raise ConfigError(
-            f"LiDAR detector '{name}': expected a name that begins with '{PREFIX}', such as lidar:vehicle"
+            f"LiDAR detector '{name}': expected a name that begins with '{LIDAR_PREFIX}', such as lidar:vehicle"
         )
-    rest = name.removeprefix(PREFIX)
+    rest = name.removeprefix(LIDAR_PREFIX)
     if rest.lower().endswith(".onnx"):
-        return open_network(Path(rest), settings, name=f"{PREFIX}{Path(rest).name}")
+        return open_network(Path(rest), settings, name=f"{LIDAR_PREFIX}{Path(rest).name}")
     try:
         create = plugins.load("lidar_detector", rest)
     except PluginError:
         raise
     except ConfigError as error:
-        raise ConfigError(f"{error}, or {PREFIX} and the path of an ONNX file (ending in .onnx)") from None
+        raise ConfigError(f"{error}, or {LIDAR_PREFIX} and the path of an ONNX file (ending in .onnx)") from None
     with plugins.blaming("lidar_detector", rest):
         detector: LidarDetector = create(log, settings)
     if plugins.is_built_in("lidar_detector", rest):

@@ -345,8 +345,7 @@ class Network:
                 f"{self.path}: output 'maps' is {maps.dtype} {maps.shape} for a grid {grid.shape}; expected float32 "
                 f"{expected} by the groups, categories and stride in '{METADATA_KEY}'"
             )
-        result: NDArray[np.float32] = maps[0]
-        return result
+        return np.asarray(maps[0])
 
 
 def load_network(path: Path) -> Network:

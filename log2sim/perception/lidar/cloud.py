@@ -91,14 +91,12 @@ def estimate_ground(xyz: NDArray[np.floating[Any]], center: Array, z_hint: float
             scaled = np.where(above_m > 0, above_m, above_m / 2) / tolerance
             weight = nearness / (1 + scaled**2) ** 2
         surface = all_terms @ solution
-    lowest = np.where(filled, lowest, 0.0)
-    residual = np.where(filled, lowest - surface, 0.0)
     for widened in (2.0, 1.0):
+        residual = np.where(filled, lowest - surface, 0.0)
         on_ground = (residual < widened * ON_GROUND_M) & (residual > -widened * ACCEPT_BELOW_M)
         weight = (filled & on_ground).astype(np.float64)
         total, blurred = _blur(weight), _blur(weight * residual)
         surface = surface + np.divide(blurred, total, out=np.zeros_like(total), where=total > 1e-6)
-        residual = np.where(filled, lowest - surface, 0.0)
     return Ground(np.asarray(center, dtype=np.float64), surface)
 
 
