@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,7 +29,6 @@ from log2sim.datatypes import (
     Sweep,
     end_of,
 )
-from log2sim.errors import RecordError
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.cluster import Sent, count_workers, map_on_workers
 from log2sim.files.inputs import following_links
@@ -61,7 +59,7 @@ from log2sim.perception.lidar.measure import Frame as MeasuredFrame
 from log2sim.perception.lidar.measure import measure, outside_ego
 from log2sim.perception.lidar.projection import View, project_boxes_in_view, project_points, view_of
 from log2sim.perception.records import Look, RecordSource, RecordWatch, SweepSketch, sketch_sweep
-from log2sim.perception.run_detectors import Detectors, GivenDetectors, create_detectors, open_store
+from log2sim.perception.run_detectors import Detectors, GivenDetectors, create_detectors, digest_of_record, open_store
 from log2sim.perception.sync import Schedule
 from log2sim.plan import FusionLevel, Plan, Stage
 
@@ -257,7 +255,7 @@ class Observations:
     # Number of sweeps by how they were compensated, see `compensation_of`
     sweeps: Counter[str] = field(default_factory=Counter)
     frames_detected: int = 0
-    frames_skipped: Mapping[str, int] = field(default_factory=dict)  # by camera
+    frames_skipped: Counter[str] = field(default_factory=Counter)  # by camera
     # Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched
     unseen: dict[str, list[int]] = field(default_factory=dict)
     faults: tuple[Finding, ...] = ()  # of the records
@@ -277,18 +275,14 @@ class Observations:
 
 @dataclass(eq=False)
 class SeenTick:
-    """What the first pass takes from one tick."""
+    """What the first pass takes from one tick, see `Observations`."""
 
-    # Of all cameras and of the sweeps, not fused; rows of a camera without LiDAR points have no position
     measurements: Measurements = field(default_factory=Measurements.empty)
-    # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera, where a homography needs
-    # them
-    feet: dict[str, Correspondences] = field(default_factory=dict)
+    feet: dict[str, Correspondences] = field(default_factory=dict)  # where a homography needs them, as `ground`
     ground: dict[str, Correspondences] = field(default_factory=dict)
     obstacles: Obstacles | None = None
     lights: list[LightBox] = field(default_factory=list)
-    # Number of detections by camera and by name of the detector in sweeps
-    found: dict[str, int] = field(default_factory=dict)
+    found: dict[str, int] = field(default_factory=dict)  # number of `detections`
     frames: int = 0  # how many were searched
     # `skipped`, `unseen`: cameras whose frame was not searched, and those of which it says nothing
     skipped: list[str] = field(default_factory=list)
@@ -304,7 +298,7 @@ class Part:
     read: dict[str, int]
     failed: dict[str, list[str]]
     compensated: dict[tuple[str, int], str]
-    before: list[tuple[Key, Boxes3D]]  # list of (Key, Boxes3D): see `CloudMaker`, after these ticks
+    before: list[tuple[Key, Boxes3D]]  # see `CloudMaker`, after these ticks
 
 
 PACKED = (
@@ -318,7 +312,7 @@ class Task:
 
     ticks: range
     watch: RecordWatch  # what is known of the records before them
-    before: list[tuple[Key, Boxes3D]]  # list of (Key, Boxes3D): see `CloudMaker`, before these ticks
+    before: list[tuple[Key, Boxes3D]]  # see `CloudMaker`, before these ticks
     judged: bool = False  # whether all that is to be known of the records is known already
 
 
@@ -382,11 +376,7 @@ class FirstPass:
         described: list[Any] = []
         for name, index in (*(key for key in shown if key[1] >= 0), *self.clouds.sweeps_of(ticks)):
             stream = self.log.streams[name]
-            try:  # its file where the log has one, which is not decoded then, else what it holds
-                of_file = None if stream.encoded is None else hashlib.blake2b(stream.encoded(index)).hexdigest()
-                digest = of_file or digest_of(records.require(name, index))
-            except RecordError as error:
-                digest = str(error)
+            digest = digest_of_record(stream, index, partial(records.require, name))
             described.append([name, index, int(stream.t_ns[index]), digest])
         sweeps = {name: index[:, ticks.start : ticks.stop] for name, index in self.schedule.sweeps.items()}
         before = task.before if self.plan.fusion is FusionLevel.POINTS else []
@@ -546,8 +536,6 @@ def observe(
     records = out.records = RecordSource(log)
     before: list[tuple[Key, Boxes3D]] = []
     compensated: dict[tuple[str, int], str] = {}
-    skipped: Counter[str] = Counter()
-
     tasks = (Task(ticks, records.watch, before) for ticks in ranges)
     if client is None:
         parts = map_in_processes(first_pass.observe, tasks, jobs)
@@ -574,7 +562,7 @@ def observe(
                 if len(out.lights) < MAX_CROPS:
                     out.lights += seen.lights
                 out.frames_detected += seen.frames
-                skipped.update(seen.skipped)
+                out.frames_skipped.update(seen.skipped)
                 for camera in seen.unseen:
                     out.unseen.setdefault(camera, []).append(tick)
                 progress(tick + 1, len(schedule))
@@ -584,5 +572,4 @@ def observe(
     used = dict.fromkeys([*schedule.frames, *schedule.sweeps])
     out.sweeps = Counter(compensated.values())
     out.faults = records.watch.faults(used, int(schedule.t_ns[0]), int(schedule.t_ns[-1]))
-    out.frames_skipped = dict(skipped)
     return out

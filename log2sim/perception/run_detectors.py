@@ -129,19 +129,21 @@ class StageCache:
         encoded = None if stream.encoded is None else noting(stream.encoded)
         return Stream(stream.name, lambda: stream.t_ns, noting(stream.read), encoded)
 
-    def _content(self, records: Iterable[tuple[str, int]]) -> str:
-        """Return a digest of records: of their files where the log has them, which are not decoded then, else of what they hold."""
-        value = hashlib.blake2b(digest_size=KEY_BYTES)
+    def _content(self, records: Collection[tuple[str, int]]) -> str:
+        """Return a digest of records."""
         for name, i in records:
-            stream = self._streams[name]
             if (name, i) not in self._digests:
-                try:
-                    found = digest_of(stream.read(i)) if stream.encoded is None else _digest(stream.encoded(i)).hex()
-                except RecordError as error:
-                    found = _digest(str(error).encode()).hex()
-                self._digests[name, i] = found
-            value.update(self._digests[name, i].encode())
-        return value.hexdigest()
+                stream = self._streams[name]
+                self._digests[name, i] = digest_of_record(stream, i, stream.read)
+        return _digest(*(self._digests[name, i].encode() for name, i in records)).hex()
+
+
+def digest_of_record(stream: Stream, i: int, read: Callable[[int], Any]) -> str:
+    """Return a digest of a record: of its file where the log has one, which is not read then, else of what it holds."""
+    try:
+        return digest_of(read(i)) if stream.encoded is None else _digest(stream.encoded(i)).hex()
+    except RecordError as error:
+        return _digest(str(error).encode()).hex()
 
 
 def _sensors(log: Log) -> list[Any]:
