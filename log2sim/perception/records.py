@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy, deepcopy
@@ -337,10 +338,8 @@ class LidarWatch:
             # (Broder, "On the resemblance and containment of documents", 1997). With the Jaccard index J of two sets of one size the
             # share is 2 J / (1 + J).
             either = np.union1d(before.hashes, sketch.hashes)[: max(len(before.hashes), len(sketch.hashes))]
-            both = np.isin(either, before.hashes, assume_unique=True) & np.isin(
-                either, sketch.hashes, assume_unique=True
-            )
-            jaccard = float(both.mean()) if len(either) else 0.0
+            shared = np.intersect1d(before.hashes, sketch.hashes, assume_unique=True)
+            jaccard = float(np.isin(either, shared, assume_unique=True).mean()) if len(either) else 0.0
             share, motion = 2 * jaccard / (1 + jaccard), motion_of(self.log, self.name, last_since_ns, t_ns)
             if motion == "drives":  # only where all points of structures are in other cells
                 poses, _ = self.log.map_T_sensor(self.name, np.array([last_since_ns, t_ns]))
@@ -473,11 +472,9 @@ class RecordWatch:
             gaps = np.flatnonzero(np.diff(around) > shortest_ns)
             for rows in [gaps] if len(gaps) > MAX_SPANS else gaps[:, None]:
                 start_s, end_s = ((around[[rows[0], rows[-1] + 1]] - start_ns) / NS_PER_S).tolist()
-                longest_s = float(np.diff(around)[rows].max()) / NS_PER_S
+                values = {"gaps": float(len(rows)), "longest_s": float(np.diff(around)[rows].max()) / NS_PER_S}
                 kind = "missing_images" if name in self.cameras else "missing_sweeps"
-                found.append(
-                    Finding(kind, name, "kept", start_s, end_s, {"gaps": float(len(rows)), "longest_s": longest_s})
-                )
+                found.append(Finding(kind, name, "kept", start_s, end_s, values))
         return tuple(found)
 
 
@@ -497,7 +494,7 @@ class RecordSource:
 
     def __init__(self, log: Log, watch: RecordWatch | None = None) -> None:
         self.log = log
-        self.read: dict[str, int] = {}
+        self.read = Counter[str]()
         self.failed: dict[str, list[str]] = {}
         self.watch = RecordWatch(log) if watch is None else watch
         self.looks: dict[tuple[str, int], Look] = {}
@@ -517,7 +514,7 @@ class RecordSource:
         except RecordError as error:
             self.add({}, {stream: [str(error)]})
             raise
-        self.count(stream)
+        self.read[stream] += 1
         return record
 
     def get(self, stream: str, index: int) -> Any | None:
@@ -539,7 +536,7 @@ class RecordSource:
             with suppress(RecordError):  # which is told when it is read whole
                 file = stream.encoded(index)
                 image = decode_image(file, camera, (width_px, height_px), least_px=least_px, gray=gray)
-                self.count(camera)
+                self.read[camera] += 1
         if image is None:
             image = self.get(camera, index)
             if image is None:
@@ -550,14 +547,9 @@ class RecordSource:
             image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
         return image
 
-    def count(self, stream: str) -> None:
-        """Count a record of a stream as read, also one whose content is known already."""
-        self.read[stream] = self.read.get(stream, 0) + 1
-
     def add(self, read: Mapping[str, int], failed: Mapping[str, Sequence[str]]) -> None:
         """Add what another source of the log counted; a record that was requested again failed again."""
-        for stream, number in read.items():
-            self.read[stream] = self.read.get(stream, 0) + number
+        self.read.update(read)
         for stream, problems in failed.items():
             known = self.failed.setdefault(stream, [])
             known += [problem for problem in problems if problem not in known]

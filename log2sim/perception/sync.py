@@ -179,9 +179,8 @@ def sweep_middle_ns(log: Log, lidar: str) -> int:
     for i in range(min(PROBED_RECORDS, len(log.streams[lidar].t_ns))):
         sweep: Sweep | None = records.get(lidar, i)
         if sweep is not None:
-            return (
-                0 if sweep.t_ns is None else (int(sweep.t_ns.min()) + int(sweep.t_ns.max())) // 2 - int(sweep.stamp_ns)
-            )
+            t_ns = sweep.t_ns
+            return 0 if t_ns is None else (int(t_ns.min()) + int(t_ns.max())) // 2 - int(sweep.stamp_ns)
     return 0
 
 
