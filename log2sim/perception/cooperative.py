@@ -323,9 +323,8 @@ class Method:
     """How boxes of two ends are joined."""
 
     match: Callable[[SeenBoxes, SeenBoxes], Pairs]  # of two sets of boxes, which belong together
-    merge: Callable[
-        [SeenBoxes, SeenBoxes], SeenBoxes
-    ]  # of two sets of P boxes that belong together row by row, the joined ones
+    # Of two sets of P boxes that belong together row by row, the joined ones
+    merge: Callable[[SeenBoxes, SeenBoxes], SeenBoxes]
     # Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
     # pose
     refines: bool
@@ -584,9 +583,7 @@ class EndsDetector:
     @property
     def cache_key(self) -> str | None:
         """What its boxes depend on besides the clouds; None where a detector does not say."""
-        keys = [
-            "" if detector is None else getattr(detector, "cache_key", None) for detector in (self.vehicle, self.road)
-        ]
+        keys = ["" if d is None else getattr(d, "cache_key", None) for d in (self.vehicle, self.road)]
         method = [name for name, method in METHODS.items() if method is self.method]
         return f"{keys} {method}" if all(isinstance(key, str) for key in keys) else None
 

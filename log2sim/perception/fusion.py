@@ -42,10 +42,8 @@ def fuse_tick(measurements: Measurements, *, across: bool = True) -> Measurement
     """
     if not len(measurements):
         return measurements
-    order = np.argsort(
-        -measurements.score * np.where(measurements.truncated, TRUNCATED_SCORE_FACTOR, 1.0), kind="stable"
-    )
-    rows = measurements.take(order)
+    score = measurements.score * np.where(measurements.truncated, TRUNCATED_SCORE_FACTOR, 1.0)
+    rows = measurements.take(np.argsort(-score, kind="stable"))
     # Pairs (M, M) of one group are gated: by distance if both have points, else by the covariances of two cameras.
     group, with_points, placed = groups_of(rows.category), _has_points(rows), rows.source != ""
     reach = provisional_sizes(rows).sum(axis=1) / 2

@@ -74,9 +74,8 @@ def fit_homographies(
     if plan.homography is not HomographyScope.ALL_CAMERAS:
         rows = [(str(m.camera[k]), m.box_px[k]) for m in observed.measurements for k in np.flatnonzero(m.source == "")]
         wanted = {name for name, box_px in rows if _has_foot(log.cameras[name], box_px)}
-    feet, ground = (
-        {c: Correspondences.join(of.get(c, [])) for c in plan.cameras} for of in (observed.feet, observed.ground)
-    )
+    feet = {c: Correspondences.join(observed.feet.get(c, [])) for c in plan.cameras}
+    ground = {c: Correspondences.join(observed.ground.get(c, [])) for c in plan.cameras}
     found, why_apart = dict[str, CameraHomography](), dict[str, str]()
     if wanted and config.rig == "together" and of_stream:
         rigs, why_apart = list_rigs(log, plan.cameras)

@@ -149,9 +149,8 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     count = np.maximum(until - after, 0)
     a = np.repeat(np.arange(len(starts)), count)
     b = order[np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(after, count)]
-    ends_stationary, starts_stationary = (
-        np.hypot(*state[:, 2:].T) < MAX_STATIONARY_MPS for state in (ends.last, ends.first)
-    )
+    ends_stationary = np.hypot(*ends.last[:, 2:].T) < MAX_STATIONARY_MPS
+    starts_stationary = np.hypot(*ends.first[:, 2:].T) < MAX_STATIONARY_MPS
     slow_end, slow_start = np.flatnonzero(ends_stationary), np.flatnonzero(starts_stationary)
     if len(slow_end) and len(slow_start):
         places = cKDTree(ends.first[slow_start, :2])
@@ -172,20 +171,16 @@ def _joining_costs(ends: _Ends, max_gap_s: float) -> tuple[NDArray[np.intp], NDA
     cost = np.where(same_place, offset_m, np.inf)
     midpoint_m = apart_m + gap_s[:, None] / 2 * (ends.last[a, 2:] + ends.first[b, 2:])
     # Beyond this distance no allowed uncertainty passes the gate.
-    near = np.flatnonzero(
-        ~same_place & (gap_s <= max_gap_s) & (np.hypot(*midpoint_m.T) <= np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M)
-    )
-    noise, speed_mps = (
-        np.array([table[g] for g in ends.group.tolist()]) for table in (ACCELERATION_MPS2, FIRST_SPEED_MPS)
-    )
+    reach_m = np.sqrt(CHI2_4DOF_999) * MAX_POSITION_SIGMA_M
+    near = np.flatnonzero(~same_place & (gap_s <= max_gap_s) & (np.hypot(*midpoint_m.T) <= reach_m))
+    noise = np.array([ACCELERATION_MPS2[g] for g in ends.group.tolist()])
+    speed_mps = np.array([FIRST_SPEED_MPS[g] for g in ends.group.tolist()])
     one, other, half_gap_s = a[near], b[near], gap_s[near] / 2
     forward = predict(ends.last[one], ends.last_covariance[one], half_gap_s, noise[one])
     backward = predict(ends.first[other], ends.first_covariance[other], -half_gap_s, noise[one])
     difference, covariance = forward[0] - backward[0], forward[1] + backward[1]
-    squared = (
-        np.einsum("ni,ni->n", difference, np.linalg.solve(covariance, difference[..., None])[..., 0])
-        + other_group[near]
-    )
+    whitened = np.linalg.solve(covariance, difference[..., None])[..., 0]
+    squared = np.einsum("ni,ni->n", difference, whitened) + other_group[near]
     agrees = np.flatnonzero(squared <= CHI2_4DOF_999)
     near, other, squared, covariance = near[agrees], other[agrees], squared[agrees], covariance[agrees]
     # Minus twice the logarithm of how much likelier it is that this one goes on there than that another starts, of which as many start

@@ -289,9 +289,8 @@ class Converter:
         """Return the convolution that a node is the result of, with the products, sums and ReLU6 after it; None for other nodes."""
         node = self._nodes[name]
         if node.op in ("Conv2D", "DepthwiseConv2dNative"):
-            weights = self._of_classes(
-                node, self.required(node.inputs[1])
-            )  # height, width, channels in, out or multiplier
+            # Height, width, channels in, channels out or multiplier.
+            weights = self._of_classes(node, self.required(node.inputs[1]))
             if node.op == "Conv2D":
                 kernel = weights.transpose(3, 2, 0, 1)
             else:
@@ -429,9 +428,8 @@ def convert(graph: bytes, *, in_bytes: bool) -> onnx.ModelProto:
     center = add("Add", [add("Mul", [offset, center_step], "decode/offset"), anchor_center], "decode/center")
     growth = add("Exp", [add("Mul", [growth, size_step], "decode/log_size")], "decode/growth")
     half = add("Mul", [growth, half_anchor], "decode/half")
-    add(
-        "Concat", [add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")], "boxes", axis=2
-    )
+    corners = [add("Sub", [center, half], "decode/low"), add("Add", [center, half], "decode/high")]
+    add("Concat", corners, "boxes", axis=2)
     converter.add("Sigmoid", [logits], "scores")
     shapes = {"boxes": ("N", len(anchors), 4), "scores": ("N", len(anchors), len(CLASS_NAMES))}
     model = converter.model("ssd_mobilenet_v2_coco", INPUT_PX, shapes)

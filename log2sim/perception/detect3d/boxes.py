@@ -51,9 +51,8 @@ def suppress(boxes: Array, score: Array, group: NDArray[Any], *, across: bool = 
     # Areas are asked for last: most pairs are decided by now.
     left = np.flatnonzero(~excluded)
     shared, area_i, area_j = rectangle_overlap(boxes[i[left]], boxes[j[left]]), area[i[left]], area[j[left]]
-    limit = np.where(
-        same[left], MAX_IOU * (area_i + area_j - shared), MAX_OVERLAP_OF_SMALLER * np.minimum(area_i, area_j)
-    )
+    of_group = MAX_IOU * (area_i + area_j - shared)
+    limit = np.where(same[left], of_group, MAX_OVERLAP_OF_SMALLER * np.minimum(area_i, area_j))
     excluded[left] = shared > limit
     for stronger, weaker in zip(i[excluded].tolist(), j[excluded].tolist()):
         kept[weaker] &= not kept[stronger]

@@ -217,9 +217,8 @@ def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[
     xx, yy = (mean(d * d) + PLANE_REACH_M**2 for d in (dx, dy))
     xy_, xz, yz = mean(dx * dy), mean(dx * dz), mean(dy * dz)
     determinant = xx * yy - xy_ * xy_
-    slope_x, slope_y = (
-        np.clip(s / determinant, -MAX_SLOPE, MAX_SLOPE) for s in (yy * xz - xy_ * yz, xx * yz - xy_ * xz)
-    )
+    slope_x = np.clip((yy * xz - xy_ * yz) / determinant, -MAX_SLOPE, MAX_SLOPE)
+    slope_y = np.clip((xx * yz - xy_ * xz) / determinant, -MAX_SLOPE, MAX_SLOPE)
     return np.asarray(mz - slope_x * mx - slope_y * my)
 
 

@@ -48,10 +48,8 @@ def fit_frames(data: NormalizedCorrespondences, estimate: FrameEstimator, *, kee
             hypotheses.append(robust.linear.h)
     if not hypotheses:
         return refused_fit("no frame has correspondences that determine a homography", data.image.shape[1])
-    best = hypotheses[
-        int(np.argmin(bounded_losses(data.products, data.sigma_image, data.sigma_ground, np.array(hypotheses))))
-    ]
-    fit = validated_fit(RobustFit(data, linearize(data, best)))
+    losses = bounded_losses(data.products, data.sigma_image, data.sigma_ground, np.array(hypotheses))
+    fit = validated_fit(RobustFit(data, linearize(data, hypotheses[int(losses.argmin())])))
     return replace(fit, per_tick=per_tick if keep_all and fit.ok else None)
 
 

@@ -195,9 +195,8 @@ def fit_camera(
         return fit, source
     per_tick = scaled(stable.ground_H_image @ stabilizing_warps(moving))
     tick_sigmas = stable.ground_H_image @ np.linalg.inv(moving.ground_H_image) @ moving.tick_sigmas
-    return replace(
-        stable, ticks=moving.ticks, per_tick=per_tick, tick_sigmas=tick_sigmas, pitch_roll=pitch_roll
-    ), source
+    fit = replace(stable, ticks=moving.ticks, per_tick=per_tick, tick_sigmas=tick_sigmas, pitch_roll=pitch_roll)
+    return fit, source
 
 
 def _fit_fixed(
@@ -272,9 +271,8 @@ def _decide(errors: HeldOutErrors, moving: HomographyFit, source: str, options: 
     pitch_deg = roll_deg = float("nan")
     if options.K is not None:  # how they vary over the ticks
         K, center = options.K, options.K[:2, 2]
-        q = np.linalg.inv(stabilizing_warps(moving)) @ np.column_stack(
-            [[*center, 1.0], [*(center + np.array([ROLL_ARM * K[0, 0], 0.0])), 1.0]]
-        )
+        points = np.column_stack([[*center, 1.0], [center[0] + ROLL_ARM * K[0, 0], center[1], 1.0]])
+        q = np.linalg.inv(stabilizing_warps(moving)) @ points
         uv = q[:, :2] / q[:, 2:]
         du, dv = (uv[:, :, 1] - uv[:, :, 0]).T
         pitch_deg = float(np.degrees(np.arctan((uv[:, 1, 0] - center[1]) / K[1, 1]).std()))

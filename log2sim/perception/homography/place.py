@@ -82,9 +82,8 @@ def place_obstacle(
     above_m = -range_m * float(rays[:2, 2].sum() / np.hypot(rays[:2, 0], rays[:2, 1]).sum())
     # Seen from above, the upper edge is that of the far side.
     if visible[TOP] and spanned_m > 0 and above_m < typical[2] + size_sigma[2]:
-        relative = np.hypot(
-            size_sigma[2] / typical[2], np.hypot(edge_px[TOP], edge_px[BOTTOM]) / (box_px[3] - box_px[1])
-        )
+        of_edges = np.hypot(edge_px[TOP], edge_px[BOTTOM]) / (box_px[3] - box_px[1])
+        relative = np.hypot(size_sigma[2] / typical[2], of_edges)
         by_height_m = range_m * typical[2] / spanned_m
         rows.append((-ahead, -by_height_m, (relative * by_height_m) ** 2, contact))
     normals, offsets, variances, parts = (np.array(column) for column in zip(*rows, strict=True))

@@ -451,9 +451,8 @@ def fit_rig(
     if share < MIN_INLIER_SHARE:
         return RigFit(f"only {share:.0%} of the correspondences of all cameras agree on a ground", rig)
     names = list(rig.cameras)
-    fit = fit_feet(
-        rig, foot_rows, RigState(plane, 0.0, dict.fromkeys(names, 0.0), {name: np.zeros(3) for name in names})
-    )
+    start = RigState(plane, 0.0, dict.fromkeys(names, 0.0), {name: np.zeros(3) for name in names})
+    fit = fit_feet(rig, foot_rows, start)
     ticks, planes, decision = np.zeros(0, dtype=np.int64), np.zeros((0, 3)), None
     if len(ground_rows) and len(foot_rows) >= MIN_TESTED_FEET:
         ticks, tilt = tilt_of_ticks(heights_of(rig, ground_rows), plane)
@@ -505,8 +504,7 @@ def _fit_of_camera(result: RigFit, fit: FeetFit, rows: RigRows, name: str, data:
         at = inverse(cam_T_rig)[:2, 3] + PROBE_M * ahead / np.hypot(*ahead) + result.rig.origin_m[:2]
         probe = np.linalg.inv(h) @ [*at, 1.0]
     if probe[2] > 0:
-        sigma_m = float(
-            np.sqrt(np.linalg.eigvalsh(ground_covariances(h, covariance, probe[None, :2] / probe[2])[0])[-1])
-        )
+        of_probe = ground_covariances(h, covariance, probe[None, :2] / probe[2])[0]
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(of_probe)[-1]))
     condition = float(s[0] / s[-1])
     return HomographyFit(True, "", h, inliers, error_m, condition, result.ticks, per_tick, sigma_m, covariance)

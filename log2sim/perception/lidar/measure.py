@@ -166,9 +166,8 @@ def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
     frame = np.repeat(np.arange(len(frames)), [len(found) for _, found, _ in frames])
     if not len(frame):
         return Measurements.empty(), frame
-    found = Detections(
-        *(np.concatenate([getattr(d, k) for _, d, _ in frames]) for k in ("box_px", "score", "category"))
-    )
+    parts = (np.concatenate([getattr(d, k) for _, d, _ in frames]) for k in ("box_px", "score", "category"))
+    found = Detections(*parts)
     views = [view for view, _, _ in frames]
     border = np.array([[view.camera.width_px, view.camera.height_px] for view in views])[frame] - BORDER_PX
     return replace(
@@ -369,9 +368,8 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
             view, index = split[i][1]
             of_sensor = view.xyz.take(index, axis=0).astype(np.float64) - view.sensor
             shown = sample_surfaces(np.linalg.norm(of_sensor, axis=1), np.array([len(index)]))
-            late_s = (
-                view.t_s[index[shown]].astype(np.float64) + (view.stamp_ns - int(columns["t_ns"][rows[i]])) / NS_PER_S
-            )
+            stamp_s = (view.stamp_ns - int(columns["t_ns"][rows[i]])) / NS_PER_S
+            late_s = view.t_s[index[shown]].astype(np.float64) + stamp_s
             place, ends = view.sensor + view.origin, view.azimuth_index.ends_visible([index])[0]
             columns["others"][rows[i]] = OtherView(place, ends, np.column_stack([of_sensor[shown] + place, late_s]))
 
