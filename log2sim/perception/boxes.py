@@ -119,8 +119,7 @@ def _parabolic_peak(score: Array, best: NDArray[np.intp]) -> Array:
 MAX_WIDTH_FACTOR = 1.2
 # Smallest and largest size of a category are so many standard deviations of the logarithm apart.
 LIMIT_SIGMAS = 4.0
-# Azimuths nearer to each other are of one column of a LiDAR, or of several lines; those of successive firings are 0.1 to 0.4
-# degrees apart.
+# Nearer azimuths are of one column of a LiDAR, or of several lines; successive firings are 0.1 to 0.4 degrees apart.
 MIN_AZIMUTH_STEP_RAD = np.deg2rad(0.04)
 # Smallest extent and probability of which a logarithm is taken.
 MIN_EXTENT_M, MIN_PROBABILITY = 0.05, 1e-6

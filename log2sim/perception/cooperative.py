@@ -325,8 +325,7 @@ class Method:
     match: Callable[[SeenBoxes, SeenBoxes], Pairs]  # of two sets of boxes, which belong together
     # Of two sets of P boxes that belong together row by row, the joined ones
     merge: Callable[[SeenBoxes, SeenBoxes], SeenBoxes]
-    # Whether boxes are first laid against the points of their end, and those of the road moved by what pairs show of its
-    # pose
+    # Whether boxes are first laid against the points of their end, and the road's moved by what pairs show of its pose
     refines: bool
 
 
@@ -505,8 +504,7 @@ MARGIN_M = 0.3
 def align_parts(cloud: Cloud, before: Sequence[Boxes3D]) -> Cloud:
     """Move the points of vehicles and riders, by how these moved between two earlier moments, to the time of most of their points.
 
-    `cloud`: with parts; one without is returned as it is. `before`: what was found at the two moments before, the earlier
-    first.
+    A cloud without parts is returned as it is. `before`: what was found at the two moments before, the earlier first.
     """
     if not cloud.parts or len(before) < 2:
         return cloud

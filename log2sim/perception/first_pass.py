@@ -249,11 +249,9 @@ class Observations:
     # `feet`, `ground`: foot points of measured objects and ground points of the LiDAR, by camera
     feet: dict[str, list[Correspondences]] = field(default_factory=dict)
     ground: dict[str, list[Correspondences]] = field(default_factory=dict)
-    # Number of detections by camera and by name of the detector in sweeps
-    detections: dict[str, int] = field(default_factory=dict)
+    detections: dict[str, int] = field(default_factory=dict)  # by camera and by name of the detector in sweeps
     records: RecordSource | None = None
-    # Number of sweeps by how they were compensated, see `compensation_of`
-    sweeps: Counter[str] = field(default_factory=Counter)
+    sweeps: Counter[str] = field(default_factory=Counter)  # by how they were compensated, see `compensation_of`
     frames_detected: int = 0
     frames_skipped: Counter[str] = field(default_factory=Counter)  # by camera
     # Ticks at which a camera has a frame that says nothing of them, by camera: unreadable, repeated, black, or not searched
@@ -284,9 +282,8 @@ class SeenTick:
     lights: list[LightBox] = field(default_factory=list)
     found: dict[str, int] = field(default_factory=dict)  # number of `detections`
     frames: int = 0  # how many were searched
-    # `skipped`, `unseen`: cameras whose frame was not searched, and those of which it says nothing
-    skipped: list[str] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)  # cameras whose frame was not searched
+    unseen: list[str] = field(default_factory=list)  # cameras whose frame says nothing
 
 
 @dataclass(eq=False)

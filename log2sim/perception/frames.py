@@ -123,8 +123,7 @@ def add_ranges(lights: Sequence[LightBox], view: View, cloud: Cloud) -> list[Lig
     return out
 
 
-# What a run takes from a picture: objects, the small copy (h, w) by which it is compared with other pictures, None where it was not
-# decoded, and traffic lights, cut out.
+# Of a picture: objects, the copy (h, w) by which it is compared with others, None where it was not decoded, and lights.
 PictureFindings = tuple[Detections, Thumbnail | None, tuple[LightBox, ...]]
 
 

@@ -35,11 +35,9 @@ TILT_SIGMA_RAD = np.deg2rad(0.5)
 # Standard deviation of an edge of a box that something nearer covers, as a share of the side of the box: detectors complete what is hidden, or
 # end the box where it begins.
 HIDDEN_SHARE = 0.25
-# Free-space test: with at least this many rays through the box and fewer than this share of them ending in it, the box
-# is empty.
+# A box with at least so many rays through it, of which fewer than this share end in it, is empty.
 MIN_RAYS, MAX_STOPPED_SHARE = 5, 0.25
-# Factor on the score of an obstacle where the LiDAR has rays but no points on it: it may continue a track and hardly
-# start one.
+# Factor on the score of an obstacle with rays but no points on it: it may continue a track and hardly start one.
 UNCONFIRMED_SCORE = 0.5
 # Cameras of one pole are nearer to each other than an arm of its mast is long, horizontally.
 MAX_POLE_M = 5.0

@@ -187,10 +187,8 @@ AXIS_BITS = 21
 class SweepSketch:
     """What is kept of a sweep to compare it with others."""
 
-    # `points`, `obstacles`: how many points it has, and how many of those that were looked at are above the ground and
-    # beyond the ego
-    points: int
-    obstacles: int
+    points: int  # how many it has
+    obstacles: int  # how many of those that were looked at are above the ground and beyond the ego
     # (K,): the smallest hashes of the cells of its obstacle points, sorted, at most `SKETCH_SIZE`
     hashes: NDArray[np.uint64]
 

@@ -40,8 +40,7 @@ from log2sim.perception.detect3d.detectors import CheckedLidarDetector, LidarDet
 
 KEY_BYTES = 16
 MAX_NAME_CHARACTERS = 48
-# Modules of log2sim between a record and what is kept of it, relative to the package; a change of any of them makes other
-# keys, so that nobody has to remember to raise a version.
+# Modules between a record and what is kept of it; a change of any makes other keys, so that no version has to be raised.
 SOURCES = ("datatypes/*.py", "files/packing.py", "geometry/*.py", "logs/**/*.py", "perception/**/*.py", "plan.py")
 STAGE_SOURCES = (*SOURCES, "localization/*.py", "road/*.py", "road/weights/*.onnx")
 
@@ -51,8 +50,7 @@ Made = TypeVar("Made")
 class StageCache:
     """What stages of earlier runs made of the records that they read.
 
-    `log`: the opened log, which a run goes on with: its streams note what is read of them. `store`: None to keep nothing.
-    `found`: stages that were known.
+    `log`: the opened log, whose streams note what is read. `store`: None to keep nothing. `found`: stages that were known.
     """
 
     def __init__(self, log: Log, store: DiskCache | None, clock: StageClock) -> None:

@@ -34,8 +34,7 @@ class Schedule:
     t_ns: NDArray[np.int64]  # (T,): stamps of the ticks
     # Mapping of camera to (T,) int64: index into its stream, -1 where no frame is near enough
     frames: Mapping[str, NDArray[np.int64]]
-    # Mapping of LiDAR to (C, T) int64: index for every camera in the order of `frames`, one row without cameras; -1 where
-    # no sweep is near enough
+    # By LiDAR (C, T): index for every camera in the order of `frames`, one row without cameras; -1 where none is near enough
     sweeps: Mapping[str, NDArray[np.int64]]
     # Mapping of stream to (T,) float64: time of the record less the requested time, NaN without a record
     residuals_s: Mapping[str, NDArray[np.float64]]

@@ -166,8 +166,7 @@ def track_forward(
 ) -> list[tuple[Index, Index]]:
     """Assign the measurements of T ticks (stamps (T,)) to tracks, in the order of their births: the ticks and rows (n,) of each.
 
-    `flow_mps`: (T, 2): velocity of the ego in the map, by which others drive that are first seen; zeros without. `joined`: the measurements
-    in one, where they are already.
+    `flow_mps`: (T, 2): velocity of the ego, as others may drive; zeros without. `joined`: all measurements in one.
     """
     if not len(measurements):
         return []

@@ -46,8 +46,7 @@ class Placement:
 class Preprocessing:
     """Preprocessing of a family of models."""
 
-    # "corner" and "center" keep the aspect ratio and fill the rest with gray (letterbox), "stretch" does not, "tf1"
-    # stretches with the sampling of TensorFlow 1
+    # "corner", "center": letterbox, with gray around; "stretch"; "tf1": stretch with the sampling of TensorFlow 1
     fit: Literal["corner", "center", "stretch", "tf1"]
     rgb: bool  # channel order RGB instead of BGR
     unit: bool  # values 0-1 instead of 0-255; never for integer inputs
@@ -148,8 +147,7 @@ def choose_classes(names: str | None, count: int | None, default: Classes, where
     """Find out the classes of a model: by the names in its metadata, else by their number.
 
     `names`: the entry `names` of the ONNX metadata: a Python literal, list or dict by index, as Ultralytics writes it.
-    `count`: number of classes in the output, None where the output holds class ids; then `default` holds. `where`: the
-    file, for messages.
+    `count`: of classes in the output, None where that holds class ids; then `default` holds. `where`: the file.
     """
     if names is None and count is not None and count not in BY_COUNT:
         raise ConfigError(

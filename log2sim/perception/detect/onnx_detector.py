@@ -200,8 +200,7 @@ RIDDEN = {"bicycle": "cyclist", "motorcycle": "motorcycle", "cyclist": "cyclist"
 def join_riders(detections: Detections, *, sure_score: float = 0.0) -> Detections:
     """Replace each two-wheeler and the person on it by one box around both; a bicycle without a person stays one.
 
-    `sure_score`: a two-wheeler of a lower score that lies inside the person's box is a bag or clothes, and nothing is
-    joined.
+    `sure_score`: a two-wheeler of a lower score inside the person's box is a bag or clothes, and is not joined.
 
     A person rides if its box ends near the two-wheeler's lower edge, rises above it, and shares most of the narrower
     width of both. A person who pushes a bicycle is often joined too: one image does not tell the two cases apart, and
@@ -268,8 +267,7 @@ class OnnxDetector:
     layout: Layout
     classes: Classes
     min_score: float  # lowest score of a box
-    # The same of people, two-wheelers and traffic lights: weaker boxes continue their tracks, and a weak bicycle under
-    # a person tells a rider
+    # The same of `WEAK_GROUPS`: weaker boxes continue their tracks, and a weak bicycle under a person tells a rider
     min_weak_score: float
     max_overlap: float  # IoU above which two boxes of one group are duplicates
     tiles: Literal["auto"] | int

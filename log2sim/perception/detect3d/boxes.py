@@ -32,8 +32,7 @@ def suppress(boxes: Array, score: Array, group: NDArray[Any], *, across: bool = 
     the distance of their centers, others by the part of the smaller one that they share. `across`: whether boxes of different
     groups exclude each other at all.
 
-    Returns (K,) int: indices of the chosen boxes, best score first; ties by place, so that the order of the input does not
-    matter.
+    Returns (K,) int: indices of the chosen boxes, best score first; ties by place, whatever the order of the input.
     """
     from scipy.spatial import cKDTree
 
@@ -93,8 +92,7 @@ class LevelBoxes(Columns):
     def terms(self, points: NDArray[Any], range_m: Array) -> Array:
         """Return what the score is computed from: (5, M), the terms of `NetworkInfo.calibration`.
 
-        `points`: (M,) or: number of points in each box. `range_m`: (M,): distance of the centers from the sensor in the
-        plane.
+        `points`: (M,): number in each box. `range_m`: (M,): distance of the centers from the sensor in the plane.
         """
         return np.stack([np.ones(len(self)), self.heat, self.quality, np.log1p(points), range_m / 10.0])
 

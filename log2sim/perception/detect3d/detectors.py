@@ -178,8 +178,7 @@ class NetworkDetector:
         else:
             boxes = decode_centers(maps, info, low)
             if not weak:
-                # Points are counted, which takes longest, for those alone that reach the least score with as many as they may
-                # hold, or with none.
+                # Counting points takes longest: for those alone that reach the least score with as many as possible or none.
                 counts, reach = np.rint(np.expm1(3 * grid[3])), bounding_reach(boxes.size_m, boxes.yaw_rad)
                 most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
                 range_m = ranges_m(boxes, sensors)
@@ -268,8 +267,7 @@ class LidarDetector(Protocol):
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
         """Detect road users in one cloud, best score first; deterministic, and may be called from threads.
 
-        `cloud`: all LiDARs of one moment. `earlier`: clouds of earlier moments, which make the grid denser; only points of
-        `cloud` count as points of a box.
+        `cloud`: all LiDARs of one moment. `earlier`: of moments before; their points make the grid denser, but count for no box.
         """
         ...
 

@@ -100,8 +100,7 @@ def grid_window(
 def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Make the grid of a cloud, H cells along x and W along y from a lower corner `low` (2,), m.
 
-    `xyz`: (N, 3) float32, m: z is the height above the ground; points outside the grid, of other heights or not finite are left
-    out.
+    `xyz`: (N, 3) float32, m, z above the ground; points outside the grid, of other heights or not finite are left out.
 
     Returns (12, H, W) float32: greatest, mean and least height, each half; logarithm of the count; logarithms of the counts in
     six slices of height; mean offsets from the middle of the cell along x and y, in cells. All zero in an empty cell.
@@ -239,8 +238,7 @@ class ScoreInfo(BaseModel):
 
     version: int
     groups: tuple[str, ...] = Field(min_length=1)  # of categories, in the order of the channels of heat
-    # For each group the weights of 1, logit of the heat, logit of the quality, log(1 + points) and range in units of 10 m, whose
-    # sum is the logit of the score
+    # By group: weights of 1, logits of heat and quality, log(1 + points) and range / 10 m; the sum is the logit of the score
     calibration: dict[str, tuple[float, ...]]
     card: dict[str, Any] = {}  # how the network was trained and how good it is; free
 

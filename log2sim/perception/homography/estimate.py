@@ -51,8 +51,7 @@ class EstimationOptions:
     pitch_roll: bool = False
     # Samples of four to draw, for the stream or for each frame; None for as many as the data need
     hypotheses: int | None = None
-    # `sigma_px`, `sigma_m`: assumed standard deviations of pixels and of ground positions; they are estimated anew from the
-    # inliers, within a factor of 4
+    # Standard deviations of pixels and of ground positions, estimated anew from the inliers within a factor of 4
     sigma_px: float = 1.5
     sigma_m: float = 0.1
 

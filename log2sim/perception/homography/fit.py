@@ -113,8 +113,7 @@ def ransac(
 ) -> RobustFit:
     """Estimate the homography of least bounded loss from samples of single ticks and of all ticks.
 
-    `image_K`: (3, 3): normalized intrinsics; with them the result is a pose of that camera. `refined`: over all inliers, whose
-    errors tell the noise.
+    `image_K`: (3, 3): normalized intrinsics, for a pose of that camera. `refined`: over all inliers, which tell the noise.
 
     LO-RANSAC (Chum, Matas & Kittler, 2003) with the bounded loss of MSAC (Torr & Zisserman, 2000).
     """
@@ -261,8 +260,7 @@ class HomographyFit:
 
     ok: bool  # whether it is accepted; False comes with a reason and NaN in `ground_H_image`
     reason: str  # why it is refused, "" otherwise
-    # (3, 3): undistorted pixels to ground positions (x forward, y left), m; the third row is a unit vector, positive below
-    # the horizon
+    # (3, 3): undistorted px to the ground (x forward, y left), m; the third row is a unit vector, positive below the horizon
     ground_H_image: Array
     inliers: NDArray[np.bool_]  # (N,): inliers of the final model
     error_m: float  # median distance of the inliers on the ground, m
@@ -273,8 +271,7 @@ class HomographyFit:
     per_tick: Array | None = None
     # Standard deviation of the homography on the ground, m, one spread of the inliers from their mean
     sigma_m: float = float("nan")
-    # (9, 9): covariance of the elements of `ground_H_image`, row by row, that the noise of the inliers causes; None where it is
-    # not known
+    # (9, 9): of the elements of `ground_H_image`, row by row, by the noise of the inliers; None where it is not known
     covariance: Array | None = None
     # (T, 2, 3, 3): by how much `per_tick` changes with one standard deviation of the pitch and of the roll of a tick
     tick_sigmas: Array | None = None
@@ -334,8 +331,7 @@ def refused_fit(reason: str, count: int, ticks: NDArray[Any] | None = None) -> H
 def validated_fit(robust: RobustFit, image_K: Array | None = None) -> HomographyFit:
     """Accept or refuse a homography by the number and the geometry of its inliers, and convert it to px and m.
 
-    Every two effective parameters of single ticks make one correspondence an inlier without evidence, so as many inliers
-    more are required.
+    Every two effective parameters of single ticks make an inlier without evidence, so as many more are required.
     """
     data, linear, rows = robust.data, robust.linear, robust.data.image.shape[1]
     if linear is None:

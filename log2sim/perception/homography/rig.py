@@ -70,8 +70,7 @@ class RigState:
     # Height above the road at which the feet of boxes in a camera seem to lie: boxes end at the tires, which stand behind
     # the nearest side of a vehicle, by more where a camera sees its ends than where it sees its sides
     lift_m: Mapping[str, float]
-    # Mapping of str to (3,) float64: rotation of each camera against its calibration that the feet of boxes ask for, rad,
-    # camera frame
+    # (3,): rotation of each camera against its calibration that the feet of boxes ask for, rad, camera frame
     feet: Mapping[str, Array]
 
 
@@ -437,8 +436,7 @@ def fit_rig(
 ) -> RigFit:
     """Fit the homographies of all cameras of a rig.
 
-    `feet`, `ground`: of obstacles and of LiDAR ground points, by camera. `samples`: planes that RANSAC draws for the whole
-    rig.
+    `feet`, `ground`: of obstacles and of LiDAR ground points, by camera. `samples`: planes that RANSAC draws for all.
     """
     foot_rows = RigRows.of(rig, feet, FOOT_SIGMA_PX, FOOT_SIGMA_M)
     ground_rows = RigRows.of(rig, ground, GROUND_SIGMA_PX, GROUND_SIGMA_M)

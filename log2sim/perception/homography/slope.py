@@ -34,8 +34,7 @@ SEARCHES, STEPS, LAST_STEPS = 3, 4, 4
 # Standard deviations of one step: slope, m a meter; rotation of the line, rad; shift of the line, m. Roads have slopes of some
 # percent, and lines are tried nearer to each other than these.
 STEP_SIGMAS = np.array([0.1, 0.1, 3.0])
-# Correspondences within a square of the map of this size, m, are held out together: an object that stands is off by the same at
-# all ticks.
+# Correspondences in a square of this size are held out together: an object that stands is off by the same at all ticks.
 CELL_M = 4.0
 
 
@@ -67,8 +66,7 @@ class _Planes:
 def fit_slope(fit: HomographyFit, data: Correspondences, K: Array, map_T_base: dict[int, Array]) -> HomographyFit:
     """Fit two planes instead of one to correspondences, and keep them if they lower errors at places that are held out.
 
-    `data`: of feet. `K`: (3, 3). `map_T_base`: (4, 4) by tick, of the frame of the ground positions; ticks without a pose are
-    left out.
+    `data`: of feet; ticks without a pose are left out. `K`: (3, 3). `map_T_base`: (4, 4) by tick, of the ground positions' frame.
     """
     known = np.isin(data.tick, list(map_T_base)) & np.isfinite(np.column_stack([data.uv, data.xy_ego])).all(axis=1)
     if not fit.ok or np.count_nonzero(known) < MIN_FEET:

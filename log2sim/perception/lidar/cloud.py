@@ -289,8 +289,7 @@ class Cloud:
     origin: Array  # (3,): m, map frame. Coordinates are relative to it, so that single precision resolves 1e-5 m.
     xyz: NDArray[np.float32]  # (N, 3): m, map axes, relative to `origin`
     t_s: NDArray[np.float32]  # (N,): time of every point relative to `stamp_ns`
-    # (3,): position of the sensor in the middle of the sweep, mean over several, relative to `origin`; with parts of the
-    # first
+    # (3,): of the sensor in the middle of the sweep, mean over several, relative to `origin`; with parts that of the first
     sensor: NDArray[np.float32]
     ground: NDArray[np.bool_]  # (N,): true for points on the ground
     height: NDArray[np.float32]  # (N,): m above the ground
@@ -367,8 +366,7 @@ def sweep_to_map(log: Log, lidar: str, sweep: Sweep, *, compensate: bool) -> tup
     rest, take the pose of their stamp in either case; sweeps that are compensated already take the pose of the stamp to
     which they are.
 
-    Returns `xyz`: (N, 3), m, map frame; `t_s`: (N,): times relative to the sweep's stamp. None is returned instead of both
-    where the sensor's pose is not known.
+    Returns `xyz`: (N, 3), m, map frame; `t_s`: (N,): after the sweep's stamp. None where the sensor's pose is not known.
     """
     t_ns = sweep.t_ns if sweep.t_ns is not None else np.full(len(sweep.xyz_m), sweep.stamp_ns, dtype=np.int64)
     t_s = ((t_ns - sweep.stamp_ns) / NS_PER_S).astype(np.float32)
@@ -454,8 +452,7 @@ MAX_APART_M = 5.0
 def assemble_views(log: Log, sweeps: Mapping[str, Sweep], **options: Any) -> Cloud | None:
     """Merge the simultaneous sweeps of all LiDARs into one cloud, by parts where both ends have LiDARs.
 
-    A part holds the vehicle's LiDARs, or those of one place at the road. The options are those of `assemble_cloud`, which
-    makes the cloud of a log with one end.
+    A part holds the vehicle's LiDARs, or those of one place at the road. The options are those of `assemble_cloud`.
 
     The ground is estimated from each viewpoint's own points: between two of them there may be none.
     """

@@ -38,8 +38,7 @@ MIN_IMAGE_IOU = 0.12
 MARGIN, MIN_DENSITY_RATIO = 0.15, 0.3
 # Points of one side lie in a layer of this depth; a nearer side shows no flank. Between points of a side a ray may be lost.
 SIDE_DEPTH_M, MAX_MISSED_RAYS = 0.2, 1.5
-# Boxes with a higher IoU are duplicates and share points. A cluster is rejected when a larger share of its points already
-# belongs to another box.
+# Boxes with a higher IoU are duplicates and share points; a cluster of which a larger share is of another box is rejected.
 DUPLICATE_IOU, MAX_FOREIGN_SHARE = 0.7, 0.5
 
 
@@ -235,8 +234,7 @@ class Shown:
 def place_few_points(seen: Shown, columns: dict[str, Any], rows: Index, boxes_px: Array) -> None:
     """Place the people and riders among the rows (R,) of a frame who have no points of their own yet.
 
-    `columns`: of `Measurements`, written to. `boxes_px`: (N, 4): all image boxes of the frame, which hide what is behind
-    them.
+    `columns`: of `Measurements`, written to. `boxes_px`: (N, 4): all image boxes of the frame, which hide what is behind.
 
     A body is where two or more points inside its box have a depth at which the box is as high as a person. Points that go
     on at that depth on both sides of the box or above it belong to a wall, a fence or a pole.

@@ -184,8 +184,7 @@ def _rows_of_images(frames: Sequence[Frame]) -> tuple[Measurements, Index]:
 MIN_IOU = 0.3
 # The category of the image counts where the boxes overlap by this.
 MIN_CATEGORY_IOU = 0.5
-# Recall of a detector in sweeps for objects with many points, within its range, by group; half of it is reached at so many
-# points.
+# Recall of a detector in sweeps, within its range, for many points, by group; half of it is reached at so many points.
 SWEEP_RECALL = {"vehicle": 0.75, "two_wheeler": 0.6, "pedestrian": 0.5}
 SWEEP_RECALL_POINTS, SWEEP_RANGE_M = 15.0, 40.0
 
@@ -330,8 +329,7 @@ def write_evidence(columns: dict[str, Any], rows: Sequence[int], members: Sequen
 
     Points of several viewpoints are measured from the one that has most of them; a second one is kept beside it.
 
-    `columns`: of `Measurements`, written to; those that are no arrays are lists. `members`: R arrays (n,): the points of
-    each row in the cloud.
+    `columns`: of `Measurements`, arrays or lists, written to. `members`: R arrays (n,): points of each row in the cloud.
     """
     split = [cloud.split(index) for index in members]
     kept = [i for i, views in enumerate(split) if len(views[0][1]) >= min(MIN_CLUSTER_POINTS, len(members[i]))]
