@@ -110,8 +110,7 @@ def refine_boxes(boxes: Boxes3D, view: Cloud) -> Boxes3D:
     turned = np.cos(rows.yaw_rad - yaw[mine]) < 0
     yaw[mine] = rows.yaw_rad + np.where(turned, np.pi, 0.0)
     center[mine, :2] = rows.center_m[:, :2]
-    shown_m = rows.high_m - rows.low_m
-    size[mine, :2] = np.fmax(size[mine, :2], shown_m)
+    size[mine, :2] = np.fmax(size[mine, :2], rows.high_m - rows.low_m)
     real = real_ends(rows.low_m, rows.high_m, np.zeros(2), rows.ends_visible)
     low, high = corner_correction(rows.low_m, rows.high_m, real, size[mine, 1])
     length = (high - low)[:, 0]
@@ -342,8 +341,7 @@ def fuse_boxes(a: SeenBoxes, b: SeenBoxes, method: Method) -> SeenBoxes:
             b = take_off_offset(a.take(i), b.take(j), b)
             i, j = method.match(a, b)
     rest_a, rest_b = (np.setdiff1d(np.arange(len(seen)), taken) for seen, taken in ((a, i), (b, j)))
-    parts = [method.merge(a.take(i), b.take(j)), a.take(rest_a), b.take(rest_b)]
-    out = join([part for part in parts if len(part)])
+    out = join([method.merge(a.take(i), b.take(j)), a.take(rest_a), b.take(rest_b)])
     return out.take(suppress(out.rectangles, out.boxes.score, groups_of(out.boxes.category)))
 
 

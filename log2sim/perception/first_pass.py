@@ -215,8 +215,7 @@ class CloudMaker:
                 self._sketches[name, i] = sketch_sweep(self._log, name, sweep)
             if records.is_live(name, i, self._sketches[name, i]):
                 self._live.add((name, i))
-                kind = compensation_of(self._log, name, sweep) if compensates else "left out"
-                self.compensated[name, i] = kind
+                self.compensated[name, i] = compensation_of(self._log, name, sweep) if compensates else "left out"
         most = max(SWEEPS_KEPT * len(self._schedule.sweeps), len(wanted), 1)
         self._sweeps = dict(list(self._sweeps.items())[-most:])
         self._sketches = {key: sketch for key, sketch in self._sketches.items() if key in self._sweeps}

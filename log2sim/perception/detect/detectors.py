@@ -195,8 +195,7 @@ def window_ns(t_ns: NDArray[np.int64]) -> int:
 
     Some logs stamp all boxes of a sweep alike, others each by its own points, from which no period can be read.
     """
-    stamps = np.unique(t_ns)
-    period_s = period_of(stamps)
+    period_s = period_of(np.unique(t_ns))
     if period_s < SCATTERED_S:
         return round(SCATTERED_WINDOW_S * NS_PER_S)
     return round(min(1.05 * period_s, MAX_WINDOW_S) * NS_PER_S)

@@ -443,8 +443,7 @@ def fit_rig(
     heights = heights_of(rig, RigRows.join([foot_rows, ground_rows]))
     plane = find_plane(heights, rng, samples) if len(heights.tick) >= MIN_ROWS else None
     if plane is None:
-        reason = f"{len(heights.tick)} correspondences of all cameras do not determine the ground"
-        return RigFit(reason, rig)
+        return RigFit(f"{len(heights.tick)} correspondences of all cameras do not determine the ground", rig)
     share = float(np.mean(((heights.xy1 @ plane - heights.height) / heights.sigma) ** 2 < CHI2_1DOF_99))
     if share < MIN_INLIER_SHARE:
         return RigFit(f"only {share:.0%} of the correspondences of all cameras agree on a ground", rig)
