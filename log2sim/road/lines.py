@@ -237,6 +237,8 @@ REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 # Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
 BESIDE_M, MAX_BESIDE = (0.45, 1.7), 1
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
+# Half of a lane 2.5 to 4.4 m wide: no lane line has others so near on both sides, but arrows in the lane have.
+HALF_LANE_M = (1.25, 2.2)
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
 MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
 # Paint of the same time is about as bright; a fainter line next to another is what is left of removed paint. Contrasts below the least are
@@ -339,7 +341,7 @@ def _dense(xy: Array) -> Array:
 
 
 def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
-    """Add to the evidence which lines form combs or grids, and how much fainter they are than others beside them."""
+    """Add to the evidence which lines form combs or grids, how much fainter they are than others beside them, and which are in mid-lane."""
     if len(lines) < 2:
         return lines
     dense = [_dense(line.xy)[::5] for line in lines]
@@ -348,15 +350,20 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     steps = [np.gradient(d, axis=0) if len(d) > 1 else np.tile([1.0, 0.0], (len(d), 1)) for d in dense]
     dx, dy = np.concatenate(steps).T
     heading = np.arctan2(dy, dx) % np.pi
-    pairs = cKDTree(points).query_pairs(BESIDE_M[1], output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(HALF_LANE_M[1], output_type="ndarray")
     a, b = np.concatenate([pairs, pairs[:, ::-1]]).T
     a, b = a[owner[a] != owner[b]], b[owner[a] != owner[b]]
     turn = np.abs((heading[a] - heading[b] + np.pi / 2) % np.pi - np.pi / 2)
     offset = points[b] - points[a]
-    distance = np.abs(offset[:, 1] * np.cos(heading[a]) - offset[:, 0] * np.sin(heading[a]))
-    parallel = (turn < PARALLEL_RAD) & (distance > BESIDE_M[0])
-    crossing = (turn > np.pi / 4) & (np.linalg.norm(offset, axis=1) < 0.5)
+    left = offset[:, 1] * np.cos(heading[a]) - offset[:, 0] * np.sin(heading[a])
+    distance = np.linalg.norm(offset, axis=1)
+    parallel = (turn < PARALLEL_RAD) & (np.abs(left) > BESIDE_M[0]) & (distance <= BESIDE_M[1])
+    crossing = (turn > np.pi / 4) & (distance < 0.5)
     length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
+    half_lane = (turn < PARALLEL_RAD) & (np.abs(left) > HALF_LANE_M[0]) & (odds[owner[b]] > odds[owner[a]] - 1)
+    sides = np.zeros((len(points), 2))
+    sides[a[half_lane], (left[half_lane] > 0).astype(int)] = 1
+    mid_lane = np.bincount(owner, sides.all(axis=1)) / np.bincount(owner)
     # Pairs of lines, not a table of all: a long log has thousands.
     i, j, count = _counted(owner[a[parallel]], owner[b[parallel]])
     beside = count > BESIDE_PER_M * length[i]
@@ -369,8 +376,15 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     grid = (crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length)
     fainter, likely = np.zeros(len(lines)), odds[j] > odds[i] - 1
     np.maximum.at(fainter, i[likely], _brighter(lines, i[likely], j[likely]))
-    context = zip(lines, (crowded.astype(float) + grid).tolist(), np.minimum(fainter, MAX_FAINTER).tolist())
-    return [replace(line, evidence=line.evidence | {"crowded": c, "fainter": f}) for line, c, f in context]
+    context = {
+        "crowded": crowded.astype(float) + grid,
+        "fainter": np.minimum(fainter, MAX_FAINTER),
+        "mid_lane": mid_lane,
+    }
+    return [
+        replace(line, evidence=line.evidence | {name: float(values[k]) for name, values in context.items()})
+        for k, line in enumerate(lines)
+    ]
 
 
 def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:

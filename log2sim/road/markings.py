@@ -240,6 +240,7 @@ def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea |
         "filled": area / float(extent.prod()),
         "slender": float(np.log(extent.max() / extent.min())),
         "widens": _widens(own),
+        "mid_lane": line.evidence.get("mid_lane", 0.0),
         "hidden": float(1 - seen[cv2.dilate(own, np.ones((9, 9), np.uint8)) > 0].mean()),
     }
     return PaintedArea("other", np.stack([x, y], 1), float(extent.min()), line.pieces, evidence)

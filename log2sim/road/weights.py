@@ -1,26 +1,27 @@
 """Weights of the evidence for markings and borders of roads, by kind and the sensors that saw it.
 
-Printed by `tools/fit.py lines` on 200 maps of random roads and plain ground, `tools/fit.py line_maps`.
+Printed by `tools/fit.py lines` on 400 maps of random roads and plain ground, `tools/fit.py line_maps`.
 """
 
 WEIGHTS: dict[str, dict[str, float]] = {
-    "line, camera and LiDAR": {"bias": 0.305, "length": 0.484, "contrast": 0.667, "reflects": 0.381, "outshone": -2.36, "varies": -2.99,
-        "bright_beside": -2.6, "dull": -0.902, "crowded": -2.29, "fainter": -5.5, "wide": -4.54},
-    "line, camera": {"bias": -1.96, "length": 0.921, "contrast": 0.461, "outshone": -2.26, "varies": -8.0, "bright_beside": -1.98, "dull":
-        -1.55, "crowded": -0.881, "fainter": -3.82, "wide": -3.35},
-    "line, LiDAR": {"bias": -0.652, "length": 0.47, "dashes": 0.136, "contrast": 1.13, "outshone": -0.46, "varies": -5.2, "bright_beside":
-        -5.21, "unresolved": -1.56, "crowded": -1.19, "fainter": -4.05, "wide": -5.52},
-    "line, few returns": {"bias": -2.93, "bright_beside": -3.35, "crowded": -0.85, "fainter": -1.06, "wide": -3.35},
-    "crosswalk, camera": {"bias": -1.4, "length": 0.269, "dashes": 0.639, "contrast": 0.693, "reflects": 0.12, "bright_beside": -1.85,
-        "dull": -3.07, "wide": 3.6},
-    "crosswalk, LiDAR": {"bias": -4.38, "length": 0.115, "dashes": 0.685, "contrast": 0.23, "reflects": 0.358, "outshone": -0.412,
-        "bright_beside": -1.83, "dull": -0.633, "unresolved": -4.84, "wide": 2.76},
-    "stop_line, camera": {"bias": -6.42, "length": 2.72, "contrast": 1.51, "reflects": 0.607, "outshone": -1.08, "bright_beside": -1.39,
-        "dull": -1.63, "crowded": -0.769, "fainter": -2.02, "no_lane_line": -1.61, "wide": 3.15},
-    "stop_line, LiDAR": {"bias": -3.56, "length": 0.561, "reflects": 0.44, "outshone": -1.05, "varies": -4.34, "bright_beside": -0.68,
-        "dull": -1.15, "unresolved": -4.07, "crowded": -1.2, "fainter": -1.17, "no_lane_line": -2.74, "wide": -0.23},
-    "border, camera and LiDAR": {"bias": -2.56, "length": 1.21, "curb": 1.23},
-    "border, camera": {"bias": -3.72},
-    "border, LiDAR": {"bias": -3.49, "length": 0.921, "curb": 1.88},
-    "other": {"bias": -5.12, "widens": 2.51, "clear": 3.16, "filled": -5.13, "slender": -0.624, "hidden": -8.0},
+    "line, camera and LiDAR": {"bias": -0.136, "length": 0.576, "contrast": 0.436, "reflects": 0.404, "outshone": -3.41, "bright_beside":
+        -1.75, "dull": -0.676, "crowded": -3.24, "fainter": -6.13, "mid_lane": -3.2, "wide": -7.45},
+    "line, camera": {"bias": -1.96, "length": 0.76, "contrast": 0.838, "outshone": -3.88, "varies": -8.0, "bright_beside": -2.04, "dull":
+        -1.66, "crowded": -1.45, "fainter": -4.71, "mid_lane": -3.02, "wide": -8.0},
+    "line, LiDAR": {"bias": -1.23, "length": 0.597, "dashes": 0.155, "contrast": 1.0, "outshone": -0.357, "bright_beside": -6.68,
+        "unresolved": -0.956, "crowded": -1.92, "fainter": -4.92, "mid_lane": -2.16, "wide": -4.51},
+    "line, few returns": {"bias": -3.18, "varies": -8.0, "bright_beside": -3.57, "crowded": -1.27, "fainter": -1.38, "mid_lane": -2.42,
+        "wide": -2.96},
+    "crosswalk, camera": {"bias": -2.4, "length": 0.474, "dashes": 0.98, "contrast": 0.835, "reflects": 0.121, "bright_beside": -1.9,
+        "dull": -2.51, "wide": 3.16},
+    "crosswalk, LiDAR": {"bias": -5.64, "length": 0.192, "dashes": 0.892, "contrast": 0.641, "reflects": 0.405, "outshone": -1.17,
+        "bright_beside": -0.261, "dull": -1.25, "unresolved": -5.23, "wide": 4.93},
+    "stop_line, camera": {"bias": -7.93, "length": 3.15, "contrast": 2.17, "reflects": 0.467, "outshone": -1.67, "bright_beside": -1.19,
+        "dull": -1.46, "crowded": -2.3, "fainter": -3.86, "mid_lane": -1.95, "no_lane_line": -2.43, "wide": 4.11},
+    "stop_line, LiDAR": {"bias": -3.51, "length": 0.31, "reflects": 0.55, "outshone": -1.66, "bright_beside": -0.628, "dull": -0.234,
+        "unresolved": -4.21, "crowded": -1.76, "fainter": -1.79, "mid_lane": -1.9, "no_lane_line": -2.78},
+    "border, camera and LiDAR": {"bias": -1.92, "length": 0.944, "curb": 1.19},
+    "border, camera": {"bias": -3.0},
+    "border, LiDAR": {"bias": -3.57, "length": 0.806, "curb": 2.33},
+    "other": {"bias": -7.46, "mid_lane": 3.35, "widens": 3.73, "clear": 3.09, "filled": -3.12, "slender": -0.654, "hidden": -5.29},
 }  # fmt: skip

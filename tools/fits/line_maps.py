@@ -146,8 +146,14 @@ def draw_scene(seed: int) -> Scene:
     ]
     if chance(0.6):
         crossed = [at for at, _ in zebras + stops] + [crossing_at]
-        for s in rng.uniform(-30, 40, int(rng.integers(1, 6))).tolist():
-            lane, shape, length = one_of(*centers), one_of("straight", "left", "right"), draw(3, 7)
+        kinds = [
+            (one_of(*centers), one_of("straight", "left", "right"), draw(3, 7)) for _ in range(int(rng.integers(1, 6)))
+        ]
+        places = rng.uniform(-30, 40, len(kinds))
+        if chance(0.5):
+            # One behind the other, as before junctions.
+            kinds, places = kinds[:1] * len(kinds), draw(-30, -10) + draw(8, 25) * np.arange(len(kinds))
+        for s, (lane, shape, length) in zip(places.tolist(), kinds):
             turn = np.degrees(course.curvature_pm * s) + (0 if lane in along else 180)
             # Bent arrows reach half their length to the side, and are within their lane.
             length = length if shape == "straight" else min(length, lane_m - 0.6)

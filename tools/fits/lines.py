@@ -24,7 +24,7 @@ from shapely.geometry.base import BaseGeometry
 
 from fits.confidence import fit_weights
 from fits.line_maps import RoadMap
-from log2sim.datatypes import Marking
+from log2sim.datatypes import LANE_LINE_KINDS, Marking
 from log2sim.evaluation.road import MIN_ARROW_OVERLAP
 from log2sim.geometry import Array
 from log2sim.road.borders import find_edges
@@ -46,7 +46,7 @@ COSTS = {
 # What the evidence can say, at most, by what it means: for paint, against it.
 SIGNS = {
     "length": 1, "dashes": 1, "contrast": 1, "reflects": 1, "outshone": -1, "varies": -1, "bright_beside": -1, "dull": -1, "unresolved": -1,
-    "crowded": -1, "fainter": -1, "no_lane_line": -1, "wide": 0, "widens": 0, "clear": 1, "filled": 0, "slender": 0, "hidden": -1,
+    "crowded": -1, "fainter": -1, "mid_lane": 0, "no_lane_line": -1, "wide": 0, "widens": 0, "clear": 1, "filled": 0, "slender": 0, "hidden": -1,
     "curb": 1,
 }  # fmt: skip
 
@@ -66,12 +66,13 @@ def judged_of(path: Path) -> list[Judged]:
     """Find what may be markings and borders in a map, and judge it by the truth."""
     road: RoadMap = pickle.loads(path.read_bytes())
     areas, lines = find_paint(road.ground)
-    painted, stop, bars = (
-        _Paint([m for m in road.true.markings if kind in ("", m.kind)]) for kind in ("", "stop_line", "crosswalk")
+    lanes, stops, bars = (
+        _Paint([m for m in road.true.markings if m.kind in kinds])
+        for kinds in (LANE_LINE_KINDS, ("stop_line",), ("crosswalk",))
     )
     out = []
     for line in lines:
-        paint = stop if line.kind == "stop_line" else painted
+        paint = stops if line.kind == "stop_line" else lanes
         table = table_of(line.pieces, line.kind)
         out.append(Judged(path.name, table, line.evidence, paint.share(_dense(line.xy)), line.length_m))
     symbols = [_polygon(m.points_m[:, :2]) for m in road.true.markings if m.kind == "other"]
@@ -99,7 +100,7 @@ class _Paint:
     """Where some markings are."""
 
     def __init__(self, true: list[Marking]) -> None:
-        outlines = [m for m in true if m.kind in ("crosswalk", "other")]
+        outlines = [m for m in true if m.kind == "crosswalk"]
         self._inside = shapely.union_all([shapely.Polygon(m.points_m[:, :2]).buffer(NEAR_M) for m in outlines])
         along = [_dense(m.points_m[:, :2]) for m in true if m not in outlines]
         self._lines = cKDTree(np.concatenate(along)) if along else None
