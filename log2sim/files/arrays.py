@@ -168,12 +168,8 @@ class DiskBackedMap(MutableMapping[Key, Value], Generic[Key, Value]):
         changing: bool = False,
         rounds: int = 0,
     ) -> None:
-        self._to_arrays, self._from_arrays, self.memory_bytes, self._changing = (
-            to_arrays,
-            from_arrays,
-            memory_bytes,
-            changing,
-        )
+        self._to_arrays, self._from_arrays = to_arrays, from_arrays
+        self.memory_bytes, self._changing = memory_bytes, changing
         self._rounds, self._round = rounds, 0
         self._used: dict[Key, int] = {}
         self._file = ArrayFile(0)

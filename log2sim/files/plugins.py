@@ -1,7 +1,7 @@
 """Plug-ins by name, imported when they are used, and what one of each kind must be; functions of higher rooms by name.
 
-A room imports only rooms of lower rank. `log.show()` draws all the same: the type names the function here, as `registry`
-names plug-ins, and stays importable without all that drawing needs.
+A room imports only rooms of lower rank. `log.show()` draws all the same: the type names the function here, as plug-ins are
+named, and stays importable without all that drawing needs.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import difflib
 import importlib
 import inspect
 import os
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -221,11 +222,8 @@ def require_type(kind: str, name: str, value: Any, expected: type) -> None:
 
 def exception_line(error: Exception) -> str:
     """Say in one line what was raised, and in which line of which file."""
-    trace, place = error.__traceback__, ""
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        place = f" (line {trace.tb_lineno} of {os.path.basename(code.co_filename)})"
-        trace = trace.tb_next
+    last = traceback.extract_tb(error.__traceback__, limit=-1)
+    place = "".join(f" (line {frame.lineno} of {os.path.basename(frame.filename)})" for frame in last)
     first = next(iter(str(error).strip().splitlines()), "")
     return f"raised {type(error).__name__}{': ' * bool(first)}{first}{place}"
 

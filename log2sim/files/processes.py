@@ -11,7 +11,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -48,11 +48,9 @@ def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: i
         yield from map(work, tasks)
         return
     rest, given, next_out = enumerate(tasks), 0, 0
-    workers: dict[Connection, multiprocessing.process.BaseProcess] = {}
     running: dict[Connection, int] = {}
     done: dict[int, Out] = {}
-    try:
-        _start(work, jobs, workers)
+    with _forked(work, jobs) as workers:
         while True:
             for connection in [c for c in workers if c not in running]:
                 task = next(rest, None) if given - next_out < AHEAD * jobs else None
@@ -68,8 +66,6 @@ def map_in_processes(work: Callable[[Task], Out], tasks: Iterable[Task], jobs: i
             for ready in wait(list(running)):
                 assert isinstance(ready, Connection)
                 done[running.pop(ready)] = _receive(ready, workers[ready])
-    finally:
-        _end(workers)
 
 
 @contextmanager
@@ -82,44 +78,41 @@ def in_background(work: Callable[[], Out], jobs: int) -> Iterator[Callable[[], O
     if jobs == 1:
         yield work
         return
-    workers: dict[Connection, multiprocessing.process.BaseProcess] = {}
-    try:
-        _start(lambda _: work(), 1, workers)
+    with _forked(lambda _: work(), 1) as workers:
         ((connection, process),) = workers.items()
         connection.send(None)
         yield lambda: _receive(connection, process)
-    finally:
-        _end(workers)
 
 
-def _end(workers: Mapping[Connection, Any]) -> None:
-    for process in workers.values():
-        process.kill()
-    for connection, process in workers.items():  # which free their memory at the same time
-        process.join()
-        connection.close()
-
-
-def _start(work: Callable[[Any], Any], jobs: int, workers: dict[Connection, Any]) -> None:
-    """Fork processes that do `work`, and note each by the end of its pipe; OpenCV's threads, which a fork lacks, end before."""
+@contextmanager
+def _forked(work: Callable[[Any], Any], jobs: int) -> Iterator[dict[Connection, Any]]:
+    """Within the block forked processes do `work`, each known by the end of its pipe; OpenCV's threads, which a fork lacks, end before."""
     cv2: Any = sys.modules.get("cv2")
     threads = cv2.getNumThreads() if cv2 else 0
-    context = multiprocessing.get_context("fork")
+    context, workers = multiprocessing.get_context("fork"), dict[Connection, Any]()
     try:
-        if cv2:
-            cv2.setNumThreads(1)
-        for _ in range(jobs):
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(work, theirs, [*workers, ours]), daemon=True)
-            with warnings.catch_warnings():
-                # Python 3.12 warns of other threads, such as those that draw progress; nothing that they may hold is used.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                process.start()
-            workers[ours] = process
-            theirs.close()
+        try:
+            if cv2:
+                cv2.setNumThreads(1)
+            for _ in range(jobs):
+                ours, theirs = context.Pipe()
+                process = context.Process(target=_serve, args=(work, theirs, [*workers, ours]), daemon=True)
+                with warnings.catch_warnings():
+                    # Python 3.12 warns of other threads, such as those that draw progress; nothing that they may hold is used.
+                    warnings.simplefilter("ignore", DeprecationWarning)
+                    process.start()
+                workers[ours] = process
+                theirs.close()
+        finally:
+            if cv2:
+                cv2.setNumThreads(threads)
+        yield workers
     finally:
-        if cv2:
-            cv2.setNumThreads(threads)
+        for process in workers.values():
+            process.kill()
+        for connection, process in workers.items():  # which free their memory at the same time
+            process.join()
+            connection.close()
 
 
 def _serve(work: Callable[[Any], Any], connection: Connection, not_mine: list[Connection]) -> None:
