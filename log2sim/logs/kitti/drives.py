@@ -159,7 +159,6 @@ def _stamps(path: Path) -> NDArray[np.int64]:
 
 
 PERIOD_NS = 100_000_000
-NO_STAMPS = "this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"
 
 
 class KittiTrackingReader(FolderReader):
@@ -181,7 +180,7 @@ class KittiTrackingReader(FolderReader):
         numbers = [k for k in (2, 3) if (base / f"image_{k:02d}" / sequence).is_dir()]
         projections = {k: c.projection(f"P{k}") for k in numbers}
         rect = c.rotation("R0_rect", "R_rect")
-        velo_T_imu, cam_T_velo = (c.rigid(f"Tr_{link}", f"Tr_{link.replace('to_', '')}") for link in LINKS)
+        velo_T_imu, cam_T_velo = c.rigid("Tr_imu_to_velo", "Tr_imu_velo"), c.rigid("Tr_velo_to_cam", "Tr_velo_cam")
         rig = kitti_labels.Rig.of(velo_T_imu, cam_T_velo, rect, projections)
         cameras, streams = dict[str, Camera](), dict[str, Stream]()
         for number in numbers:
@@ -202,7 +201,7 @@ class KittiTrackingReader(FolderReader):
             raise LogError(f"{oxts_file}: no records; a stream needs at least one")
         poses, map_frame = kitti_labels.poses_from_oxts(rows)
         track = PoseTrack(_nominal_stamps(range(len(rows))), poses)
-        notes = [NO_STAMPS]
+        notes = ["this layout has no stamps: 10 Hz is assumed for all streams, frame 0 at stamp 0"]
         for name, stream in streams.items():
             missing = np.setdiff1d(np.arange(len(rows)), stream.t_ns // PERIOD_NS)
             if len(missing):
@@ -219,7 +218,6 @@ class KittiTrackingReader(FolderReader):
 
 
 TRACKING_READER = KittiTrackingReader()
-LINKS = ("imu_to_velo", "velo_to_cam")
 
 
 def _base(path: Path) -> Path:
@@ -230,10 +228,7 @@ def _nominal_stamps(numbers: Iterable[int], period_ns: int = PERIOD_NS) -> NDArr
     return np.array(list(numbers), dtype=np.int64) * period_ns
 
 
-SPLITS = ("training", "testing")
 OBJECT_PERIOD_NS = 100_000_000_000
-IMAGES = "image_2"
-SINGLE_FRAMES = "single frames: taken to be 100 s apart, and the ego to stand still; use detect and evaluate"
 EGO_R_RECT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The ego has the axes of the rectified camera 0, in which labels stand upright."""
 LIDAR_HEIGHT_M = 1.73
@@ -249,7 +244,7 @@ class KittiObjectReader(FolderReader):
     def find(self, path: Path) -> dict[str, Path]:
         """Find the splits at a folder by name."""
         path = path.resolve()
-        places = [path, *(path / name for name in SPLITS)]
+        places = [path, path / "training", path / "testing"]
         return {p.name: p for p in places if (p / "calib").is_dir() and any((p / "velodyne").glob("*.bin"))}
 
     def open(self, path: Path, sequence: str) -> Log:
@@ -271,7 +266,7 @@ class KittiObjectReader(FolderReader):
             return sweep_of(points, sweep.stamp_ns, None, "map", intensity=sweep.intensity)
 
         streams, cameras = {"velodyne": Stream("velodyne", t_ns, read)}, dict[str, Camera]()
-        images = list_numbered_files(base / IMAGES, PICTURES)
+        images = list_numbered_files(base / "image_2", PICTURES)
         if images:
             size_px = first_image_size(list(images.values()))
             cameras[kitti_labels.CAMERA] = first.camera(*size_px)
@@ -279,7 +274,7 @@ class KittiObjectReader(FolderReader):
                 kitti_labels.CAMERA, _nominal_stamps(images, OBJECT_PERIOD_NS), list(images.values()), size_px
             )
         ego = PoseTrack(t_ns, np.repeat(np.eye(4)[None], len(t_ns), axis=0))
-        notes = [SINGLE_FRAMES]
+        notes = ["single frames: taken to be 100 s apart, and the ego to stand still; use detect and evaluate"]
         without = sorted(set(images) - set(sweeps))
         if without:
             notes.append(f"{len(without)} of {len(images)} images have no sweep, first number {without[0]:06d}")
@@ -364,10 +359,9 @@ def _labels(
         path = base / "label_2" / f"{file.stem}.txt"
         if is_present(path):
             texts.append(kitti_labels.read_text(path))
-            lines = [
-                f"{number} {number}-{k} {line}" * bool(line.strip()) for k, line in enumerate(texts[-1].splitlines())
-            ]
-            parts.append(kitti_labels.parse_labels("\n".join(lines), path, damaged))
+            lines = enumerate(texts[-1].splitlines())
+            numbered = (f"{number} {number}-{k} {line}" * bool(line.strip()) for k, line in lines)
+            parts.append(kitti_labels.parse_labels("\n".join(numbered), path, damaged))
             labeled.append(number)
     if not parts:
         return kitti_labels.DriveLabels()

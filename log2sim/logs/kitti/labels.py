@@ -303,8 +303,8 @@ def labels_of_rows(
     )
 
 
-def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> LabelRows:
-    """Parse the lines of a label file; `damaged` takes a message for each that is wrong, without it the first is a `LogError`."""
+def parse_labels(text: str, path: Path, damaged: list[str]) -> LabelRows:
+    """Parse the lines of a label file; `damaged` takes a message for each that is wrong."""
     rows = []
     for k, line in enumerate(text.splitlines(), start=1):
         words, problem = line.split(), ""
@@ -323,12 +323,10 @@ def parse_labels(text: str, path: Path, damaged: list[str] | None = None) -> Lab
                     problem = f"a number is not finite, or larger than {MAX_POSITION_M:g}"
                 elif not 0 <= frame <= MAX_FRAME:
                     problem = f"frame {words[0][:20]}, expected 0 to {MAX_FRAME}"
-        if not problem:
-            rows.append((frame, words[1], words[2], row))
-        elif damaged is None:
-            raise LogError(f"{path}, line {k}: {problem}")
-        else:
+        if problem:
             damaged.append(f"{path}, line {k}: {problem}")
+        else:
+            rows.append((frame, words[1], words[2], row))
     frames, ids, types, values = zip(*rows) if rows else ((), (), (), ())
     table = np.array(values, dtype=np.float64).reshape(-1, LABEL_FIELDS - 3)
     return LabelRows(np.array(frames, np.int64), np.array(ids, "<U16"), np.array(types, "<U16"), table)

@@ -8,16 +8,16 @@ read; neither is radar.
 from __future__ import annotations
 
 import json
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream, Sweep
+from log2sim.datatypes import EgoVehicle, Labels, Lidar, Log, MapFrame, Stream
 from log2sim.errors import LogError
 from log2sim.files.images import MAX_IMAGE_PX
-from log2sim.geometry import NS_PER_S, Array, Camera, PoseTrack, shift_poses, whole_kilometers
+from log2sim.geometry import NS_PER_S, Camera, PoseTrack, shift_poses, whole_kilometers
 from log2sim.logs.excerpt import digest_of
 from log2sim.logs.kitti.labels import EARTH_RADIUS_M
 from log2sim.logs.nuscenes.scene import (
@@ -174,7 +174,7 @@ def _sensors(
             streams[name] = image_stream(name, t_ns, files, (cameras[name].width_px, cameras[name].height_px))
         else:
             lidars[name] = Lidar(name, "ego", channel.ego_T_sensor)
-            streams[name] = Stream(name, t_ns, partial(_read_sweep, channel, track, t_ns, files))
+            streams[name] = _sweep_stream(channel, track, t_ns, files)
     if not streams:
         there = f"none of the {missing} images and sweeps of scene '{scene.record['name']}' is there"
         raise LogError(f"{root}: {there}; unpack samples/ and sweeps/ next to the folder of the tables")
@@ -194,9 +194,5 @@ def _camera(channel: Channel, record: Record, files: list[Path], path: Path) -> 
     return Camera(channel.name, int(width or 0), int(height or 0), K, "ego", channel.ego_T_sensor)
 
 
-def _read_sweep(channel: Channel, track: PoseTrack, t_ns: NDArray[np.int64], files: list[Path], i: int) -> Sweep:
-    def poses(stamps: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-        map_T_ego, known = track.at(stamps)
-        return map_T_ego @ channel.ego_T_sensor, known
-
-    return read_sweep(files[i], int(t_ns[i]), poses)
+def _sweep_stream(channel: Channel, track: PoseTrack, t_ns: NDArray[np.int64], files: list[Path]) -> Stream:
+    return Stream(channel.name, t_ns, lambda i: read_sweep(files[i], int(t_ns[i]), track, channel.ego_T_sensor))

@@ -12,7 +12,7 @@ the left of the vehicle and turns clockwise; times by order and by azimuth agree
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -222,11 +222,8 @@ TURN_NS = 50_000_000
 
 BYTES_PER_POINT = 20
 
-# Takes stamps (N,) int64 to the poses (N, 4, 4) of the LiDAR in the map, and whether each is known.
-Poses = Callable[[NDArray[np.int64]], tuple[Array, NDArray[np.bool_]]]
 
-
-def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
+def read_sweep(path: Path, t_ns: int, track: PoseTrack, ego_T_lidar: Array) -> Sweep:
     """Read a sweep in the frame of the sensor at `t_ns`; points nearer than 1 m, which are no returns, are left out."""
     data = read_bytes(path, t_ns, MAX_SWEEP_BYTES)
     points = len(data) // BYTES_PER_POINT
@@ -240,7 +237,8 @@ def read_sweep(path: Path, t_ns: int, poses: Poses) -> Sweep:
     sensor: Array = np.zeros(3)
     if offset_ns is not None:
         first = int(offset_ns.min())
-        map_T_lidar, known = poses(np.array([t_ns + first, t_ns]))
+        map_T_ego, known = track.at(np.array([t_ns + first, t_ns]))
+        map_T_lidar = map_T_ego @ ego_T_lidar
         if first and known.all():
             start = map_T_lidar[1, :3, :3].T @ (map_T_lidar[0, :3, 3] - map_T_lidar[1, :3, 3])
             sensor = (offset_ns / first)[:, None] * start
