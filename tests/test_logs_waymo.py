@@ -287,7 +287,7 @@ def test_both_returns_become_points_and_pixels_without_return_do_not() -> None:
     laser = read_range_images(laser_message(1, Ranges([first, second])))
     assert len(laser.returns) == 2
     assert laser.poses is None
-    xyz, turn = points_of(laser, LASER, np.eye(4))
+    xyz, turn, _ = points_of(laser, LASER, np.eye(4))
     a = np.pi / 8
     np.testing.assert_allclose(
         xyz,
@@ -307,8 +307,8 @@ def test_points_are_taken_through_the_poses_of_their_pixels() -> None:
     angles, moved = rng.normal(0, 0.02, (8, 3)) + np.array([0, 0, 1.9]), rng.normal(0, 0.5, (8, 3))
     world_T_vehicle = transform(rotation_from_rpy(*angles.T), place + moved)
     poses = np.broadcast_to(np.concatenate([angles, place + moved], axis=1), (4, 8, 6)).astype(np.float32)
-    xyz, turn = points_of(RangeImages((image,), poses), laser, world_T_vehicle[3])
-    own, _ = points_of(RangeImages((image,), None), laser, world_T_vehicle[3])
+    xyz, turn, _ = points_of(RangeImages((image,), poses), laser, world_T_vehicle[3])
+    own, _, _ = points_of(RangeImages((image,), None), laser, world_T_vehicle[3])
     column = np.round(turn * 8 - 0.5).astype(int)
     expected = apply(inverse(world_T_vehicle[3] @ mount), apply(world_T_vehicle[column] @ mount, own))
     assert np.abs(xyz - own).max() > 0.3
@@ -345,7 +345,7 @@ def test_a_recorded_cloud_survives_a_range_image(recorded_cloud: np.ndarray) -> 
     column = np.floor(turn_of(recorded_cloud, laser) * columns).astype(int)
     image = np.full((rows, columns, 4), -1.0, np.float32)
     image[row[seen], column[seen], 0] = reach[seen]
-    decoded, _ = points_of(read_range_images(laser_message(1, Ranges([image]))), laser, np.eye(4))
+    decoded, _, _ = points_of(read_range_images(laser_message(1, Ranges([image]))), laser, np.eye(4))
     last = {(r, c): k for k, r, c in zip(np.flatnonzero(seen), row[seen], column[seen])}
     source = np.array([last[place] for place in zip(*np.nonzero(image[..., 0] > 0))])
     off = np.linalg.norm(decoded - own[source], axis=1) / reach[source]

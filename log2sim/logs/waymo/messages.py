@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from io import SEEK_END
@@ -149,9 +150,11 @@ class RecordFile:
                 self._kept.popitem(last=False)
             return data
 
-    def window(self, k: int) -> RecordWindow:
-        """Open record `k` to read parts of it, without its CRC; to be closed."""
-        return RecordWindow(self.path, *self.spans[k])
+    @contextmanager
+    def window(self, k: int) -> Iterator[RecordWindow]:
+        """Open record `k` to read parts of it, without its CRC."""
+        with open_regular(self.path, buffering=0) as file:
+            yield RecordWindow(file, *self.spans[k])
 
     def _find_spans(self, file: BinaryIO, total: int) -> list[tuple[int, int]]:
         """Find offset and size of the data of all whole records by their lengths."""
@@ -186,17 +189,9 @@ class RecordFile:
 class RecordWindow:
     """Parts of one record, read in blocks from its file; offsets count from the start of its data."""
 
-    def __init__(self, path: Path, begin: int, size: int) -> None:
-        self._file, self._begin, self.size = open_regular(path, buffering=0), begin, size
+    def __init__(self, file: BinaryIO, begin: int, size: int) -> None:
+        self._file, self._begin, self.size = file, begin, size
         self._block, self._block_begin = b"", 0
-
-    def __enter__(self) -> RecordWindow:
-        """Return the window."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the file."""
-        self._file.close()
 
     def peek(self, begin: int, count: int) -> bytes:
         """Return up to `count` bytes at an offset, fewer at the end of the record; at most `BLOCK_BYTES`."""

@@ -115,9 +115,8 @@ def read_boxes(path: Path, prefix: str, frame_of: Mapping[int, int], camera: int
     frame = np.array([frame_of.get(int(t), -1) for t in columns[STAMP]], dtype=np.int64)
     box = np.stack([columns[name].astype(np.float64) for name in numbers], axis=1)
     tracks = [str(word) for word in columns[track]]
-    return segment.BoxTable.of(frame, tracks, columns[kind], box, int((frame < 0).sum())).take(
-        np.flatnonzero(frame >= 0)
-    )
+    table = segment.BoxTable.of(frame, tracks, columns[kind], box, int((frame < 0).sum()))
+    return table.take(np.flatnonzero(frame >= 0))
 
 
 def numbers_of(words: NDArray[Any], names: Mapping[int, str]) -> NDArray[np.int64]:

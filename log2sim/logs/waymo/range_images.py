@@ -61,13 +61,10 @@ def read_matrix(compressed: bytes) -> NDArray[np.float32]:
             parts.append(np.frombuffer(data[f.begin : f.end], "<f4"))
         elif f.number == 2:
             # A MatrixShape: its dimensions packed, or one field each.
-            shape = data[f.begin : f.end]
-            found = (
-                varints(shape[g.begin : g.end]) if g.kind == BYTES else [g.value]
-                for g in fields_of(shape)
-                if g.number == 1
-            )
-            dims = [n for numbers in found for n in numbers]
+            shape, dims = data[f.begin : f.end], []
+            for g in fields_of(shape):
+                if g.number == 1:
+                    dims += varints(shape[g.begin : g.end]) if g.kind == BYTES else [g.value]
     return shaped(np.concatenate(parts) if parts else np.zeros(0, np.float32), dims)
 
 
@@ -92,21 +89,23 @@ def checked(returns: list[NDArray[np.float32]], poses: NDArray[np.float32] | Non
 
 def points_of(
     images: RangeImages, laser: LaserCalibration, world_T_vehicle: Array
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32] | None]:
     """Turn the range images of one LiDAR into points (N, 3), m, of all returns, in the lidar's frame as it was at `world_T_vehicle`.
 
-    Also the share (N,) of the turn, in [0, 1), at which the middle of each point's column was measured. After comments of RangeImage
-    in dataset.proto: each pixel is taken to the world by the pose of the vehicle at its own time and back by `world_T_vehicle`,
-    which defines the vehicle's frame. Range images without such poses are made of points in the vehicle's frame already.
+    Also the share (N,) of the turn, in [0, 1), at which the middle of each point's column was measured, and the intensities (N,), None
+    where there are ranges only. After comments of RangeImage in dataset.proto: each pixel is taken to the world by the pose of the
+    vehicle at its own time and back by `world_T_vehicle`, which defines the vehicle's frame. Range images without such poses are made
+    of points in the vehicle's frame already.
     """
     height, width = images.returns[0].shape[:2]
     # Columns are even in the vehicle's frame, azimuths in the lidar's.
     yaw = np.arctan2(laser.vehicle_T_lidar[1, 0], laser.vehicle_T_lidar[0, 0])
     azimuth = np.pi - 2 * np.pi * (np.arange(width) + 0.5) / width - yaw
     inclination = row_inclinations(laser, height)
-    parts, turns = [], []
+    has_intensity = min(image.shape[2] for image in images.returns) > 1
+    parts, turns, intensities = [], [], []
     for image in images.returns:
-        row, column = _pixels_with_return(image)
+        row, column = np.nonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
         reach = image[row, column, 0].astype(np.float64)
         level = np.cos(inclination[row]) * reach
         xyz = np.stack(
@@ -125,19 +124,9 @@ def points_of(
             xyz = apply(inverse(laser.vehicle_T_lidar), (turned + from_pose) @ world_T_vehicle[:3, :3])
         parts.append(xyz.astype(np.float32))
         turns.append((column + 0.5) / width)
-    return np.concatenate(parts), np.concatenate(turns)
-
-
-def intensities_of(images: RangeImages) -> NDArray[np.float32] | None:
-    """Return the intensities (N,) of the points of `points_of`, in their order; None where the images hold ranges only."""
-    if min(image.shape[2] for image in images.returns) < 2:
-        return None
-    return np.concatenate([image[(*_pixels_with_return(image), 1)] for image in images.returns])
-
-
-def _pixels_with_return(image: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    row, column = np.nonzero((image[..., 0] > 0) & np.isfinite(image[..., 0]))
-    return row, column
+        if has_intensity:
+            intensities.append(image[row, column, 1])
+    return np.concatenate(parts), np.concatenate(turns), np.concatenate(intensities) if has_intensity else None
 
 
 def row_inclinations(laser: LaserCalibration, height: int) -> Array:
@@ -183,8 +172,7 @@ def labels_of(
     note_left_out(kind[~road_user].tolist(), NO_ROAD_USERS, notes)
     rows = np.flatnonzero(usable & road_user)
     table, kind = table.take(rows), kind[rows]
-    turn = None if top is None else turn_of(table.center, top)
-    t_ns = times.pose_ns[table.frame] if turn is None else times.at_turn(table.frame, turn)
+    t_ns = times.pose_ns[table.frame] if top is None else times.at_turn(table.frame, turn_of(table.center, top))
     order = np.argsort(t_ns, kind="stable")
     keep = order[select_spaced(t_ns[order], table.track_id[order])]
     table, kind, t_ns = table.take(keep), kind[keep], t_ns[keep]

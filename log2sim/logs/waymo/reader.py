@@ -153,17 +153,15 @@ class Segment:
                 elif calibration is not None:
                     self.notes.append(f"{name}: no images of this camera")
                 continue
-            camera = camera_of(name, calibration, [self.frames[k] for k in rows], number)
-            untimed = sum(not self.frames[k].images[number].is_timed for k in rows)
+            frames = [self.frames[k] for k in rows]
+            camera = camera_of(name, calibration, frames, number)
+            untimed = sum(not frame.images[number].is_timed for frame in frames)
             if untimed:
                 self.notes.append(
                     f"{name}: {untimed} of {len(rows)} images without the times of their exposure: those of their poses are taken"
                 )
-            stamped = [
-                (segment.plausible_stamp(self.frames[k].images[number].middle_ns(), self.frames[k].stamp_ns), k)
-                for k in rows
-            ]
-            t_ns = np.array([self.times.pose_ns[k] if stamp is None else stamp for stamp, k in stamped], dtype=np.int64)
+            stamps = [segment.plausible_stamp(f.images[number].middle_ns(), f.stamp_ns) for f in frames]
+            t_ns = np.array([self.times.pose_ns[k] if s is None else s for k, s in zip(rows, stamps)], dtype=np.int64)
             keep = strictly_increasing(t_ns, name, self.notes)
             rows, t_ns = rows[keep], t_ns[keep]
             cameras[name], image_ns[number] = camera, np.full(len(self.frames), -1, dtype=np.int64)
@@ -205,17 +203,14 @@ class Segment:
             row, stamp_ns = rows[i], int(stamps[i])
             images = self.ranges(int(self.order[row]), number)
             try:
-                xyz_m, turn = range_images.points_of(images, calibration, self.frames[row].world_T_vehicle)
+                world_T_vehicle = self.frames[row].world_T_vehicle
+                xyz_m, turn, intensity = range_images.points_of(images, calibration, world_T_vehicle)
             except messages.WireError as error:
                 raise RecordError(f"{self.where(int(self.order[row]))}, {name} (stamp {stamp_ns}): {error}") from None
             # How the short-range LiDARs scan is not documented.
-            timed = (
-                self.times.at_turn(np.broadcast_to(row, len(turn)), turn) - stamp_ns if number == segment.TOP else None
-            )
-            raw = number == segment.TOP and self.pixel_poses_are_missing
-            return sweep_of(
-                xyz_m, stamp_ns, timed, "lidar", None if raw else stamp_ns, range_images.intensities_of(images)
-            )
+            offset_ns = self.times.at_turn(row, turn) - stamp_ns if number == segment.TOP else None
+            compensated_ns = None if number == segment.TOP and self.pixel_poses_are_missing else stamp_ns
+            return sweep_of(xyz_m, stamp_ns, offset_ns, "lidar", compensated_ns, intensity)
 
         return Stream(name, stamps, read)
 
@@ -430,6 +425,5 @@ class _SegmentFile(Segment):
 def _table(rows: list[tuple[int, str, int, list[float]]], dimensions: int, lost: int) -> segment.BoxTable:
     """Make a table of rows: frame, id, type, and the numbers of a box."""
     frame, track_id, kind, box = zip(*rows) if rows else ((), (), (), ())
-    return segment.BoxTable.of(
-        frame, track_id, kind, np.array(box, dtype=np.float64).reshape(-1, 2 * dimensions + 1), lost
-    )
+    boxes = np.array(box, dtype=np.float64).reshape(-1, 2 * dimensions + 1)
+    return segment.BoxTable.of(frame, track_id, kind, boxes, lost)

@@ -106,9 +106,8 @@ class FrameRow:
 class RangeImages:
     """Range images of one LiDAR in one frame."""
 
-    returns: tuple[
-        NDArray[np.float32], ...
-    ]  # (H, W, C) each: first the range in m, not positive where nothing returned
+    # (H, W, C) each: first the range in m, not positive where nothing returned
+    returns: tuple[NDArray[np.float32], ...]
     # (H, W, 6): roll, pitch, yaw, x, y, z of the vehicle in the world at the time of each pixel
     poses: NDArray[np.float32] | None
 
@@ -190,8 +189,8 @@ class FrameTimes:
             )
         return cls(start, period, pose)
 
-    def at_turn(self, frame: NDArray[np.int64], turn: NDArray[np.float64]) -> Stamps:
-        """Return the stamps (N,) at shares of the turns (N,) of frames (N,)."""
+    def at_turn(self, frame: NDArray[np.int64] | np.intp, turn: NDArray[np.float64]) -> Stamps:
+        """Return the stamps (N,) at shares of the turns (N,) of frames (N,), or of one."""
         return self.start_ns[frame] + np.round(turn * self.period_ns[frame]).astype(np.int64)
 
 
