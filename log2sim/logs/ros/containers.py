@@ -305,7 +305,7 @@ def decompressor_of(method: str) -> Any:
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES = 1024 * 1024
 MAX_INDEX_BYTES = 256 * 1024 * 1024
-MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+MESSAGE, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 4, 5, 6, 7
 # A record begins with its header; that of a message is about 40 bytes.
 FIRST_BYTES = 512
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from log2sim.config import Section
 from log2sim.datatypes import Sweep
@@ -35,17 +35,12 @@ from log2sim.logs.stamps import strictly_increasing
 
 MAX_SETTINGS_BYTES = 1024 * 1024
 MAX_OFFSET_S = 10.0
-NAME = r"^[A-Za-z0-9_-]+$"
 
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
-Vector = Annotated[tuple[float, float, float], BeforeValidator(_as_tuple)]
-Quaternion = Annotated[tuple[float, float, float, float], BeforeValidator(_as_tuple)]
-Numbers = Annotated[tuple[float, ...], BeforeValidator(_as_tuple)]
-Name = Annotated[str, Field(pattern=NAME)]
+# Lists, as TOML has them, become tuples; their items are not converted.
+Vector = Annotated[tuple[float, float, float], Field(strict=False)]
+Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 
 
 class Intrinsics(Section):
@@ -171,7 +166,7 @@ class TopicSettings(Section):
     ego: EgoSettings = EgoSettings()
     poses: PoseSettings = PoseSettings()
     map: MapSettings = MapSettings()
-    static_transforms: Annotated[tuple[StaticTransform, ...], BeforeValidator(_as_tuple)] = ()
+    static_transforms: Annotated[tuple[StaticTransform, ...], Field(strict=False)] = ()
 
 
 def read_settings(places: Iterable[Path]) -> tuple[TopicSettings, Path | None]:

@@ -26,14 +26,11 @@ from log2sim.logs.ros.containers import printable
 from log2sim.logs.ros.frames import BASE_FRAMES, FoundPoses, FrameTree, PoseSources
 from log2sim.logs.ros.sensors import COMPRESSED, camera_stream, lidar_stream
 
-IMAGE = "sensor_msgs/msg/Image"
-CLOUD, CAMERA_INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
-ODOMETRY, FIX, IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
-POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
-TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 KINDS = {
-    IMAGE: "camera", **dict.fromkeys(messages.TYPES, "lidar"), COMPRESSED: "camera", CLOUD: "lidar", CAMERA_INFO: "camera info", ODOMETRY: "odometry",
-    FIX: "gnss", IMU: "imu", **dict.fromkeys(POSES, "pose"), **dict.fromkeys(TRANSFORMS, "tf"),
+    "sensor_msgs/msg/Image": "camera", **dict.fromkeys(messages.TYPES, "lidar"), COMPRESSED: "camera",
+    "sensor_msgs/msg/PointCloud2": "lidar", "sensor_msgs/msg/CameraInfo": "camera info", "nav_msgs/msg/Odometry": "odometry",
+    "sensor_msgs/msg/NavSatFix": "gnss", "sensor_msgs/msg/Imu": "imu", "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose", "tf2_msgs/msg/TFMessage": "tf", "tf/msg/tfMessage": "tf",
 }  # fmt: skip
 FIXED_FRAMES = ("map", "world", "earth", "odom")
 # Images and clouds that are computed from others, by words in their topics.

@@ -221,12 +221,10 @@ class SqliteBag:
             with self._lock:
                 if self._process != os.getpid():  # a connection must not be used in a forked process
                     self._open()
-            with (
-                self._lock,
-                self._database.blobopen("messages", "data", int(self.entries.place[k]), readonly=True) as blob,
-            ):
-                size = checked_size(len(blob))
-                data = blob.read(size if wanted is None else min(size, wanted))
+                row = int(self.entries.place[k])
+                with self._database.blobopen("messages", "data", row, readonly=True) as blob:
+                    size = checked_size(len(blob))
+                    data = blob.read(size if wanted is None else min(size, wanted))
         except sqlite3.Error as problem:
             raise ValueError(f"the database cannot be read there: {one_line(problem)}") from None
         if compression:
@@ -251,13 +249,9 @@ class SqliteBag:
         definitions: dict[str, str] = {}
         if "message_definitions" in tables:
             with suppress(sqlite3.Error):
-                definitions = {
-                    str(kind): str(text)
-                    for kind, language, text in database.execute(
-                        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-                    )
-                    if language == "ros2msg"
-                }
+                columns = "topic_type, encoding, encoded_message_definition"
+                found = database.execute(f"SELECT {columns} FROM message_definitions")
+                definitions = {str(kind): str(text) for kind, language, text in found if language == "ros2msg"}
         rows = list(database.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id"))
         self.channels = [
             Channel(
