@@ -256,13 +256,13 @@ class ArgoverseReader(FolderReader):
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder is a log or holds some."""
-        return next(_logs(path, MAX_DEPTH), None) is not None
+        return next(_logs(path), None) is not None
 
     def find(self, path: Path) -> dict[str, Path]:
         """Find the logs at a folder by name; below other folders with these ("sensor/val/LOG")."""
         if _is_log(path):
             return {path.resolve().name: path}
-        return {log.relative_to(path).as_posix(): log for log in _logs(path, MAX_DEPTH)}
+        return {log.relative_to(path).as_posix(): log for log in _logs(path)}
 
     def open(self, path: Path, sequence: str) -> Log:
         """Open a log; no image, no sweep and no annotation is read."""
@@ -278,9 +278,9 @@ def _is_log(path: Path) -> bool:
     return (path / POSES).is_file() and (path / "calibration").is_dir()
 
 
-def _logs(root: Path, depth: int) -> Iterator[Path]:
-    """Find logs at and up to `depth` levels below a folder, not below logs nor in what is hidden or cannot be read."""
-    folders, left = [(root, depth)], MAX_FOLDERS
+def _logs(root: Path) -> Iterator[Path]:
+    """Find logs at and up to `MAX_DEPTH` levels below a folder, not below logs nor in what is hidden or cannot be read."""
+    folders, left = [(root, MAX_DEPTH)], MAX_FOLDERS
     while folders and left:
         left -= 1
         path, below = folders.pop()
@@ -297,7 +297,7 @@ def _logs(root: Path, depth: int) -> Iterator[Path]:
 
 def _open(path: Path) -> Log:
     notes: list[str] = []
-    # Read `city_SE3_egovehicle.feather`: all its poses, in a map that lies `offset_m`, whole kilometers, off the city's frame
+    # All its poses, in a map that lies `offset_m`, whole kilometers, off the city's frame.
     poses = path / POSES
     columns = read_columns(poses, {"timestamp_ns": "int", **TRANSFORM})
     city_T_ego = transforms_of(columns, poses)
@@ -366,11 +366,8 @@ def _cameras(folder: Path, mounts: dict[str, Array], notes: list[str]) -> tuple[
     for row, name in enumerate(columns.pop("sensor_name")):
         values = {key: float(column[row]) for key, column in columns.items()}
         fx, fy, cx, cy, height, width = values.values()
-        if (
-            not np.isfinite(list(values.values())).all()
-            or min(fx, fy, height, width) <= 0
-            or width * height > MAX_IMAGE_PX
-        ):
+        is_possible = np.isfinite(list(values.values())).all() and min(fx, fy, height, width) > 0
+        if not is_possible or width * height > MAX_IMAGE_PX:
             raise LogError(f"{path}, row {row} ('{name}'): {values}, expected a size in px and focal lengths above 0")
         if name in mounts:
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

@@ -299,7 +299,7 @@ def translate_errors(path: Path | str, error: type[LogError]) -> Iterator[None]:
         raise error(f"{path}: {lines[0] if lines else type(problem).__name__}") from None
 
 
-def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection[str] = ()) -> list[str]:
+def checked_schema(schema: Any, wanted: Mapping[str, Kind], optional: Collection[str]) -> list[str]:
     """Return the names out of `wanted` that a pyarrow schema has; `ValueError` when one is missing, there twice, or an extension.
 
     Extension types run code of whoever registered them.
@@ -382,7 +382,6 @@ class ParquetRows:
         if self._file is not None and self._process == os.getpid():
             return
         self._process, self._group = os.getpid(), -1
-        import_pyarrow()
         from pyarrow.parquet import ParquetFile
 
         open_regular(self._path).close()  # pyarrow would wait for a pipe

@@ -187,7 +187,7 @@ def list_time_problems(log: Log) -> list[str]:
             if not lost.any():
                 continue
             line = f"{int(lost.sum())} of {len(lost)} {what} in images of '{name}' are at stamps of no frame, first {rows.t_ns[lost].min()}"
-            spans = Span.of(f"{what}", rows.t_ns), Span.of("frames", frames)
+            spans = Span.of(what, rows.t_ns), Span.of("frames", frames)
             apart = f": {describe_gap(*spans)}" if spans[0].is_apart(spans[1]) else ""
             nearest = "" if apart or not lost.all() else f"; the nearest is {off_ns.min() / 1e6:.3g} ms off"
             problems.append(f"{line}{nearest}{apart}")

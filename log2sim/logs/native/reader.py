@@ -37,7 +37,6 @@ MAX_TABLE_BYTES = 256 * 1024 * 1024
 # No coordinate on Earth, in any projection, is near this, and no square of it overflows.
 MAX_NUMBER = 1e8
 
-_DTYPE = {"int": np.int64, "float": np.float64}
 _EXPECTED = {
     "int": "a whole number",
     "float": f"a finite number of at most {MAX_NUMBER:g} in size",
@@ -143,7 +142,7 @@ def _parse(text: list[str], kind: str) -> tuple[NDArray[Any], int | None]:
     try:
         if not is_plain("".join(text)):
             raise ValueError
-        values = np.array(text, dtype=np.str_).astype(_DTYPE[kind])
+        values = np.array(text, dtype=np.str_).astype(np.int64 if kind == "int" else np.float64)
     except (ValueError, OverflowError):
         # The first that cannot be parsed by itself, or is impossible.
         good = [_parse([t], kind)[1] is None for t in text] if len(text) > 1 else [False]

@@ -161,7 +161,6 @@ CATEGORY_OF = {
     "Other Vehicle - Uncommon": "other", "Personal Mobility Device": "other", "Towed Object": "other",
     "Train": "other", "Tram / Subway": "other",
 }  # fmt: skip
-# Things that are no road users.
 NO_ROAD_USERS = {
     "Animals - Bird", "Animals - Other", "Cones", "Construction Signs", "Pylons", "Road Barriers", "Rolling Containers",
     "Signs", "Temporary Construction Barriers",
@@ -351,8 +350,8 @@ def _files(path: Path, folder: str, suffix: str, count: int, notes: list[str]) -
 def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, Camera], dict[str, Stream]]:
     cameras, streams = {}, {}
     for folder in records.list_folders(path / "camera"):
-        name = folder.name
-        if not is_present(folder / "intrinsics.json"):
+        name, intrinsics = folder.name, folder / "intrinsics.json"
+        if not is_present(intrinsics):
             images = len(records.list_numbered_files(folder, (".jpg",)))
             if images:
                 notes.append(f"camera/{name}: {images} images left out: it has no intrinsics.json")
@@ -372,17 +371,15 @@ def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, 
         rotation = nearest_rotation(np.median(ego_T_cam[:, :3, :3], axis=0))
         spread_m = float(np.median(np.linalg.norm(ego_T_cam[:, :3, 3] - translation, axis=1)))
         if spread_m > MAX_MOUNT_SPREAD_M:
-            notes.append(f"{folder.name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
-        mount = transform(rotation, translation)
-        path_K = folder / "intrinsics.json"
+            notes.append(f"{name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
         try:
-            fx, fy, cx, cy = (float(read_json(path_K)[k]) for k in ("fx", "fy", "cx", "cy"))
+            fx, fy, cx, cy = (float(read_json(intrinsics)[k]) for k in ("fx", "fy", "cx", "cy"))
         except (TypeError, KeyError, ValueError):
-            raise LogError(f"{path_K}: expected the numbers fx, fy, cx, cy") from None
+            raise LogError(f"{intrinsics}: expected the numbers fx, fy, cx, cy") from None
         if fx <= 0 or fy <= 0:
-            raise LogError(f"{path_K}: fx {fx:g}, fy {fy:g}, expected focal lengths above 0")
+            raise LogError(f"{intrinsics}: fx {fx:g}, fy {fy:g}, expected focal lengths above 0")
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        cameras[name] = Camera(name, *size_px, K, "ego", mount)
+        cameras[name] = Camera(name, *size_px, K, "ego", transform(rotation, translation))
         numbers = np.array(list(files))
         numbers = numbers[strictly_increasing(t_ns[numbers], name, notes)]
         streams[name] = records.image_stream(name, t_ns[numbers], [files[int(n)] for n in numbers], size_px)
@@ -445,9 +442,6 @@ def _poses(folder: Path) -> tuple[NDArray[np.int64], Array]:
     sensor_poses = records.checked_poses(q, position, lambda k: f"{folder}/poses.json: record {k}")
     for k, stamp in enumerate(stamps):
         if not isinstance(stamp, (int, float)) or isinstance(stamp, bool) or not abs(stamp) < MAX_TIME_S:
-            where, expected = (
-                f"{folder}/timestamps.json: record {k}",
-                f"expected a stamp in seconds below {MAX_TIME_S:g}",
-            )
-            raise LogError(f"{where}: {str(stamp)[:40]!a}, {expected}")
+            expected = f"expected a stamp in seconds below {MAX_TIME_S:g}"
+            raise LogError(f"{folder}/timestamps.json: record {k}: {str(stamp)[:40]!a}, {expected}")
     return np.round(np.array(stamps, dtype=np.float64) * NS_PER_S).astype(np.int64), sensor_poses
