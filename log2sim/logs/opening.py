@@ -24,11 +24,8 @@ from log2sim.logs.records import guard_log, translate_parser_errors
 class Reader(Protocol):
     """Reader of one log format.
 
-    To add a format, write a module with an object that has these members and register it: in `registry.BUILT_IN["log"]`,
+    To add a format, write a module with an object that has these members and register it: in `log2sim.files.plugins.BUILT_IN`,
     or in another distribution as an entry point of the group "log2sim.log".
-
-    `name`: that `--format` takes. `looks_for`: what a folder of this format must contain, for messages. `suffixes`: of files that
-    are logs by themselves, in lower case (".bag"); none for formats that are folders.
 
     A `Log` returned by `open` fulfills this contract:
 
@@ -64,11 +61,11 @@ class Reader(Protocol):
 
     @property
     def looks_for(self) -> str:
-        """What a folder of this format must contain."""
+        """What a folder of this format must contain, for messages."""
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """Suffixes of files that are logs by themselves."""
+        """Suffixes of files that are logs by themselves, in lower case (".bag"); none for formats that are folders."""
 
     def matches(self, path: Path) -> bool:
         """Return whether the folder or file is a sequence of this format or holds some, by names and magic bytes alone."""
