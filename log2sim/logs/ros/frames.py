@@ -206,6 +206,7 @@ def is_pose(translation: Any, rotation: Any) -> bool:
 # Usual names of the frame of a vehicle, first that of REP 105.
 BASE_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "vehicle", "rear_axle", "base", "chassis", "ego")
 GROUND_FRAME = "base_footprint"
+FIXED_FRAMES = ("map", "world", "earth", "odom")
 # x forward, y left, z up out of the axes of an image: x right, y down, z forward.
 CAMERA_R_EGO = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -228,7 +229,7 @@ class EgoFrame:
 
 
 def choose_base(
-    tree: FrameTree, sensor_frames: list[str], pose_frames: list[str], fixed_frames: tuple[str, ...], given: str
+    tree: FrameTree, sensor_frames: list[str], pose_frames: list[str], given: str
 ) -> tuple[str | None, str]:
     """Choose the vehicle's frame, that of the settings if they give one, and say why; `pose_frames` are those of odometry."""
     if given:
@@ -241,7 +242,7 @@ def choose_base(
     if ordered:
         return ordered[0], reasons[ordered[0]]
     roots = (tree.rigid_root(frame) for frame in sensor_frames)
-    root = next((root for root in roots if root not in fixed_frames), None)
+    root = next((root for root in roots if root not in FIXED_FRAMES), None)
     if root is None:
         return None, "the sensors stand still"
     return root, f"all sensors are fixed to it, and no frame is named {BASE_FRAMES[0]}"
@@ -309,7 +310,6 @@ MAP_FRAMES = ("map", "world", "earth", "utm")
 # The course of a moving vehicle shows whether the heading of the IMU counts from the east.
 MIN_COURSE_STEP_M = 1.0
 MAX_COURSE_ERROR_DEG = 30.0
-MAX_LATITUDE_DEG, MAX_LONGITUDE_DEG = 90.0, 360.0
 ORIGIN = SimpleNamespace(x=0.0, y=0.0, z=0.0)
 
 
@@ -457,7 +457,7 @@ class PoseSources:
         fixes, stamps = self._decoded(name)
         rows = np.array([[m.latitude, m.longitude, m.altitude] for m in fixes]).reshape(-1, 3)
         good = np.isfinite(rows).all(axis=1) & np.array([int(m.status.status) >= 0 for m in fixes], dtype=bool)
-        good &= (np.abs(rows[:, 0]) < MAX_LATITUDE_DEG) & (np.abs(rows[:, 1]) <= MAX_LONGITUDE_DEG)
+        good &= (np.abs(rows[:, 0]) < 90.0) & (np.abs(rows[:, 1]) <= 360.0)
         problems = list[str]()
         keep = strictly_increasing(stamps[good], name, problems)
         rows, stamps = rows[good][keep], stamps[good][keep]

@@ -240,7 +240,6 @@ def describe_uncovered(t_ns: NDArray[np.int64], begin_ns: int, end_ns: int) -> s
 
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
-FIELDS = ["header", "timebase", "point_num", "lidar_id", "rsvd", "points"]
 # CustomPoint: time in ns after the stamp, position in m; then reflectivity, tag and line.
 POINT_FORMATS = ("u4", "f4", "f4", "f4", "u1")
 POINT_BYTES = 19
@@ -280,11 +279,9 @@ def sweep_from_livox(raw: bytes, encoding: str, t_ns: int, settings: LidarTopic,
     return sweep_of(xyz[kept], t_ns, times, "lidar", t_ns if settings.compensated else None, points["r"][kept])
 
 
-_TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms\n"
 # ROS 1 called it so before tf2.
 ALIASES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _FIELD = re.compile(r"^\s*[\w/<>=]+(?:\[[<>=\d]*\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<constant>=)?")
-PLAIN_CDR = (b"\0\0", b"\0\1")
 _COMPILING = threading.Lock()
 
 
@@ -295,7 +292,7 @@ def decode(bag: Bag, topic: Topic, i: int) -> Any:
 
 def decode_bytes(topic: Topic, raw: bytes, where: str) -> Any:
     """Decode the bytes of a message; `RecordError`, beginning with `where`, when they are damaged."""
-    if topic.encoding == "cdr" and raw[:2] not in PLAIN_CDR:
+    if topic.encoding == "cdr" and raw[:2] not in (b"\0\0", b"\0\1"):
         raise RecordError(f"{where}: encapsulation {raw[:2].hex() or 'missing'}, only plain CDR (0000, 0001) is read")
     store = typestore(topic.encoding)
     kind = ALIASES.get(topic.msgtype, topic.msgtype)
@@ -312,7 +309,7 @@ def find_layout_problem(topic: Topic) -> str | None:
     if topic.encoding not in ENCODINGS:
         return f"its messages are encoded as '{topic.encoding}', only ros1 and cdr are read"
     if topic.msgtype in TYPES:
-        expected = FIELDS
+        expected = ["header", "timebase", "point_num", "lidar_id", "rsvd", "points"]
     else:
         definitions = typestore(topic.encoding).fielddefs
         expected = [name for name, _ in definitions[ALIASES.get(topic.msgtype, topic.msgtype)][1]]
@@ -335,5 +332,5 @@ def typestore(encoding: str) -> Any:
     if encoding != "ros1":
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg(_TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
     return store

@@ -23,7 +23,7 @@ from log2sim.logs.ros import messages
 from log2sim.logs.ros import sensors as calibration
 from log2sim.logs.ros.bag import NAME_BYTES, SUFFIXES, Bag, Topic, find_recordings
 from log2sim.logs.ros.containers import printable
-from log2sim.logs.ros.frames import BASE_FRAMES, FoundPoses, FrameTree, PoseSources
+from log2sim.logs.ros.frames import BASE_FRAMES, FIXED_FRAMES, FoundPoses, FrameTree, PoseSources
 from log2sim.logs.ros.sensors import COMPRESSED, camera_stream, lidar_stream
 
 KINDS = {
@@ -32,7 +32,6 @@ KINDS = {
     "sensor_msgs/msg/NavSatFix": "gnss", "sensor_msgs/msg/Imu": "imu", "geometry_msgs/msg/PoseStamped": "pose",
     "geometry_msgs/msg/PoseWithCovarianceStamped": "pose", "tf2_msgs/msg/TFMessage": "tf", "tf/msg/tfMessage": "tf",
 }  # fmt: skip
-FIXED_FRAMES = ("map", "world", "earth", "odom")
 # Images and clouds that are computed from others, by words in their topics.
 _DERIVED_IMAGE = re.compile(
     r"depth|disparity|mask|segment|label|debug|overlay|annotat|confidence|visuali[sz]|/theora|/h26"
@@ -304,8 +303,7 @@ class _Opening:
             if raw is not None:
                 child = printable(messages.decode_bytes(bag.topics[name], raw, name).child_frame_id).lstrip("/")
                 pose_frames += [child] if child else []
-        named = settings.ego.base_frame
-        base, why = ego.choose_base(self.tree, sensor_frames, pose_frames, FIXED_FRAMES, named)
+        base, why = ego.choose_base(self.tree, sensor_frames, pose_frames, settings.ego.base_frame)
         frame = ego.place_ego(base, settings.ego, self.tree, {c.frame for c in roles.cameras.values()})
         stamped = self._stamps()
         span_ns = min(int(s.t_ns[0]) for s in stamped.values()), max(int(s.t_ns[-1]) for s in stamped.values())
