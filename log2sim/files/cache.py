@@ -169,7 +169,6 @@ class DiskCache:
         return self.folder / name[-1] / name
 
     def _entries(self, digits: str = DIGITS) -> Iterator[tuple[Path, os.stat_result]]:
-        """Yield the entries of some folders."""
         for digit in digits:
             for path, state in _files(self.folder / digit):
                 if _NAME.fullmatch(path.name):

@@ -49,7 +49,7 @@ def claim(target: Path, *, overwrite: bool) -> None:
     if claims is None or path in claims:
         return
     try:
-        lock = _Lock.take(path)
+        claims[path] = _Lock.take(path)
     except BlockingIOError:
         if not overwrite:
             raise ConfigError(
@@ -57,8 +57,6 @@ def claim(target: Path, *, overwrite: bool) -> None:
             ) from None
     except OSError as error:
         raise ConfigError(f"{target}: cannot be written: {error.strerror or error}; choose another place") from None
-    else:
-        claims[path] = lock
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,6 @@ LASERS = 32
 COLUMNS: dict[str, Kind] = {
     "x": "float", "y": "float", "z": "float", "laser_number": "int", "offset_ns": "int", "intensity": "float",
 }  # fmt: skip
-OPTIONAL = ("intensity",)
 SWEEP_LIMITS = TableLimits(rows=MAX_SWEEP_POINTS, file_bytes=MAX_SWEEP_BYTES, unpacked_bytes=MAX_SWEEP_BYTES)
 # A sweep lasts 0.1 s, those of both LiDARs together 0.106 s in the sample log.
 MAX_OFFSET_NS = 1_000_000_000
@@ -112,7 +111,7 @@ def sweep_stream(lidar: str, t_ns: NDArray[np.int64], files: list[Path], ego_T_l
 # The streams of both LiDARs read each file, one after the other.
 @lru_cache(maxsize=4)
 def _read_points(path: Path) -> dict[str, NDArray[Any]]:
-    columns = read_columns(path, COLUMNS, optional=OPTIONAL, error=RecordError, limits=SWEEP_LIMITS)
+    columns = read_columns(path, COLUMNS, optional=("intensity",), error=RecordError, limits=SWEEP_LIMITS)
     for name, low, high, expected in (
         ("laser_number", 0, LASERS * len(LIDARS) - 1, "0 to 63"),
         ("offset_ns", -MAX_OFFSET_NS, MAX_OFFSET_NS, "less than 1 s from the stamp"),

@@ -137,7 +137,6 @@ def _mark_rows(t_ns: NDArray[np.int64], rows: NDArray[np.intp], span: _Span) -> 
 
 
 def _cut_boxes(boxes: B, span: _Span | None, margin_ns: int) -> B:
-    """Keep the boxes or regions of the frames that are kept."""
     if span is None:
         return boxes
     rows = span.contains(boxes.t_ns, margin_ns + STAMP_TOLERANCE_NS)

@@ -157,7 +157,6 @@ BOX_3D_FIELDS = ("x_m", "y_m", "z_m", *SIZE_FIELDS, "yaw_rad")
 BOX_3D_COLUMNS = {"t_ns": "int", "track_id": "str", "category": "str", **dict.fromkeys(BOX_3D_FIELDS, "float")}
 BOX_3D_OPTIONAL = {"visible": "bool", "kind": "str", "occlusion": "int"}
 LABELED_COLUMNS = {"t_ns": "int"}
-OCCLUSIONS = (0, 1, 2, 3)
 BOX_2D_FIELDS = ("u0_px", "v0_px", "u1_px", "v1_px")
 REGION_COLUMNS = {"t_ns": "int", "camera": "str", **dict.fromkeys(BOX_2D_FIELDS, "float")}
 BOX_2D_COLUMNS = {**REGION_COLUMNS, "category": "str"}
@@ -170,7 +169,7 @@ def boxes_3d(table: CsvTable) -> datatypes.Labels:
     for name in SIZE_FIELDS:
         table.refuse(table[name] <= 0, name, "VALUE, expected a size above 0")
     if occlusion is not None:
-        table.refuse(~np.isin(occlusion, OCCLUSIONS), "occlusion", "VALUE, expected 0, 1, 2 or 3")
+        table.refuse(~np.isin(occlusion, (0, 1, 2, 3)), "occlusion", "VALUE, expected 0, 1, 2 or 3")
     center, size = table.stack("x_m", "y_m", "z_m"), table.stack(*SIZE_FIELDS)
     return datatypes.Labels(
         table["t_ns"], table["track_id"], table["category"], center, size, table["yaw_rad"], visible, kind=kind,

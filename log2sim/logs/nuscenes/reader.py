@@ -92,7 +92,6 @@ def _versions(path: Path) -> list[Path]:
 
 
 def _open(scene: Scene) -> Log:
-    """Read the tables and return the log of a scene."""
     notes, tables, ego = scene.notes, scene.tables, scene.ego
     offset_m = whole_kilometers(ego.map_T_ego[:, :3, 3])
     map_T_ego = shift_poses(ego.map_T_ego, offset_m)
