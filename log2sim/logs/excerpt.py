@@ -184,8 +184,7 @@ def summarize(log: Log) -> dict[str, Any]:
     if log.labels is not None:
         # Of each track the category of its first label.
         first = dict(zip(log.labels.track_id.tolist()[::-1], log.labels.category.tolist()[::-1]))
-        tracks = {"tracks": len(first), "tracks_by_category": _counts(first.values())}
-        labels = {"boxes": len(log.labels.t_ns), **tracks}
+        labels = {"boxes": len(log.labels.t_ns), "tracks": len(first), "tracks_by_category": _counts(first.values())}
     return {
         "name": log.name,
         "format": log.format,

@@ -171,12 +171,12 @@ def guard_log(log: Log, where: str, reopen: Callable[[], Log]) -> Log:
                 f"{MAX_POSITION_M:g} m; {len(wrong)} of {len(log.ego.t_ns)} poses are so"
             )
 
-    def guarded(read: Callable[[], Any], what: str, stream: str, name: str) -> Callable[[], Any]:
+    def guarded(of: Log | Stream, name: str, what: str) -> Callable[[], Any]:
         def reading() -> Any:
             with translate_parser_errors(f"{where}: {what}", LogError):
-                return read()
+                return getattr(of, name)
 
-        return OfLog(reading, reopen, (stream, name))
+        return OfLog(reading, reopen, (of.name if isinstance(of, Stream) else "", name))
 
     sweeps: OrderedDict[tuple[str, int], tuple[Sweep, int]] = OrderedDict()  # those read last, with their bytes
     lock = threading.Lock()
@@ -200,18 +200,15 @@ def guard_log(log: Log, where: str, reopen: Callable[[], Log]) -> Log:
                         sweeps.popitem(last=False)
             return found
 
-        name, stamps = stream.name, f"the stamps of '{stream.name}' cannot be read"
+        name, t_ns = stream.name, guarded(stream, "t_ns", f"the stamps of '{stream.name}' cannot be read")
         encoded = None if stream.encoded is None else OfLog(partial(record, stream.encoded), reopen, (name, "encoded"))
-        read = OfLog(read_or_keep, reopen, (name, "read"))
-        return Stream(name, guarded(lambda: stream.t_ns, stamps, name, "t_ns"), read, encoded)
+        return Stream(name, t_ns, OfLog(read_or_keep, reopen, (name, "read")), encoded)
 
     return log.changed(
         streams={name: guarded_stream(stream) for name, stream in log.streams.items()},
-        labels=guarded(lambda: log.labels, "the labels cannot be read", "", "labels"),
-        notes=guarded(lambda: log.notes, "cannot be read", "", "notes"),
-        ground_z_ego_m=guarded(
-            lambda: log.ground_z_ego_m, "the height of the road cannot be read", "", "ground_z_ego_m"
-        ),
+        labels=guarded(log, "labels", "the labels cannot be read"),
+        notes=guarded(log, "notes", "cannot be read"),
+        ground_z_ego_m=guarded(log, "ground_z_ego_m", "the height of the road cannot be read"),
     )
 
 
