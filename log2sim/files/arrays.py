@@ -147,16 +147,9 @@ Value = TypeVar("Value", bound=SupportsNbytes)
 class DiskBackedMap(MutableMapping[Key, Value], Generic[Key, Value]):
     """A mapping with values made of arrays: the most recently used ones are in memory, the others in a file.
 
-    Parameters
-    ----------
-    to_arrays, from_arrays : callable
-        Convert a value to arrays and back.
-    memory_bytes : int
-        Limit of the values in memory; the one used last always stays.
-    changing : bool
-        Whether values change while they are in memory; others are written once. A changed value is appended to the file.
-    rounds : int
-        Values that were used in so many rounds before stay in memory, whatever they take; `spill` ends a round.
+    `to_arrays`, `from_arrays`: convert a value to arrays and back. `memory_bytes`: limit of the values in memory; the one used last
+    always stays. `changing`: whether values change while they are in memory; others are written once. A changed value is appended
+    to the file. `rounds`: values that were used in so many rounds before stay in memory, whatever they take; `spill` ends a round.
     """
 
     def __init__(
