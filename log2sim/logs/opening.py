@@ -248,7 +248,6 @@ def is_log_file(path: Path) -> bool:
 
 
 def _may_read(reader: Reader, root: Path) -> bool:
-    """Return whether a path is a folder, or a file with a suffix of the format."""
     return root.is_dir() or root.suffix.lower() in reader.suffixes
 
 

@@ -287,7 +287,6 @@ class KittiObjectReader(FolderReader):
         labels = _labels(base, sweeps, first, ego, notes)
         ground_z_m, boxes = 0.0, labels.boxes_3d
         if not first.knows_ground and boxes is not None and len(boxes.t_ns):
-            # The median of the lower faces of labels.
             ground_z_m = float(np.median(boxes.center_m[:, 2] - boxes.size_m[:, 2] / 2))
         others = sum(not np.allclose(frame.P, first.P, rtol=1e-2, atol=1e-3) for frame in frames.values())
         if others:
