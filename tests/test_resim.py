@@ -21,7 +21,7 @@ from log2sim.resim.cameras import Pictures
 from log2sim.resim.rays import all_shots, find_pattern, poses_of, recorded_shots
 from log2sim.resim.simulate import MASKS, Simulation, resimulate, seeing, simulate, with_sensors
 from log2sim.resim.surfels import SurfelGrid, Tile, local_surface
-from log2sim.resim.world import Seen, World, _add_sweep, build_world
+from log2sim.resim.world import World, _add_sweep, build_world
 from log2sim.simulation.policy import Controls, Observation
 from log2sim.simulation.runner import open_world, replay
 from log2sim.synth import Scene, load_scene, synthesize
@@ -145,9 +145,9 @@ def test_wheels_that_reach_out_of_a_short_box_are_kept(recorded: tuple[Log, Scen
     for category in ("cyclist", "car"):
         short = replace(seen, category=category, size_m=(length - 0.6, width, height))
         grids: dict[Tile | str, SurfelGrid] = {}
-        own = {short.id: Seen(Alignment(short), [])}
+        alignments, sightings = {short.id: Alignment(short)}, {short.id: []}
         only = replace(truth, agents=(short,))
-        _add_sweep(log, log, only, name, shots, pattern, 1.0, world.shift_m, grids, own)
+        _add_sweep(log, log, only, name, shots, pattern, 1.0, world.shift_m, grids, alignments, sightings)
         reach[category] = np.abs(grids[short.id].surfels().center_m[:, 0]).max() - short.size_m[0] / 2
     assert reach["car"] < 0.15 < 0.25 < reach["cyclist"] < 0.35
 

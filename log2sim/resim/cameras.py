@@ -68,27 +68,14 @@ CAM_T_LEVEL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, y le
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What a picture shows at its nodes, h rows and w columns, `step` pixels apart from the first pixel on.
-
-    Attributes
-    ----------
-    owner : (h, w) int64
-        0 for the background, k + 1 for agent k of `ids`.
-    depth_m : (h, w) float64
-        Along the optical axis.
-    met : (h, w) bool
-        Whether a surface is there; elsewhere the depth is guessed.
-    point : (h, w, 3) float64, m
-        In the frame of the agent, or the map of the background.
-    beside : (h, w) int64
-        0, or k + 1 before the box of agent k or the ground around it, where its outline and shadow may be.
-    """
+    """What a picture shows at its nodes, h rows and w columns, `step` pixels apart from the first pixel on."""
 
     step: int
-    owner: NDArray[np.int64]
-    depth_m: Array
-    met: NDArray[np.bool_]
-    point: Array
+    owner: NDArray[np.int64]  # (h, w) 0 for the background, k + 1 for agent k of `ids`
+    depth_m: Array  # (h, w) along the optical axis
+    met: NDArray[np.bool_]  # (h, w) whether a surface is there; elsewhere the depth is guessed
+    point: Array  # (h, w, 3) m, in the frame of the agent, or the map of the background
+    # (h, w) 0, or k + 1 before the box of agent k or the ground around it, where its outline and shadow may be
     beside: NDArray[np.int64]
     ids: tuple[str, ...]
 
@@ -182,14 +169,8 @@ def pose_of(scenario: Scenario, id: str, t_ns: int) -> Array:
 def _without_gaps(depth: Array, owner: NDArray[np.int64], rise: Array, above_m: float) -> Array:
     """Guess the depth where nothing was met: the ground is level, and what stands goes on upward, as LiDARs see no higher.
 
-    Parameters
-    ----------
-    depth : (h, w) float64, m
-        NaN where nothing was met.
-    rise : (h, w) float64
-        Of the rays above the ground for each meter of depth.
-    above_m : float
-        Height of the camera above the ground.
+    `depth` (h, w), m: NaN where nothing was met. `rise` (h, w): of the rays above the ground for each meter of depth.
+    `above_m`: height of the camera above the ground.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         level = np.where(rise < 0, above_m / -rise, np.inf)
@@ -416,13 +397,8 @@ class Pictures:
             at = np.meshgrid(u[c] / seen.step, v[r] / seen.step)
             smooth = cv2.remap(flow, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             moved = np.where(even[cell[0][r]][:, cell[1][c], None], smooth, flow[near[0][r]][:, near[1][c]])
-            taken: NDArray[Any] = cv2.remap(
-                recorded,
-                moved[..., 0] + u[c],
-                moved[..., 1] + v[r, None],
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REPLICATE,
-            )
+            x, y = moved[..., 0] + u[c], moved[..., 1] + v[r, None]
+            taken: NDArray[Any] = cv2.remap(recorded, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             gain = self.gain(int(frame), reference) if reference >= 0 else np.ones(3)
             if (gain != 1).any():
                 taken = np.clip(np.rint(taken * gain), 0, 255)
@@ -433,9 +409,7 @@ class Pictures:
 
 def _filled(image: Image, unknown: NDArray[np.bool_], step: int) -> Image:
     """Fill in pixels from around them (Telea, 2004), at the resolution of the nodes."""
-    if not unknown.any():
-        return image
-    if unknown.all():
+    if not unknown.any() or unknown.all():
         return image
     size = (max(1, image.shape[1] // step), max(1, image.shape[0] // step))
     known = cv2.resize((~unknown).astype(np.float32), size, interpolation=cv2.INTER_AREA)

@@ -199,22 +199,12 @@ def _dot(a: Any, b: Any) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What each of N rays ends on.
+    """What each of N rays ends on."""
 
-    Attributes
-    ----------
-    range_m : (N,) float32
-        Infinite where it meets nothing.
-    surfel : (N,) int32
-        The first disc; -1 without.
-    intensity, returned : (N,) float32
-        Of the discs there: their mean intensity, and how many of their rays come back.
-    """
-
-    range_m: Floats
-    surfel: NDArray[np.int32]
-    intensity: Floats
-    returned: Floats
+    range_m: Floats  # infinite where it meets nothing
+    surfel: NDArray[np.int32]  # the first disc; -1 without
+    intensity: Floats  # mean of the discs there
+    returned: Floats  # how many of the rays that end on the discs there come back
 
 
 def first_hits(parts: Sequence[Meetings], material: Material, count: int, rng: np.random.Generator) -> Hits:
@@ -238,12 +228,7 @@ def first_hits(parts: Sequence[Meetings], material: Material, count: int, rng: n
     for met, stops in zip(parts, stopped):
         depth = (met.range_m - nearest.take(met.ray)) * met.facing
         some = np.flatnonzero(stops & (depth < THICKNESS_M))
-        ray, t, surfel, weight = (
-            met.ray.take(some),
-            met.range_m.take(some),
-            met.surfel.take(some),
-            met.weight.take(some),
-        )
+        ray, t, surfel, weight = (c.take(some) for c in (met.ray, met.range_m, met.surfel, met.weight))
         np.add.at(total, ray, weight.astype(np.float64))
         values = t, np.nan_to_num(material.intensity.take(surfel)), material.returned.take(surfel)
         for of, value in zip(sums, values):

@@ -33,48 +33,23 @@ MIN_DOWN_RAD = np.deg2rad(5.0)  # below the horizon: a street is not steeper
 
 @dataclass(frozen=True, eq=False)
 class Shots(Columns):
-    """Rays of one sweep in the frame of the sensor, each at its own time.
+    """Rays of one sweep in the frame of the sensor, each at its own time."""
 
-    Attributes
-    ----------
-    direction : (N, 3) float32
-        Unit vectors.
-    t_ns : (N,) int64
-        Absolute stamps.
-    range_m : (N,) float32
-        As recorded; NaN where nothing came back.
-    intensity : (N,) float32
-        NaN where unknown.
-    """
-
-    direction: Floats
-    t_ns: NDArray[np.int64]
-    range_m: Floats
-    intensity: Floats
+    direction: Floats  # (N, 3) unit vectors
+    t_ns: NDArray[np.int64]  # (N,) absolute stamps
+    range_m: Floats  # (N,) as recorded; NaN where nothing came back
+    intensity: Floats  # (N,) NaN where unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """How a LiDAR scans, as far as sweeps show it.
+    """How a LiDAR scans, as far as sweeps show it."""
 
-    Attributes
-    ----------
-    level_R_sensor : (3, 3) float64
-        Rotation in which lines have one elevation each: mounts of logs are not exact.
-    elevation_rad : (L,) float64
-        Of the lines, increasing; empty where the sensor has none.
-    step_rad : float
-        Between firings of a line.
-    gap_rad : float
-        Usual angle between lines; `step_rad` without lines.
-    covered : (L + 1, 120) bool
-        Lines by 3 degrees of azimuth from -180 on in which rays may come back; the last row is of any line.
-    """
-
-    level_R_sensor: Array
-    elevation_rad: Array
-    step_rad: float
-    gap_rad: float
+    level_R_sensor: Array  # (3, 3) rotation in which lines have one elevation each: mounts of logs are not exact
+    elevation_rad: Array  # (L,) of the lines, increasing; empty where the sensor has none
+    step_rad: float  # between firings of a line
+    gap_rad: float  # usual angle between lines; `step_rad` without lines
+    # (L + 1, 120) lines by 3 degrees of azimuth from -180 on in which rays may come back; the last row is of any line
     covered: NDArray[np.bool_]
 
 
@@ -211,8 +186,8 @@ def all_shots(shots: Shots, pattern: Pattern) -> Shots:
     # Every line begins and ends at the seam at -180 degrees.
     first, last = np.searchsorted(k, np.arange(len(lines))), np.searchsorted(k, np.arange(len(lines)), side="right")
     empty = first == last
-    begin = np.insert(a, np.append(first, last), np.append(np.full(len(lines), -np.pi), np.full(len(lines), np.pi)))
-    own = np.insert(k, np.append(first, last), np.append(np.arange(len(lines)), np.arange(len(lines))))
+    begin = np.insert(a, np.append(first, last), np.repeat([-np.pi, np.pi], len(lines)))
+    own = np.insert(k, np.append(first, last), np.tile(np.arange(len(lines)), 2))
     width = np.where(own[1:] == own[:-1], np.diff(begin), 0.0)
     missing = np.maximum(np.rint(width / pattern.step_rad).astype(np.int64) - 1, 0)
     missing[width < 1.6 * pattern.step_rad] = 0
@@ -246,34 +221,17 @@ def all_shots(shots: Shots, pattern: Pattern) -> Shots:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of one sweep in the map.
+    """Rays of one sweep in the map."""
 
-    Attributes
-    ----------
-    azimuth, elevation : (N,) float32, rad
-        In the sensor's frame.
-    origin, direction : (N, 3) float32
-        In the map less `shift_m`, and in the axes of the map.
-    t_ns : (N,) int64
-    shift_m : (3,) float64, m
-        Place near the sensor that keeps the numbers small.
-    bin_T_map : (B, 4, 4) float64
-        For each bin of azimuth, from the shifted map to the sensor when its rays go out.
-    bin_ns : (B,) int64
-        Mean time of the bins' rays.
-    spread_m : float
-        How far rays of one bin start from each other.
-    """
-
-    azimuth: Floats
+    azimuth: Floats  # (N,) rad, in the sensor's frame; likewise `elevation`
     elevation: Floats
-    origin: Floats
-    direction: Floats
-    t_ns: NDArray[np.int64]
-    shift_m: Array
-    bin_T_map: Array
-    bin_ns: NDArray[np.int64]
-    spread_m: float
+    origin: Floats  # (N, 3) m, in the map less `shift_m`
+    direction: Floats  # (N, 3) in the axes of the map
+    t_ns: NDArray[np.int64]  # (N,)
+    shift_m: Array  # (3,) place near the sensor that keeps the numbers small
+    bin_T_map: Array  # (B, 4, 4) for each bin of azimuth, from the shifted map to the sensor when its rays go out
+    bin_ns: NDArray[np.int64]  # (B,) mean time of the bins' rays
+    spread_m: float  # how far rays of one bin start from each other
 
     def bins_toward(self, count: int, points: Callable[[NDArray[np.int64]], Any]) -> NDArray[np.int64]:
         """Return the bins (N,) in which rays go toward `count` points.

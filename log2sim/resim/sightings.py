@@ -29,32 +29,17 @@ PASSED, ENDED, HIDDEN, LOST = range(4)
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """What rays around an agent met in one sweep.
+    """What rays around an agent met in one sweep."""
 
-    Attributes
-    ----------
-    t_s : float
-        Time of the scenario.
-    view_m : (3,) float64, m
-        The sensor in the frame of the agent.
-    point_m : (N, 3) float32, m
-        In the frame of the agent: where rays ended on it; of others a point as far away as its middle.
-    state : (N,) int8
-        Whether the ray passed the agent, ended on it, was stopped before, or was lost where its neighbors ended on it.
-    intensity : (N,) float32
-        Relative; NaN where unknown.
-    step_rad : float
-        Of azimuth, between rays.
-    line_rad : (L,) float64
-        Elevations of the lines of the LiDAR, increasing, which may be closer to each other where it looks far.
-    """
-
-    t_s: float
-    view_m: Array
+    t_s: float  # time of the scenario
+    view_m: Array  # (3,) the sensor in the frame of the agent
+    # (N, 3) in the frame of the agent: where rays ended on it; of others a point as far away as its middle
     point_m: Floats
+    # (N,) whether the ray passed the agent, ended on it, was stopped before, or was lost where its neighbors ended on it
     state: NDArray[np.int8]
-    intensity: Floats
-    step_rad: float
+    intensity: Floats  # (N,) relative; NaN where unknown
+    step_rad: float  # of azimuth, between rays
+    # (L,) elevations of the lines of the LiDAR, increasing, which may be closer to each other where it looks far
     line_rad: Array
 
     @property

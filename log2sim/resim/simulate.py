@@ -35,46 +35,27 @@ MAX_OFF_PATH_M = 6.0
 MAX_PICTURES_OFF_M = 3.0
 # What no recorded picture shows is then as much as at 3 m beside the path.
 TOLD_SHARE = 0.13
-MASKS = (
-    "masks"  # folder of a log: by camera a mask for each picture, white where no recorded picture shows what is there
-)
+# Folder of a log: by camera a mask for each picture, white where no recorded picture shows what is there.
+MASKS = "masks"
+Masks = dict[str, tuple[bytes, float]]  # by name of its file, such a mask as PNG, and the share of it that is white
 
 
 @dataclass(eq=False)
 class Simulation:
-    """The sensors of a log in a scenario.
+    """The sensors of a log in a scenario."""
 
-    Attributes
-    ----------
-    log : Log
-        Recorded, with the poses of the scenario.
-    world : World
-    scenario : Scenario
-        What happens now.
-    seed : int
-    pictures : Pictures or None
-        What pictures are made of; None where no camera is simulated.
-    sensors : tuple of str
-        Those that are simulated.
-    driven : Log
-        The same log with the ego's poses in the scenario.
-    agents : mapping of str to Surfels
-        Bodies of agents that were not recorded, and those of the world.
-    """
-
-    log: Log
+    log: Log  # recorded, with the poses of the scenario
     world: World
-    scenario: Scenario
+    scenario: Scenario  # what happens now
     seed: int = 0
-    pictures: Pictures | None = None
-    sensors: tuple[str, ...] = ()
-    driven: Log = field(init=False)
-    agents: dict[str, Surfels] = field(init=False)
+    pictures: Pictures | None = None  # what pictures are made of; None where no camera is simulated
+    sensors: tuple[str, ...] = ()  # those that are simulated; all where it is empty
+    driven: Log = field(init=False)  # the same log with the ego's poses in the scenario
+    agents: dict[str, Surfels] = field(init=False)  # by id: those of the world, bodies for those that were not recorded
 
     def __post_init__(self) -> None:
         """Make bodies, and find the path of the ego."""
-        ids = {agent.id: agent for agent in self.scenario.others}
-        self.agents = {id: self.world.agents.get(id) or body_of(agent) for id, agent in ids.items()}
+        self.agents = {a.id: self.world.agents.get(a.id) or body_of(a) for a in self.scenario.others}
         self.driven = self.log.changed(ego=ego_poses(self.log, self.scenario))
         self.sensors = self.sensors or (*self.world.models, *(self.log.cameras if self.pictures else ()))
 
@@ -240,10 +221,10 @@ def refuse_far(off_m: tuple[float, float]) -> None:
         )
 
 
-def simulated_log(simulation: Simulation, *, notes: Collection[str] = (), masks: dict[str, bytes] | None = None) -> Log:
+def simulated_log(simulation: Simulation, *, notes: Collection[str] = (), masks: Masks | None = None) -> Log:
     """Return the log that the sensors would have recorded; its records are made when they are read.
 
-    `masks` takes PNG files, by name, of where no recorded picture shows what is in the pictures that are read.
+    `masks` takes those of the pictures that are read.
     """
     log, driven = simulation.log, simulation.driven
     streams = {}
@@ -262,14 +243,13 @@ def simulated_log(simulation: Simulation, *, notes: Collection[str] = (), masks:
     )  # fmt: skip
 
 
-def _read(
-    simulation: Simulation, name: str, known: NDArray[np.intp], masks: dict[str, bytes] | None, i: int
-) -> Sweep | Image:
+def _read(simulation: Simulation, name: str, known: NDArray[np.intp], masks: Masks | None, i: int) -> Sweep | Image:
     if name in simulation.log.lidars:
         return simulation.sweep(name, int(known[i]))
     image, unknown = simulation.picture(name, int(simulation.log.streams[name].t_ns[known[i]]))
     if masks is not None:
-        masks[f"{name}/{i:06d}.png"] = cv2.imencode(".png", unknown.astype(np.uint8) * 255)[1].tobytes()
+        png = cv2.imencode(".png", unknown.astype(np.uint8) * 255)[1].tobytes()
+        masks[f"{name}/{i:06d}.png"] = png, float(unknown.mean())
     return image
 
 
@@ -358,18 +338,16 @@ def resimulate(
         notes.append(
             f"at {when_s:.1f} s the ego is {off_m:.1f} m from where anything was recorded; sweeps lack what was hidden"
         )
-    masks: dict[str, bytes] = {}
+    masks: Masks = {}
+    shares: dict[str, list[float]] = {}
     result = simulated_log(simulation, notes=notes[len(simulation.world.notes) :], masks=masks)
     with replaced_folder(Path(out), overwrite=overwrite) as folder:
         write_log(result, folder, progress=partial(progress, "simulate"))
         scenario.save(folder / TRUTH_FILE)
-        for file, data in masks.items():
+        for file, (data, share) in masks.items():
             (folder / MASKS / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / MASKS / file).write_bytes(data)
-    shares: dict[str, list[float]] = {}
-    for file, data in masks.items():
-        unknown = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE))
-        shares.setdefault(file.rsplit("/", 1)[0], []).append(float(np.mean(unknown > 0)))
+            shares.setdefault(file.rsplit("/", 1)[0], []).append(share)
     for name, made_up in shares.items():
         if max(made_up) > TOLD_SHARE:
             notes.append(

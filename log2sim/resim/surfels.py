@@ -45,29 +45,16 @@ class Material(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Surfels(Columns):
-    """Discs, S of them.
+    """Discs, S of them."""
 
-    Attributes
-    ----------
-    center_m : (S, 3) float32, m
-        In the frame of what they belong to; of the map less its shift.
-    normal : (S, 3) float32
-        Toward where they were seen from; 0 for what has no plane, such as leaves, which faces every ray.
-    radius_m : (S,) float32
-    intensity : (S,) float32
-        Mean; NaN where unknown.
-    share : (S,) float32
-        Of the rays that meet the disc, how many end there: less than 1 for leaves, fences and edges.
-    returned : (S,) float32
-        Of the rays that end there, how many come back.
-    """
-
-    center_m: Floats
-    normal: Floats
-    radius_m: Floats
-    intensity: Floats
-    share: Floats
-    returned: Floats
+    center_m: Floats  # (S, 3) in the frame of what they belong to; of the map less its shift
+    normal: (
+        Floats  # (S, 3) toward where they were seen from; 0 for what faces every ray as it has no plane, such as leaves
+    )
+    radius_m: Floats  # (S,)
+    intensity: Floats  # (S,) mean; NaN where unknown
+    share: Floats  # (S,) of the rays that meet the disc, how many end there: less than 1 for leaves, fences and edges
+    returned: Floats  # (S,) of the rays that end there, how many come back
 
     @property
     def material(self) -> Material:
@@ -78,11 +65,6 @@ class Surfels(Columns):
 def joined(parts: Iterable[Surfels]) -> Surfels:
     """Concatenate surfels of one frame."""
     return Surfels.join(list(parts) or [no_surfels()])
-
-
-def columns_of(surfels: Surfels) -> list[Floats]:
-    """Return the columns of surfels."""
-    return list(vars(surfels).values())
 
 
 def no_surfels() -> Surfels:
@@ -214,7 +196,7 @@ class Tiles(DiskBackedMap[Tile, Surfels]):
     """Surfels of what stands, by tile; of a large world those near the sensor are in memory, and the others in a file."""
 
     def __init__(self, surfels: Surfels | None = None) -> None:
-        super().__init__(columns_of, Surfels, TILES_BYTES)
+        super().__init__(lambda surfels: list(vars(surfels).values()), Surfels, TILES_BYTES)
         self.add(surfels or no_surfels())
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -85,45 +85,19 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What a log shows of its surroundings.
+    """What a log shows of its surroundings."""
 
-    Attributes
-    ----------
-    shift_m : (3,) float64, m
-        The background is in its own map less this.
-    given, refined : PoseTrack or None
-        Poses of the ego by which agents are placed, and at the same stamps those by which surfaces lie on each other: its
-        background is in the map of the latter.
-    background : Tiles
-    agents : mapping of str to Surfels
-        By id, in the frame of the agent.
-    sightings : mapping of str to list of Sighting
-        Of people and riders, by id.
-    alignments : mapping of str to Alignment
-        Of the others, by id.
-    models : mapping of str to Model
-        By LiDAR.
-    notes : tuple of str
-        What could not be seen.
-    """
-
-    shift_m: Array
+    shift_m: Array  # (3,): the background is in its own map less this
+    # Poses of the ego by which agents are placed, and at the same stamps those by which surfaces lie on each other: the
+    # background is in the map of the latter.
     given: PoseTrack | None
     refined: PoseTrack | None
     background: Tiles
-    agents: Mapping[str, Surfels]
-    sightings: Mapping[str, list[Sighting]]
-    alignments: Mapping[str, Alignment]
-    models: Mapping[str, Model]
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What sweeps have shown of an agent beside its surfaces; sightings are of people and riders alone, alignments of the others."""
-
-    alignment: Alignment
-    sightings: list[Sighting]
+    agents: Mapping[str, Surfels]  # by id, in the frame of the agent
+    sightings: Mapping[str, list[Sighting]]  # of people and riders, by id
+    alignments: Mapping[str, Alignment]  # of the others, by id
+    models: Mapping[str, Model]  # by LiDAR
+    notes: tuple[str, ...]  # what could not be seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +130,10 @@ def _is_near(agent: Agent, t_s: Array, here: Array, reach_m: float) -> bool:
 
 def place(world: World, scenario: Scenario, rays: Rays, agents: Mapping[str, Surfels], reach_m: float) -> Placed:
     """Put the agents of a scenario within reach into the background, each disc where it is when the sensor looks there."""
-    move = given_T_refined(world, rays.origin[len(rays.origin) // 2] + rays.shift_m, int(rays.t_ns[0]))
+    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
+    move = given_T_refined(world, here, int(rays.t_ns[0]))
     rotation = move[:3, :3].astype(np.float32)
     offset = (move[:3, :3] @ world.shift_m + move[:3, 3] - rays.shift_m).astype(np.float32)
-    here = rays.origin[len(rays.origin) // 2] + rays.shift_m
     x_m, y_m, _ = np.linalg.inv(move[:3, :3]) @ (here - move[:3, 3]) - world.shift_m
     tiles, ids = world.background.near(float(x_m), float(y_m), reach_m), []
     parts = [no_surfels(), *(world.background[tile] for tile in tiles)]
@@ -240,8 +214,8 @@ def build_world(
     grids: DiskBackedMap[Tile | str, SurfelGrid] = DiskBackedMap(
         SurfelGrid.arrays, SurfelGrid, GRIDS_BYTES, changing=True, rounds=AROUND_SWEEPS
     )
-    seen = {agent.id: Seen(Alignment(agent), []) for agent in scenario.others}
-    sightings = {id: s.sightings for id, s in seen.items()}
+    alignments = {agent.id: Alignment(agent) for agent in scenario.others}
+    sightings: dict[str, list[Sighting]] = {id: [] for id in alignments}
     refined = refine_poses(log, every_sweep=True)
     surveyed = log if refined is None else log.changed(ego=refined)
     shift: Array | None = None
@@ -261,7 +235,9 @@ def build_world(
                 scale = float(known.mean()) if len(known) and known.mean() > 0 else np.nan
                 top, whole = float(known.max(initial=0)), bool((known == np.rint(known)).all())
             far = max(far, float(shots.range_m.max()))
-            noise.append(_add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, grids, seen))
+            noise.append(
+                _add_sweep(log, surveyed, scenario, name, shots, pattern, scale, shift, grids, alignments, sightings)
+            )
             grids.spill()
             models[name] = Model(pattern, 0.0, scale, top, whole, far)
             if done % SIGHTINGS_EVERY == 0:
@@ -273,9 +249,7 @@ def build_world(
         raise LogError(
             f"log '{log.name}': no sweep of {', '.join(lidars)} can be used; there is nothing to simulate from"
         )
-    surfaces = {
-        id: s.alignment.centered(grids[id].surfels() if id in grids else no_surfels()) for id, s in seen.items()
-    }
+    surfaces = {id: a.centered(grids[id].surfels() if id in grids else no_surfels()) for id, a in alignments.items()}
     agents = {agent.id: completed(agent, surfaces[agent.id]) for agent in scenario.others}
     unseen = [id for id, surfels in surfaces.items() if not len(surfels)]
     notes = [f"no point of {', '.join(unseen)} was recorded: each is a body of its category"] if unseen else []
@@ -290,7 +264,6 @@ def build_world(
         if agent.static:
             standing.add(ground_below(agent, standing, shift))
     given = log.ego if refined is not None else None
-    alignments = {id: s.alignment for id, s in seen.items()}
     world = World(shift, given, refined, standing, agents, sightings, alignments, models, tuple(notes))
     # Discs reach beyond edges as far as they are wide; what is left of them then has its share.
     world = _weighed(log, scenario, world, leave_out, progress)
@@ -360,7 +333,8 @@ def _add_sweep(
     scale: float,
     shift: Array,
     grids: MutableMapping[Tile | str, SurfelGrid],
-    seen: Mapping[str, Seen],
+    alignments: Mapping[str, Alignment],
+    sightings: Mapping[str, list[Sighting]],
 ) -> float:
     """Share out the points of a sweep to the background and the agents; return the noise of its ranges, m."""
     surface = local_surface(shots, pattern)
@@ -395,7 +369,7 @@ def _add_sweep(
         on_agent = free[rows]
         free[rows] = False
         if on_agent.any() and not is_non_rigid(agent):
-            inside, axes = seen[agent.id].alignment.fit(float(t_s[rows].mean()), inside, axes, on_agent)
+            inside, axes = alignments[agent.id].fit(float(t_s[rows].mean()), inside, axes, on_agent)
         own_half = half + TAKEN_M
         if GROUP_OF[agent.category] == "two_wheeler":
             own_half[0] = half[0] + LEFT_OUT_M  # wheels have few points, so that boxes end before them
@@ -403,11 +377,11 @@ def _add_sweep(
         rows = rows[taken]
         if len(rows):
             axes = axes[taken].astype(np.float32)
-            _grid(grids, agent.id).add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
+            grids.setdefault(agent.id, SurfelGrid()).add(inside[taken], axes, surface.radius_m[rows], intensity[rows])
             if is_non_rigid(agent):
                 people.append((agent, rows))
     if people:
-        _add_sightings(log, scenario, name, all_shots(shots, pattern), pattern, scale, people, seen)
+        _add_sightings(log, scenario, name, all_shots(shots, pattern), pattern, scale, people, sightings)
     poses, moment, _ = poses_of(surveyed, name, shots.t_ns[free])
     rotation = poses[moment, :3, :3]
     points = np.einsum("nij,nj->ni", rotation, shots.direction[free] * shots.range_m[free, None])
@@ -415,14 +389,8 @@ def _add_sweep(
     normal = np.einsum("nij,nj->ni", rotation, surface.normal[free])
     normal, radius, intensity = normal.astype(np.float32), surface.radius_m[free], intensity[free]
     for tile, rows in by_tile(points, GRID_TILE_M):
-        _grid(grids, tile).add(points[rows], normal[rows], radius[rows], intensity[rows])
+        grids.setdefault(tile, SurfelGrid()).add(points[rows], normal[rows], radius[rows], intensity[rows])
     return surface.noise_m
-
-
-def _grid(grids: MutableMapping[Tile | str, SurfelGrid], key: Tile | str) -> SurfelGrid:
-    if key not in grids:
-        grids[key] = SurfelGrid()
-    return grids[key]
 
 
 def _add_sightings(
@@ -433,7 +401,7 @@ def _add_sightings(
     pattern: Pattern,
     scale: float,
     people: list[tuple[Agent, NDArray[np.intp]]],
-    of: Mapping[str, Seen],
+    sightings: Mapping[str, list[Sighting]],
 ) -> None:
     """Add what the rays of a sweep, those that did not come back included, met around agents, of which rows of `shots` are."""
     poses, moment, _ = poses_of(log, name, shots.t_ns)
@@ -456,7 +424,7 @@ def _add_sightings(
             step_rad=pattern.step_rad, line_rad=lines + np.median(raised[rows]),
         )  # fmt: skip
         if seen is not None:
-            of[agent.id].sightings.append(seen)
+            sightings[agent.id].append(seen)
 
 
 def _on_ego(log: Log, name: str, shots: Shots, points: Array) -> NDArray[np.bool_]:
