@@ -272,11 +272,7 @@ class Pictures:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Find points (N, 3) of the background ("") or an agent in a recorded picture; `beside` (N,): of which agents they are.
 
-        Returns
-        -------
-        uv_px : (N, 2) float64
-        shown : (N,) bool
-            Whether the picture shows them and nothing before them.
+        Returns their pixels (N, 2), and whether the picture shows them and nothing before them (N,).
         """
         name, _, t_ns = self.frames[frame]
         seen, camera, map_T_cam = self.seen(frame), self.log.cameras[name], self.map_T_cam[frame]
@@ -330,11 +326,7 @@ class Pictures:
     ) -> tuple[Image, NDArray[np.bool_]]:
         """Make the picture of a camera, where it is in a log at a stamp, among the agents of a scenario.
 
-        Returns
-        -------
-        image : (H, W, 3) uint8, BGR
-        unknown : (H, W) bool
-            Pixels that no recorded picture shows: they are drawn or filled in.
+        Returns the picture (H, W, 3), BGR, and the pixels (H, W) that no recorded one shows: they are drawn or filled in.
         """
         camera, map_T_cam = log.cameras[name], log.map_T_sensor(name, t_ns)[0][0]
         there = {id: surfels for id, surfels in agents.items() if id not in drawn}

@@ -151,14 +151,7 @@ def _met(rays: Rays, grid: RayGrid, to_sensor: Floats, start: Floats, discs: Sur
 def _runs(begin: NDArray[np.int32], count: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.int64], list[int]]:
     """Cut `count` entries from `begin` on to runs of at most `RUN`, the longest first.
 
-    Returns
-    -------
-    which : (R,) int
-        Whose run it is.
-    entry : (R,) int64
-        Its first one.
-    longer : list of int
-        How many runs have more than 0, 1, 2 ... entries.
+    Returns whose each run is (R,), its first entry (R,), and how many runs have more than 0, 1, 2 ... entries.
     """
     which = np.flatnonzero(count)
     entry, left = begin.take(which).astype(np.int64), count.take(which)

@@ -56,13 +56,7 @@ class Pattern:
 def poses_of(log: Log, name: str, t_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.intp], NDArray[np.bool_]]:
     """Interpolate the pose of a sensor where its rays start.
 
-    Returns
-    -------
-    map_T_sensor : (K, 4, 4) float64
-        Of some moments.
-    moment : (N,) int
-        Of each stamp.
-    valid : (K,) bool
+    Returns map_T_sensor (K, 4, 4) of some moments, the moment (N,) of each stamp, and which poses are valid (K,).
     """
     step = t_ns // POSE_STEP_NS
     first = int(step.min(initial=np.iinfo(np.int64).max))

@@ -68,20 +68,9 @@ def sighting(
 ) -> Sighting | None:  # fmt: skip
     """Take what rays around an agent met; None where none ended on it.
 
-    Parameters
-    ----------
-    view_m : (3,) float64, m
-        The sensor in the frame of the agent.
-    offset : (N, 3) float64
-        Unit vectors of rays from there.
-    range_m : (N,) float32
-        NaN where nothing came back.
-    on : (N,) bool
-        Whether the ray ended on the agent.
-    half_m : (3,) float64, m
-        Of its size.
-    step_rad, line_rad
-        Between rays, of azimuth, and elevations of lines, with one beyond each end.
+    `view_m` (3,): the sensor in the frame of the agent. `offset` (N, 3): unit vectors of rays from there. `range_m` (N,): NaN
+    where nothing came back. `on` (N,): whether the ray ended on the agent. `half_m` (3,): of its size. `step_rad`,
+    `line_rad`: as of `Sighting`, with a line beyond each end.
     """
     away = float(np.linalg.norm(view_m))
     near = np.flatnonzero(on | (np.abs(view_m + away * offset) < half_m + AROUND_M).all(axis=1))

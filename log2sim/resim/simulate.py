@@ -72,10 +72,7 @@ class Simulation:
     def picture(self, name: str, t_ns: int) -> tuple[Image, NDArray[np.bool_]]:
         """Make the picture of a camera at a stamp, (H, W, 3) BGR, and the mask (H, W) of pixels that no recorded picture shows.
 
-        Raises
-        ------
-        ConfigError
-            Where no camera is simulated, and where the ego is too far off the path that it recorded.
+        Raises `ConfigError` where no camera is simulated, and where the ego is too far off the path that it recorded.
         """
         if self.pictures is None:
             raise ConfigError(f"image '{name}': no camera is simulated; simulate with its name in `sensors`")

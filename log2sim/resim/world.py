@@ -192,22 +192,9 @@ def build_world(
     leave_out: Callable[[str, int], bool] = lambda *_: False,
     progress: Progress = lambda *_: None,
 ) -> World:
-    """Build the world from the sweeps of a log.
+    """Build the world from the sweeps of a log, which has the poses of the scenario that was reconstructed from it.
 
-    Parameters
-    ----------
-    log : Log
-        With the poses of the scenario.
-    scenario : Scenario
-        What was reconstructed from the log, in its map.
-    lidars : collection of str
-    leave_out : callable
-        Whether sweep `i` of a LiDAR is left out, to be compared with.
-
-    Raises
-    ------
-    LogError
-        Where no sweep of the log can be used.
+    `leave_out`: whether sweep `i` of a LiDAR is left out, to be compared with. Raises `LogError` where no sweep can be used.
     """
     models: dict[str, Model] = {}
     scale, top, whole = np.nan, 0.0, False
