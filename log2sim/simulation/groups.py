@@ -168,9 +168,6 @@ class AgentGroup:
     def _exact(self, index: NDArray[np.intp], t_s: float) -> Array:
         return np.stack([self.references[i].exact(np.array([t_s]))[0] for i in index], axis=1)
 
-    def _slots(self, index: NDArray[np.intp]) -> NDArray[np.intp]:
-        return np.searchsorted(self.live, index)
-
 
 class VehicleGroup(AgentGroup):
     """Vehicles that follow their trajectories through a vehicle model."""
@@ -198,7 +195,7 @@ class VehicleGroup(AgentGroup):
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put vehicles on their references, with the slip that the reference has there."""
-        slots = self._slots(index)
+        slots = np.searchsorted(self.live, index)
         state = start_vehicles(self._exact(index, t_s), self.living.take(slots))
         if self.references[index[0]].slips:  # all of a fleet have the same model
             state = set_slip_states(state, lambda at_s: self._exact(index, at_s), t_s)
@@ -253,7 +250,7 @@ class PedestrianGroup(AgentGroup):
 
     def place(self, index: NDArray[np.intp], t_s: float) -> None:
         """Put points on their references."""
-        slots = self._slots(index)
+        slots = np.searchsorted(self.live, index)
         x, y, _, yaw, speed, *_ = self._exact(index, t_s)
         self.state.put(slots, vehicle.PointState(x.copy(), y.copy(), yaw.copy(), speed.copy()))
 

@@ -58,7 +58,7 @@ MAX_CONTROL_STEP_S = 0.1
 
 def control_step(dt_s: float) -> float:
     """Return the part of a simulation step for which controls are held."""
-    return dt_s / max(1, math.ceil(dt_s / MAX_CONTROL_STEP_S - 1e-9))
+    return vehicle.equal_steps(dt_s, MAX_CONTROL_STEP_S)[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +97,7 @@ def follow_vehicles(
     x, y, yaw, speed, _, curvature, _, _ = row
     cos, sin = cos_sin(yaw)
     dx, dy = x - state.x_m, y - state.y_m
-    along = cos * dx + sin * dy
-    along = np.minimum(np.maximum(along, -gains.max_along_m), gains.max_along_m)
+    along = vehicle.clamp(cos * dx + sin * dy, -gains.max_along_m, gains.max_along_m)
     turn = curvature * along
     across = cos * dy - sin * dx + turn * along / 2
     _, slope = cos_sin(yaw - turn - state.yaw_rad)
@@ -113,9 +112,7 @@ def follow_vehicles(
     # The smallest radius with grip grows with the square of the speed; at standstill only the lock limits.
     grip = np.minimum(gains.max_lateral_accel_mps2 / np.maximum(square, 1.0), p.max_curvature_1pm)
     asked = vehicle.rows(wanted[0] * gear, wanted[1])
-    given = np.minimum(
-        np.maximum(asked, vehicle.rows(-p.max_brake_mps2, -grip)), vehicle.rows(p.max_throttle_mps2, grip)
-    )
+    given = vehicle.clamp(asked, vehicle.rows(-p.max_brake_mps2, -grip), vehicle.rows(p.max_throttle_mps2, grip))
 
     # Anti-windup: the integral does not grow while an actuator is at its limit, while a vehicle far behind catches up, or
     # at standstill.
@@ -123,8 +120,7 @@ def follow_vehicles(
     integrates[0] &= np.abs(error[0]) < gains.max_along_m
     integrates[1] &= moves
     bound = vehicle.rows(gains.integral_limit_mps2, gains.integral_share * grip)
-    integral = memory.integral + (dt_s / gains.integral_s) * pull * integrates
-    integral = np.minimum(np.maximum(integral, -bound), bound)
+    integral = vehicle.clamp(memory.integral + (dt_s / gains.integral_s) * pull * integrates, -bound, bound)
 
     held = (stands > 0.5) & (pace < gains.hold_below_mps) & (error[0] * reference_gear < gains.hold_within_m)
     np.copyto(given[0], -gains.hold_brake_mps2, where=held)
@@ -134,10 +130,10 @@ def follow_vehicles(
     return controls, ControllerMemory(integral, rate)
 
 
-def follow_points(row: Array, state: vehicle.PointState, gains: ControllerGains = GAINS) -> vehicle.PointControls:
+def follow_points(row: Array, state: vehicle.PointState) -> vehicle.PointControls:
     """Compute the controls of points that follow their references `row` (C, A), as `POINT_COLUMNS`, in any direction."""
     x, y, _, vx, vy, ax, ay, _ = row
-    p, d = 1 / gains.point_s**2, 2 * gains.damping / gains.point_s
+    p, d = 1 / GAINS.point_s**2, 2 * GAINS.damping / GAINS.point_s
     return vehicle.PointControls(
         ax + p * (x - state.x_m) + d * (vx - state.velocity_x_mps),
         ay + p * (y - state.y_m) + d * (vy - state.velocity_y_mps),
@@ -148,8 +144,8 @@ def start_vehicles(row: Array, parameters: vehicle.VehicleParameters) -> vehicle
     """Return states of vehicles on their references `row` (C, A)."""
     x, y, yaw, speed, accel, curvature, gear, stands = row
     angle = np.arctan(parameters.wheelbase_m * curvature * (1 + parameters.understeer_s2pm2 * speed**2))
-    steer = np.minimum(np.maximum(angle, -parameters.max_steer_rad), parameters.max_steer_rad)
-    pedal = np.minimum(np.maximum(accel * gear, -parameters.max_brake_mps2), parameters.max_throttle_mps2)
+    steer = vehicle.clamp(angle, -parameters.max_steer_rad, parameters.max_steer_rad)
+    pedal = vehicle.clamp(accel * gear, -parameters.max_brake_mps2, parameters.max_throttle_mps2)
     speed, pedal = np.where(stands > 0.5, 0.0, [speed, pedal])
     still = np.zeros(len(x))
     return vehicle.VehicleState(x.copy(), y.copy(), yaw.copy(), speed, steer, pedal, still, still)
@@ -193,9 +189,8 @@ def vehicle_reference(
     """Build the table of a vehicle. Columns "..._ahead" are of a later time, to compensate for the lag of the actuators."""
     course, departure_m = feasible_trajectory_of(trajectory, limits)
     first, t = _grid_times(trajectory)
-    motion = _interpolated(course, t)
     # For every row the gear, +1 or -1, of the present or next movement, and whether the agent stands.
-    speed = motion[3]
+    speed = _interpolated(course, t)[3]
     direction = np.where(np.abs(speed) < REFERENCE_HOLD_MPS, 0, np.sign(speed)).astype(int)
     runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
     gear, stands, begin = np.ones(len(speed)), np.ones(len(speed)), 0
@@ -206,17 +201,14 @@ def vehicle_reference(
             stands[run] = 0.0
             begin = run[-1] + 1
 
-    def rows_at(at_s: Array, motion: Array) -> Array:
+    def exact(at_s: Array) -> Array:
         rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
-        rows[:4] = motion
+        rows[:4] = _interpolated(course, at_s)
         rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
         rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
         k = np.minimum(np.searchsorted(t, at_s + accel_ahead_s), len(t) - 1)
         rows[6], rows[7] = gear[k], stands[k]
         return rows.T
-
-    def exact(at_s: Array) -> Array:
-        return rows_at(at_s, _interpolated(course, at_s))
 
     flags = _discontinuity_flags(trajectory)
     for name, values, limit, unit in (
@@ -227,7 +219,7 @@ def vehicle_reference(
         worst = int(np.argmax(np.abs(values)))
         if abs(values[worst]) > limit:
             flags += (f"{name} of {values[worst]:.2f} {unit} at {course.t_s[worst]:.2f} s, limit {limit:g}",)
-    return Reference(trajectory, first, rows_at(t, motion), exact, limits.offset_m, flags)
+    return Reference(trajectory, first, exact(t), exact, limits.offset_m, flags)
 
 
 def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:

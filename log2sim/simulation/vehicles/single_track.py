@@ -28,6 +28,7 @@ from log2sim.simulation.vehicles.vehicle import (
     advance_speed,
     clamp,
     engaged_gear,
+    equal_steps,
     sinc,
 )
 
@@ -50,7 +51,7 @@ def step_single_track(
     for forward motion; backward, each tire's force opposes its slip as well. Actuators as in `step_bicycle`.
     """
     p, chassis = parameters, Chassis.of(parameters)
-    count, h = inner_steps(dt_s)
+    count, h = equal_steps(dt_s, MAX_INNER_STEP_S)
     actuators, target, lag_s, max_rate = actuation(state, controls, p)
     yaw, speed, steer = state.yaw_rad, state.speed_mps, state.steer_rad
     cos, sin = cos_sin(yaw)
@@ -173,12 +174,6 @@ def axle_grips(accel: Array, p: VehicleParameters, c: Chassis) -> tuple[NDArray[
     return whole * (c.cg_to_front_m + shift), whole * (p.cg_to_rear_m - shift)
 
 
-def inner_steps(dt_s: float) -> tuple[int, float]:
-    """Return number and length of the integration steps in `dt_s`."""
-    count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
-    return count, dt_s / count
-
-
 # Share of the friction limit that drive and brakes may use: wheels that do not lock keep a third of it for steering.
 ANTILOCK_SHARE = 0.95
 
@@ -196,7 +191,7 @@ def step_dynamic(
     friction limit: at full lock, while the yaw rate changes, the sum of forces can exceed the limit by a seventh.
     """
     p, chassis = parameters, Chassis.of(parameters)
-    count, h = inner_steps(dt_s)
+    count, h = equal_steps(dt_s, MAX_INNER_STEP_S)
     actuators, target, lag_s, max_rate = actuation(state, controls, p)
     body, bend, grip = state, np.tan(state.steer_rad), ANTILOCK_SHARE * GRAVITY_MPS2 * p.friction
     for _ in range(count):

@@ -150,8 +150,7 @@ def step_bicycle(
     otherwise, unconditionally stable. Braking ends at standstill; to reverse, the gear must change.
     """
     actuators, target, lag_s, max_rate = actuation(state, controls, parameters)
-    count = max(1, math.ceil(dt_s / MAX_INNER_STEP_S - 1e-9))
-    h = dt_s / count
+    count, h = equal_steps(dt_s, MAX_INNER_STEP_S)
     x, y, yaw, speed = state.x_m, state.y_m, state.yaw_rad, state.speed_mps
     for _ in range(count):
         actuators, (mean_pedal, mean_steer) = actuate(actuators, target, lag_s, max_rate, h)
@@ -176,6 +175,12 @@ def step_point(state: PointState, controls: PointControls, dt_s: float) -> Point
         state.velocity_x_mps + ax * dt_s,
         state.velocity_y_mps + ay * dt_s,
     )
+
+
+def equal_steps(dt_s: float, longest_s: float) -> tuple[int, float]:
+    """Return number and length of the fewest equal steps in `dt_s` of which none is longer than a limit."""
+    count = max(1, math.ceil(dt_s / longest_s - 1e-9))
+    return count, dt_s / count
 
 
 def clamp(value: Array, low: Array | float, high: Array | float) -> Array:
