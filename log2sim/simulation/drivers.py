@@ -76,12 +76,12 @@ def roll_out(
         velocity = present.speed_mps * np.exp(1j * present.course_rad)
         place = present.place_m[:, None] + velocity[:, None] * np.arange(1, ticks + 1) * TICK_S
         yaw = np.repeat(present.yaw_rad[:, None], ticks, axis=1)
-        place, yaw = np.repeat(place[None], count, axis=0), np.repeat(yaw[None], count, axis=0)
+        place, yaw = place[None], yaw[None]
     else:
         crowd = Crowd(scenario, now_s, horizon_s, count if model == "drivers" else 1, rng, noisy=model == "drivers")
         place, yaw = crowd.run(ticks)
-        if model != "drivers":
-            place, yaw = np.repeat(place, count, axis=0), np.repeat(yaw, count, axis=0)
+    if model != "drivers":
+        place, yaw = np.repeat(place, count, axis=0), np.repeat(yaw, count, axis=0)
     place = np.concatenate([past_place[:, :, : now + 1], place], axis=2)
     return replace(log, position_m=place, yaw_rad=np.concatenate([past_yaw[:, :, : now + 1], yaw], axis=2))
 
@@ -128,15 +128,11 @@ class Crowd:
         overlap = self._overlapping(self.place, self.yaw, i, j)[1][0]
         self.touching = set(zip(i[overlap].tolist(), j[overlap].tolist()))  # which is the log's doing
         if noisy:  # who follows another keeps the time gap that it has now, in all rollouts up to a spread
-            _, leads, gap = self._demand(self._reach())
+            _, leads, gap = self._demand()
             own_s = (gap - self.driver.gap_m) / np.maximum(self.speed, 2.0)
             follows = (self.speed > 2.0) & (np.abs(leads - self.speed) < 0.3 * self.speed) & (own_s < 3.0)
             fitted = np.clip(own_s, 0.4, 3.0) * self._spread(1.15, own_s.shape)
             self.driver.time_gap_s[follows] = fitted[follows]
-
-    def _reach(self) -> Array:
-        """Return how far drivers (R, M) look ahead, m."""
-        return np.minimum(10.0 + 3.0 * self.speed + self.speed**2 / 3.0, 90.0)
 
     def _spread(self, factor: float, shape: tuple[int, ...]) -> Array:
         return np.exp(np.log(factor) * self.rng.standard_normal(shape)) if self.noisy else np.ones(shape)
@@ -168,7 +164,7 @@ class Crowd:
         k = np.clip((self.way / self.paths.step_m).astype(np.intp), 0, POINTS - 1)
         desired = np.minimum(self.desired, np.take_along_axis(self.limit, k[..., None], axis=2)[..., 0])
         free = np.maximum(d.accel_mps2 * (1.0 - (self.speed / desired) ** EXPONENT), -d.comfort_mps2)
-        taken, leads, _ = self._demand(self._reach())
+        taken, leads, _ = self._demand()
         # Who stands sets off by itself now and then, or when who is ahead does.
         if self.noisy:
             chance = np.array([START_PER_S[g] for g in self.group]) * 2 * TICK_S
@@ -211,8 +207,9 @@ class Crowd:
         i, j = np.nonzero(near)
         return i, j
 
-    def _demand(self, reach: Array) -> tuple[Array, Array, Array]:
+    def _demand(self) -> tuple[Array, Array, Array]:
         """Return the greatest share of the free acceleration that who is ahead takes (R, M), and the speed and the gap to that one."""
+        reach = np.minimum(10.0 + 3.0 * self.speed + self.speed**2 / 3.0, 90.0)  # how far drivers look ahead
         taken, leads, gaps = np.zeros(self.speed.shape), np.zeros(self.speed.shape), np.full(self.speed.shape, np.inf)
         i, j = self._near_pairs(reach)
         if not len(i):
@@ -304,7 +301,7 @@ class Crowd:
 
     def _change_lanes(self, n: int) -> None:
         """Begin changes of lane that gain acceleration and leave who comes from behind room."""
-        taken, _, _ = self._demand(self._reach())
+        taken, _, _ = self._demand()
         velocity = self._velocity()
         for (m, side), (aside, missing) in self.paths.beside.items():
             k = self.rows[m]

@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
-from log2sim.simulation.metrics.realism import Motions, sizes_of
+from log2sim.simulation.metrics.realism import Mask, Motions, sizes_of
 from log2sim.simulation.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
 from log2sim.simulation.vehicles.vehicle import WHEELED
 
 HISTORY_S = 1.0  # of the past is known; with the present eleven ticks, as in the challenge
 NORMAL_PER_MEDIAN = 1.4826
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +56,18 @@ def judged(log: Motions, now: int) -> list[int]:
 def observe(scenario: Scenario, now_s: float) -> Present:
     """Fit the state of agents at a time to their last second; nothing later is looked at."""
     log, now = recorded(scenario, now_s, 0.0)
-    known = []
-    for a in log.agents:
+    known = list(log.agents)
+    for k, a in enumerate(log.agents):
         past = (a.waypoints.t_s <= now_s + TICK_S / 2) & (a.waypoints.t_s >= now_s - HISTORY_S - TICK_S)
-        known.append(
-            a
-            if a.is_permanent or a.static or not past.any()
-            else replace(a, waypoints=a.waypoints.take(np.flatnonzero(past)))
-        )
+        if not (a.is_permanent or a.static) and past.any():
+            known[k] = replace(a, waypoints=a.waypoints.take(np.flatnonzero(past)))
     t_s: Array = now_s + np.arange(-now, 1, dtype=np.float64) * TICK_S
     table = tabulate(known, t_s, TICK_S)
     smooth = smooth_motion(table)
     row = np.arange(len(known))
     last = table.present.shape[1] - 1 - table.present[:, ::-1].argmax(axis=1)
-    yaw, velocity, place = (
-        table.yaw_rad[row, last],
-        smooth.velocity_mps[row, last],
-        table.position_m[row, last] + smooth.velocity_mps[row, last] * (now_s - t_s[last]),
-    )
+    yaw, velocity = table.yaw_rad[row, last], smooth.velocity_mps[row, last]
+    place = table.position_m[row, last] + velocity * (now_s - t_s[last])
     for k in np.flatnonzero(~table.present.any(axis=1)).tolist():  # seen once, between two ticks
         w = known[k].waypoints
         yaw[k], velocity[k] = w.yaw_rad[-1], w.speed_mps[-1] * np.exp(1j * w.yaw_rad[-1])
