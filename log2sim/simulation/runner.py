@@ -68,22 +68,22 @@ class World:
     Between two calls the world is at `step`, and agents whose lifetime begins there have been placed. `advance` moves it on,
     until `done`. With an external simulator in `host`, groups only compute controls, and its tick moves the agents.
 
-    `statics`: agents that never move; they are in no group. `traffic`, optional: decides the speeds of reactive agents.
-    `choices`, optional: by id, the model that moves each vehicle and why. `sight_m`: range within which the ego's policy
-    observes other agents.
+    `statics`: agents that never move; they are in no group. `traffic`: decides the speeds of reactive agents, if there are
+    some. `choices`: by id, the model that moves each vehicle and why. `sight_m`: range within which the ego's policy observes
+    other agents.
     """
 
     def __init__(
         self,
         groups: Sequence[AgentGroup],
         clock: StepClock,
-        statics: Sequence[Agent] = (),
-        traffic: Traffic | None = None,
-        choices: Mapping[str, ModelChoice] | None = None,
-        sight_m: float = SIGHT_M,
+        statics: Sequence[Agent],
+        traffic: Traffic | None,
+        choices: Mapping[str, ModelChoice],
+        sight_m: float,
     ) -> None:
         self.groups, self.clock, self.statics, self.traffic = tuple(groups), clock, tuple(statics), traffic
-        self.choices = dict(choices or {})
+        self.choices = choices
         self.host: CarlaSimulator | None = None
         self.ego = next((g for g in groups if isinstance(g, PolicyVehicle)), None)
         self._observer = PolicyObserver(self.ego, self.groups, self.statics, sight_m) if self.ego is not None else None
@@ -222,7 +222,7 @@ def reactive_ids(agents: Sequence[Agent], wanted: str | Collection[str], *, driv
 
 
 def agent_groups(
-    assignment: Mapping[str, Sequence[Agent]], clock: StepClock, mode: str = "pid", model: str = "auto"
+    assignment: Mapping[str, Sequence[Agent]], clock: StepClock, mode: str, model: str
 ) -> tuple[list[AgentGroup], dict[str, ModelChoice]]:
     """Build the groups that have agents, and choose by id the model that moves each vehicle; static agents are in no group."""
     groups: list[AgentGroup] = []
@@ -234,14 +234,11 @@ def agent_groups(
         return clock.first_step(begin_s), clock.last_step(end_s)
 
     controlled: list[tuple[str, type[VehicleGroup], type[PedestrianGroup]]] = [
-        ("policy", PolicyVehicle, PedestrianGroup)
+        ("policy", PolicyVehicle, PedestrianGroup),
+        ("reactive", ReactiveVehicleGroup, ReactivePedestrianGroup),
+        ("pid", VehicleGroup, PedestrianGroup),
     ]
-    if mode == "pid":
-        controlled += [
-            ("reactive", ReactiveVehicleGroup, ReactivePedestrianGroup),
-            ("pid", VehicleGroup, PedestrianGroup),
-        ]
-    for driver, kind, on_foot in controlled:
+    for driver, kind, on_foot in controlled if mode == "pid" else controlled[:1]:
         wheeled = [a for a in assignment[driver] if a.category in WHEELED]
         references = {a.id: vehicle_reference_of(a, clock.dt_s) for a in wheeled}
         for a in wheeled:
@@ -261,8 +258,8 @@ def agent_groups(
         if walking:
             points = [point_reference(Trajectory.through(a.waypoints)) for a in walking]
             groups.append(on_foot(walking, points, *lifespans(walking)))
-    placed: list[tuple[str, type[AgentGroup]]] = [("exact", AgentGroup)]
-    for driver, tape in placed + ([("reactive", ReactiveGroup)] if mode == "exact" else []):
+    placed: list[tuple[str, type[AgentGroup]]] = [("exact", AgentGroup), ("reactive", ReactiveGroup)]
+    for driver, tape in placed if mode == "exact" else placed[:1]:
         agents = assignment[driver]
         if agents:
             rows = [log_reference(Trajectory.through(a.waypoints, rear_axle_offset(a))) for a in agents]
