@@ -18,7 +18,7 @@ from log2sim.files.plugins import nearest
 from log2sim.geometry import Array, fit_windows, wrap_angle
 from log2sim.simulation.corridors import PathTable
 from log2sim.simulation.groups import StepClock
-from log2sim.simulation.metrics.collisions import REPLAY, SCENARIO, BoxTracks, collisions
+from log2sim.simulation.metrics.collisions import REPLAY, BoxTracks, collisions
 from log2sim.simulation.metrics.conflicts import conflicts, most_critical
 from log2sim.simulation.metrics.realism import signed_distance
 from log2sim.simulation.result import AgentReplay, Replay
@@ -155,12 +155,15 @@ MAX_PAIRS = 100_000  # pairs of boxes whose distance is computed at once, which 
 MIN_SPEED_MPS = 0.05  # below this a vehicle stands, and what its acceleration is then is no braking
 
 
-def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path: Trajectory) -> dict[str, Any]:
-    """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`; its smallest gap is to the agent of a column.
+def ego_figures(
+    agents: Sequence[AgentReplay], index: int, boxes: BoxTracks, t_s: Array, path: Trajectory
+) -> dict[str, Any]:
+    """Compute the figures of the ego in `metrics.ego` of `schemas/replay-1.json`.
 
-    `index`: its column in `boxes`. `boxes`: of all agents. `t_s` (S,), s: times of the rows of `boxes`. `path`: of the
+    `index`: the ego among the agents. `boxes`: of all agents. `t_s` (S,), s: times of the rows of `boxes`. `path`: of the
     ego in the scenario.
     """
+    ego = agents[index]
     table = PathTable([path])
     gone_m = table.progress(0, ego.x_m, ego.y_m)
     length_m = float(table.at(np.zeros(1, dtype=np.intp), np.array([path.t_s[-1]])).distance_m[0])
@@ -168,9 +171,8 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     # What the actuators do between two states shows in the speed at its end, so the larger of both speeds says if it moves.
     speed, before = np.abs(ego.speed_mps), np.r_[ego.speed_mps[:1], ego.speed_mps[:-1]]
     moves = np.maximum(speed, np.abs(before)) > MIN_SPEED_MPS
-    brake = np.where(
-        moves, -ego.accel_mps2 * np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, before)), 0.0
-    ).round(3)
+    gear = np.sign(np.where(speed > MIN_SPEED_MPS, ego.speed_mps, before))
+    brake = np.where(moves, -ego.accel_mps2 * gear, 0.0).round(3)
     k, hardest = int(np.argmax(brake)) if len(brake) else 0, None
     if len(brake) and brake[k] > 0:
         hardest = {"mps2": float(brake[k]), "t_s": round(float(ego.t_s[k]), 6)}
@@ -196,7 +198,7 @@ def ego_figures(ego: AgentReplay, index: int, boxes: BoxTracks, t_s: Array, path
     gap, smallest = np.concatenate(gaps), None
     if len(gap):
         k = int(np.argmin(gap))
-        smallest = {"m": round(float(gap[k]), 3), "t_s": round(float(t_s[rows[k]]), 6), "agent": int(others[k])}
+        smallest = {"m": round(float(gap[k]), 3), "t_s": round(float(t_s[rows[k]]), 6), "agent": agents[others[k]].id}
     return {
         "driven_m": round(float(steps_m.sum()), 3), "progress_m": round(float(gone_m[-1]) if len(gone_m) else 0.0, 3),
         "path_m": round(length_m, 3), "min_gap": smallest, "max_brake": hardest,
@@ -285,7 +287,7 @@ def replay_metrics(
     errors: Mapping[str, TrackingErrors],
     clock: StepClock,
     *,
-    source_kind: str = SCENARIO,
+    source_kind: str,
 ) -> dict[str, Any]:
     """Compute the metrics of `schemas/replay-1.json`, by agent and overall.
 
@@ -320,10 +322,7 @@ def replay_metrics(
     driven = next((k for k, agent in enumerate(agents) if agent.driver == "policy"), None)
     ego = {}
     if driven is not None:
-        path = trajectories[ids[driven]]
-        figures = ego_figures(agents[driven], driven, replayed, t_s, path)
-        gap = figures["min_gap"]
-        ego["ego"] = {**figures, "min_gap": None if gap is None else {**gap, "agent": ids[gap["agent"]]}}
+        ego["ego"] = ego_figures(agents, driven, replayed, t_s, trajectories[ids[driven]])
     # Errors averaged over all followers, every stored sample counting alike; 0 without followers.
     out: dict[str, Any] = {}
     for key, samples in (

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from log2sim.datatypes import EGO
 from log2sim.geometry import Array, rectangles_overlap, separating_axes, wrap_angle
 from log2sim.simulation.metrics.collisions import CHUNK, REPLAY, BoxTracks, RowIndex, circles_meet, spacing_s
-from log2sim.simulation.vehicles.vehicle import Columns
 
 HORIZON_S = 10.0  # constant velocity is no prediction over a longer time
 BLOCK = 256  # rows and agents of one broad phase, so that its arrays stay small
 
 
 @dataclass(frozen=True, eq=False)
-class TimesToCollision(Columns):
+class TimesToCollision:
     """Pairs a < b (N,) on a collision course."""
 
     a: RowIndex
@@ -147,7 +146,7 @@ PARTS, ZOOMS = 4, 4  # a row is divided into so many parts so many times: 50 ms 
 
 
 @dataclass(frozen=True, eq=False)
-class PostEncroachmentTimes(Columns):
+class PostEncroachmentTimes:
     """Pairs (N,) of agents on crossing paths."""
 
     first: RowIndex  # the agent that was at the place first, and second

@@ -96,9 +96,8 @@ class Road:
             normal = 1j * np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
             half = normal / np.maximum(np.abs(normal), 1e-9) * lane.width_m / 2
             edges = np.stack([line + half, line - half])
-            pixel = np.round((np.stack([edges.real, edges.imag], axis=-1) - self._low) / self._cell_m * 16).astype(
-                np.int32
-            )
+            at = (np.stack([edges.real, edges.imag], axis=-1) - self._low) / self._cell_m
+            pixel = np.round(at * 16).astype(np.int32)
             for k in range(len(line) - 1):
                 cv2.fillConvexPoly(inside, pixel[[0, 0, 1, 1], [k, k + 1, k + 1, k]], 1, shift=4)
         gap = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (round(GAP_M / self._cell_m) | 1,) * 2)
@@ -166,9 +165,8 @@ def signed_distance(away_m: Complex, yaw_a: Array, yaw_b: Array, size_a_m: Array
         (-away_m, yaw_b, yaw_a, size_b_m, size_a_m),
     ):
         for one, two in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            corner = (way + (one * corners[:, 0] + 1j * two * corners[:, 1]) / 2 * np.exp(1j * other)) * np.exp(
-                -1j * own
-            )
+            corner = way + (one * corners[:, 0] + 1j * two * corners[:, 1]) / 2 * np.exp(1j * other)
+            corner = corner * np.exp(-1j * own)
             beyond_x, beyond_y = np.abs(corner.real) - size[:, 0] / 2, np.abs(corner.imag) - size[:, 1] / 2
             nearest = np.minimum(nearest, np.hypot(np.maximum(beyond_x, 0.0), np.maximum(beyond_y, 0.0)))
     return np.where(depth > 0, nearest, depth)
@@ -205,11 +203,8 @@ def _nearest(motions: Motions, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         least, leads = (np.take_along_axis(c, first, axis=1)[:, 0] for c in (gap, speed))
         closing = speed[:, k] - leads
         near = np.isfinite(least) & (closing > 0)
-        ahead_s[:, e] = np.where(
-            near,
-            np.minimum(np.divide(least, closing, out=np.full_like(least, MAX_TTC_S), where=near), MAX_TTC_S),
-            MAX_TTC_S,
-        )
+        meet_s = np.divide(least, closing, out=np.full_like(least, MAX_TTC_S), where=near)
+        ahead_s[:, e] = np.minimum(meet_s, MAX_TTC_S)
     there = motions.present[:, rows]
     return np.where(there, distance, np.nan), np.where(there, ahead_s, np.nan)
 
