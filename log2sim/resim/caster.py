@@ -221,7 +221,8 @@ def first_hits(parts: Sequence[Meetings], material: Material, count: int, rng: n
     for met, stops in zip(parts, stopped):
         depth = (met.range_m - nearest.take(met.ray)) * met.facing
         some = np.flatnonzero(stops & (depth < THICKNESS_M))
-        ray, t, surfel, weight = (c.take(some) for c in (met.ray, met.range_m, met.surfel, met.weight))
+        ray, t = met.ray.take(some), met.range_m.take(some)
+        surfel, weight = met.surfel.take(some), met.weight.take(some)
         np.add.at(total, ray, weight.astype(np.float64))
         values = t, np.nan_to_num(material.intensity.take(surfel)), material.returned.take(surfel)
         for of, value in zip(sums, values):

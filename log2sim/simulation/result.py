@@ -240,9 +240,8 @@ class Replay:
         metrics["by_agent"] = {k: {**m, "collisions": owned(m["collisions"])} for k, m in metrics["by_agent"].items()}
         metrics["collisions"] = owned(metrics["collisions"])
         if "conflicts" in metrics:
-            renamed = {"log": "scenario"}
             metrics["conflicts"] = [
-                {**c, "contact": renamed.get(c["contact"], c["contact"])} for c in metrics["conflicts"]
+                {**c, "contact": "scenario" if c["contact"] == "log" else c["contact"]} for c in metrics["conflicts"]
             ]
         plain = {k: document[k] for k in ("scenario", "scenario_digest", "mode", "model", "dt_s", "store_dt_s")}
         warned = Warnings.from_dict(document["warnings"]) if "warnings" in document else None

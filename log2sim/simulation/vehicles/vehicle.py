@@ -73,15 +73,6 @@ VehicleStep = Callable[["VehicleState", "VehicleControls", "VehicleParameters", 
 """Moves vehicles for so many s with constant controls; no argument is changed."""
 
 
-class Actuators(NamedTuple):
-    """Limits, lags and rate limits of actuators, arrays of one shape."""
-
-    low: Array
-    high: Array
-    lag_s: Array
-    max_rate: Array
-
-
 @dataclass(frozen=True, eq=False)
 class VehicleParameters(Columns):
     """Size and limits of vehicles, all positive and (A,)."""
@@ -109,9 +100,9 @@ class VehicleParameters(Columns):
         return np.tan(self.max_steer_rad) / self.wheelbase_m
 
     @cached_property
-    def actuators(self) -> Actuators:
-        """Limits of pedal and steering, as rows (2, A)."""
-        return Actuators(
+    def actuators(self) -> tuple[Array, Array, Array, Array]:
+        """Lower and upper limits, lags and rate limits of pedal and steering, as rows (2, A)."""
+        return (
             rows(-self.max_brake_mps2, -self.max_steer_rad),
             rows(self.max_throttle_mps2, self.max_steer_rad),
             rows(self.pedal_lag_s, self.steer_lag_s),
