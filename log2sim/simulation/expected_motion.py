@@ -15,7 +15,7 @@ from log2sim.datatypes import ENDS, MARGIN_S, Agent, Scenario, Span, Trajectory
 from log2sim.errors import ConfigError
 from log2sim.files.arrays import Columns
 from log2sim.files.plugins import nearest
-from log2sim.geometry import Array, wrap_angle
+from log2sim.geometry import Array, runs_of, wrap_angle
 from log2sim.simulation.corridors import ON_PATH_COS, ON_PATH_M, PathTable
 from log2sim.simulation.metrics.conflicts import touching
 from log2sim.simulation.prediction.motion_table import Complex, MotionTable
@@ -147,8 +147,7 @@ def observed_spans(agent: Agent, ends: Sequence[str]) -> tuple[Span, ...]:
         return ((-np.inf, np.inf),)
     w = agent.waypoints
     seen = w.observed if w.visible is None else w.observed & w.visible
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
-    return tuple((float(w.t_s[a]), float(w.t_s[b - 1])) for a, b in zip(edges[::2], edges[1::2]))
+    return tuple((float(w.t_s[first]), float(w.t_s[end - 1])) for first, end in runs_of(seen))
 
 
 def ends_of(scenario: Scenario) -> tuple[str, ...]:
@@ -193,7 +192,6 @@ class ExpectedAgents:
     def __init__(self, table: MotionTable, known: Known, interval_s: float, horizon_s: float) -> None:
         self.table, self.known, self._interval_s = table, known, interval_s
         self.lead_s = np.linspace(0.0, horizon_s, int(np.ceil(horizon_s / LEAD_STEP_S - 1e-9)) + 1)
-        self.size_m = np.array([a.size_m[:2] for a in table.agents], dtype=np.float64).reshape(-1, 2)
         self._static = np.array([a.static for a in table.agents], dtype=bool)
         movers = np.flatnonzero(~self._static)
         self._mover = np.full(len(table.agents), -1, dtype=np.intp)
@@ -237,7 +235,7 @@ class ExpectedAgents:
             drift = sigma0[..., 0] * (np.sqrt(12.0 / (count * (count**2 - 1.0))) / self._interval_s)[:, None]
             spread = _at_leads(np.concatenate([sigma0, f.sigma_m[row]], axis=1), lead)
             sigma[moving] = np.sqrt(spread**2 + (drift * lead)[..., None] ** 2)
-        return ExpectedPaths(position, yaw, course, sigma, self.size_m[agent])
+        return ExpectedPaths(position, yaw, course, sigma, t.size_m[agent, :2])
 
 
 def _at_leads(values: NDArray[Any], lead_s: Array) -> NDArray[Any]:

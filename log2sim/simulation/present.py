@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, STANDSTILL_MPS, Agent, Scenario
+from log2sim.datatypes import STANDSTILL_MPS, Agent, Scenario
 from log2sim.geometry import Array, wrap_angle
-from log2sim.simulation.metrics.realism import Mask, Motions, sizes_of
+from log2sim.simulation.metrics.realism import Motions
 from log2sim.simulation.prediction.motion_table import TICK_S, Complex, smooth_motion, tabulate
 from log2sim.simulation.vehicles.vehicle import WHEELED
 
 HISTORY_S = 1.0  # of the past is known; with the present eleven ticks, as in the challenge
 NORMAL_PER_MEDIAN = 1.4826
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ def recorded(scenario: Scenario, now_s: float, horizon_s: float = 8.0) -> tuple[
     there = [
         a for a in scenario.agents if a.is_permanent or a.waypoints.t_s[0] - 1e-3 <= now_s <= a.waypoints.t_s[-1] + 1e-3
     ]
-    table = tabulate(there, t_s, TICK_S)
+    table = tabulate(there, t_s)
     jumps = table.piece != table.piece[:, before, None]
     yaw = np.where(jumps, np.nan, table.yaw_rad)
     return Motions(tuple(there), TICK_S, np.where(jumps, np.nan, table.position_m)[None], yaw[None]), before
@@ -62,7 +64,7 @@ def observe(scenario: Scenario, now_s: float) -> Present:
         if not (a.is_permanent or a.static) and past.any():
             known[k] = replace(a, waypoints=a.waypoints.take(np.flatnonzero(past)))
     t_s: Array = now_s + np.arange(-now, 1, dtype=np.float64) * TICK_S
-    table = tabulate(known, t_s, TICK_S)
+    table = tabulate(known, t_s)
     smooth = smooth_motion(table)
     row = np.arange(len(known))
     last = table.present.shape[1] - 1 - table.present[:, ::-1].argmax(axis=1)
@@ -72,7 +74,7 @@ def observe(scenario: Scenario, now_s: float) -> Present:
         w = known[k].waypoints
         yaw[k], velocity[k] = w.yaw_rad[-1], w.speed_mps[-1] * np.exp(1j * w.yaw_rad[-1])
         place[k] = complex(w.x_m[-1], w.y_m[-1]) + velocity[k] * (now_s - w.t_s[-1])
-    wheeled = np.array([a.category in WHEELED for a in known], dtype=bool)
+    wheeled = np.isin(table.category, WHEELED)
     forward = (velocity * np.exp(-1j * yaw)).real
     slow = np.abs(velocity) < 2 * STANDSTILL_MPS
     course = np.where(wheeled | slow, np.where(wheeled & (forward < -0.5), yaw + np.pi, yaw), np.angle(velocity))
@@ -90,11 +92,10 @@ def observe(scenario: Scenario, now_s: float) -> Present:
         # White noise, whose second differences over two ticks have a standard deviation of sqrt(6) times its own.
         bends = [np.abs(c[4:] - 2 * c[2:-2] + c[:-4]) for c in (*rest, np.unwrap(table.yaw_rad[k, there]))]
         jitter[:, k] = np.median(bends, axis=1) * NORMAL_PER_MEDIAN / np.sqrt(6.0)
-    group = np.array([GROUP_OF.get(a.category, "other") for a in known], dtype="<U16")
     return Present(
         tuple(known), place, wrap_angle(course), yaw, np.where(slow, 0.0, speed), np.clip(accel, -4.0, 3.0),
         np.where(slow, 0.0, smooth.turn_radps[row, last]), np.array([not a.static for a in known], dtype=bool),
-        np.stack([_drawn_to_group(c, group) for c in jitter]), sizes_of(known), group,
+        np.stack([_drawn_to_group(c, table.group) for c in jitter]), table.size_m[:, :2], table.group,
     )  # fmt: skip
 
 

@@ -133,7 +133,7 @@ class MotionForesight(PathForesight):
         super().__init__(paths)
         self._begin_s, end_s = float(paths.begin_s.min()), float(paths.end_s.max())
         ticks = np.arange(int((end_s - self._begin_s) / TICK_S) + 1, dtype=np.float64)
-        table = tabulate(agents, self._begin_s + TICK_S * ticks, TICK_S)
+        table = tabulate(agents, self._begin_s + TICK_S * ticks)
         smooth = smooth_motion(table)
         self._velocity = np.where(table.present, smooth.velocity_mps, 0.0)
         self._turn_radps = np.where(table.present, smooth.turn_radps, 0.0)

@@ -122,14 +122,12 @@ class Watch:
         self.settings, self.interval_s = settings, observation_interval_s(scenario)
         source = {a.id: a for a in scenario.agents}
         spans = [observed_spans(source[a.id], settings.used_ends) for a in agents]
-        self.table = tabulate(agents, t_s, TICK_S)
+        self.table = tabulate(agents, t_s)
         self.known = known_agents(agents, spans, t_s, self.interval_s, self.table.present)
         self.own: int | None = None
         if scenario.ego is not None:
             self.ego_path = EgoPath(scenario.ego)
         self._expected = ExpectedAgents(self.table, self.known, self.interval_s, settings.horizon_s)
-        self._height_m = np.array([a.size_m[2] for a in agents])
-        self._radius_m = np.array([np.hypot(*a.size_m[:2]) / 2 for a in agents])
 
     def for_driver(self, driver: Agent) -> Watch:
         """Return a watch that warns a vehicle of the scenario in place of the ego, while the ends know it."""
@@ -156,11 +154,12 @@ class Watch:
         apart = np.abs(place - (ego.x_m + 1j * ego.y_m)[row])
         ahead_s = self.settings.horizon_s + (ticks[row] - source) * TICK_S
         reach = np.abs(ego.speed_mps[row]) * self.settings.horizon_s + (speed + SPARE_MPS) * ahead_s
-        near = np.flatnonzero(apart <= reach + np.hypot(*size[:2]) / 2 + self._radius_m[agent])
+        radius = np.hypot(*table.size_m[agent, :2].T) / 2
+        near = np.flatnonzero(apart <= reach + np.hypot(*size[:2]) / 2 + radius)
         row, agent, source, apart = row[near], agent[near], source[near], apart[near]
         path_z = self.ego_path.heights(ego.progress_m[row], apart)
         z = np.array([table.agents[k].trajectory.heights(table.t_s[[n]])[0] for k, n in zip(agent, source)])
-        room = (self._height_m[agent] + size[2]) / 2 + MAX_SLOPE * apart
+        room = (table.size_m[agent, 2] + size[2]) / 2 + MAX_SLOPE * apart
         level = np.abs(path_z - z.reshape(-1, 1)).min(axis=1) < room
         row, agent = row[level], agent[level]
         tick, lead_s = ticks[row], self._expected.lead_s

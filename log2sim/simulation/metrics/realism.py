@@ -51,11 +51,6 @@ CELL_M = 0.25
 GAP_M = 1.5  # gaps between lanes up to this width belong to the road
 
 
-def sizes_of(agents: Sequence[Agent]) -> Array:
-    """Return length and width (A, 2) of agents, m."""
-    return np.array([a.size_m[:2] for a in agents], dtype=np.float64).reshape(-1, 2)
-
-
 @dataclass(frozen=True, eq=False)
 class Motions:
     """R rollouts of A agents at T ticks, `tick_s` apart; NaN where an agent is absent."""
@@ -68,7 +63,7 @@ class Motions:
     @property
     def size_m(self) -> Array:
         """Length and width (A, 2)."""
-        return sizes_of(self.agents)
+        return np.array([a.size_m[:2] for a in self.agents], dtype=np.float64).reshape(-1, 2)
 
     @property
     def present(self) -> Mask:

@@ -53,17 +53,17 @@ class MotionTable(AgentTable):
         return position, observed & self.observed
 
 
-def table_of(scenario: Scenario, tick_s: float = TICK_S) -> MotionTable:
-    """Sample the trajectories of a scenario every `tick_s` from its begin to its end."""
+def table_of(scenario: Scenario) -> MotionTable:
+    """Sample the trajectories of a scenario every `TICK_S` from its begin to its end."""
     agents = scenario.agents
     begin_s = min([0.0, *(float(a.waypoints.t_s[0]) for a in agents)])
     end_s = max([scenario.duration_s, *(float(a.waypoints.t_s[-1]) for a in agents)])
-    first, last = (round(np.floor(t / tick_s + MARGIN_S)) for t in (begin_s, end_s))
-    return tabulate(agents, np.arange(first, last + 1) * tick_s, tick_s)
+    first, last = (round(np.floor(t / TICK_S + MARGIN_S)) for t in (begin_s, end_s))
+    return tabulate(agents, np.arange(first, last + 1) * TICK_S)
 
 
-def tabulate(agents: Sequence[Agent], t_s: Array, tick_s: float) -> MotionTable:
-    """Sample the trajectories of agents at ticks (T,)."""
+def tabulate(agents: Sequence[Agent], t_s: Array) -> MotionTable:
+    """Sample the trajectories of agents at ticks (T,), `TICK_S` apart."""
     table = AgentTable.of(agents, t_s, permanent=True)
     shape = table.present.shape
     velocity, sigma = np.full(shape, np.nan, dtype=complex), np.full(shape, np.nan)
@@ -80,7 +80,7 @@ def tabulate(agents: Sequence[Agent], t_s: Array, tick_s: float) -> MotionTable:
         observed[k, there] = w.observed[after] & w.observed[before]
         piece[k, there] = np.searchsorted(path.discontinuity_times(), t + MARGIN_S, side="right")
     columns = table.agents, t_s, table.center_m, table.yaw_rad, table.speed_mps
-    return MotionTable(*columns, tick_s, velocity, sigma, observed, piece)
+    return MotionTable(*columns, TICK_S, velocity, sigma, observed, piece)
 
 
 # Time constants to choose from, of velocity and of turn rate: 0 takes the latest value, and infinity none, so that the
@@ -123,7 +123,7 @@ def turn_rates(table: MotionTable) -> Array:
     known[:, 0] = False
     turn = np.where(known, angle / table.tick_s, 0.0)
     limit = MAX_LATERAL_MPS2 / np.maximum(speed, MIN_COURSE_MPS)
-    walks = np.array([a.category == "pedestrian" for a in table.agents], dtype=bool)[:, None]
+    walks = (table.category == "pedestrian")[:, None]
     limit = np.where(walks, limit, np.minimum(limit, MAX_CURVATURE_1PM * speed))
     return np.clip(turn, -limit, limit)
 

@@ -303,7 +303,7 @@ def predict_scenario(
     found = () if scenario.map_features is None else scenario.map_features.lanes
     # Lanes out of paths would know where agents will go.
     lanes = [lane.points_m[:, :2] for lane in found if lane.inferred_from != "paths"]
-    return predict_table(table_of(scenario, TICK_S), leads_of(horizon_s), methods, lanes)
+    return predict_table(table_of(scenario), leads_of(horizon_s), methods, lanes)
 
 
 def predict_table(
@@ -363,7 +363,7 @@ def measure_predictions(predictions: Predictions) -> list[dict[str, Any]]:
     for h, lead in enumerate(predictions.lead_s):
         position, observed = table.later(round(lead / table.tick_s))
         truth[:, h], seen[:, h] = position[row, tick], observed[row, tick]
-    category = np.array([a.category for a in table.agents], dtype=object)[row]
+    category = table.category[row]
     is_ego = np.array([a.id == EGO for a in table.agents], dtype=bool)[row]
     mobile = ~np.array([a.static for a in table.agents], dtype=bool)[row]
     moving = np.abs(table.velocity_mps[row, tick]) >= STANDSTILL_MPS
