@@ -7,7 +7,6 @@ the texture of the road moves as a rigid picture, whereas in the image it grows,
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +29,7 @@ from log2sim.geometry import (
     undistort,
     yaw_of,
 )
-from log2sim.localization.odometry import MAX_SPEED_MPS, is_during, share_of_motion
+from log2sim.localization.odometry import MAX_SPEED_MPS, Progress, is_during, share_of_motion
 from log2sim.perception.records import RecordSource
 
 MIN_CORNER = 1e-4
@@ -121,8 +120,6 @@ STANDING_PX = 0.25
 ROTATION_ROUNDS, MIN_ROTATION_SHARE = 8, 0.5
 # Yaw rates of vehicles are below 1 rad/s; a steeper turn of two images is a wrong essential matrix.
 MAX_YAW_RATE_RADPS = 1.5
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)

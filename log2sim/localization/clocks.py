@@ -11,7 +11,6 @@ sweeps alike and does not show; turned mounts do.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,7 +20,7 @@ from scipy.linalg import solve_triangular
 from log2sim.config import CalibrationConfig, Config
 from log2sim.datatypes import Finding, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, inverse, transform
-from log2sim.localization.choice import during_ns
+from log2sim.localization.choice import Progress, during_ns
 from log2sim.localization.odometry import lidars_on_ego
 from log2sim.localization.replaced import shift_stream
 from log2sim.localization.surfaces import (
@@ -334,8 +333,6 @@ def course_in_ego(seen: SweepPairs) -> float:
     (course, _), *_ = np.linalg.lstsq(np.stack([forward, turning], axis=1), sideways, rcond=None)
     return float(np.arctan(course))
 
-
-Progress = Callable[[str, int, int], None]
 
 # Poses that err by more within seconds, or that belong to other sweeps, are no base for a calibration.
 MAX_POSE_ERROR_M = 0.5

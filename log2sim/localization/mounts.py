@@ -5,7 +5,7 @@ An error of some degrees, or of the poses, hardly shows in the direction of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,7 +16,7 @@ from log2sim.config import Config
 from log2sim.datatypes import Finding, Log, Treatment
 from log2sim.geometry import NS_PER_S, Array, Camera, inverse, rotation_from_rpy, transform, undistort
 from log2sim.localization.camera_motion import LEVELS, SPACING_PX, WINDOW_PX, follow_points
-from log2sim.localization.choice import during_ns
+from log2sim.localization.choice import Progress, during_ns
 from log2sim.localization.clocks import check_lidars, turn_mount
 from log2sim.localization.edges import (
     MIN_WIDTH_PX,
@@ -105,9 +105,8 @@ def find_exchanged(cameras: Mapping[str, Camera], pairs: Mapping[str, Sequence[F
 def _choose_pairs(log: Log, t_ns: NDArray[np.int64], during_ns: tuple[int, int] | None) -> list[tuple[int, int]]:
     """Choose up to `MAX_PAIRS` pairs of rows between which the ego moves by about `MIN_APART_M`."""
     assert log.ego is not None
-    poses, known = log.ego.at(t_ns) if len(t_ns) else (np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-    known = known & is_during(t_ns, during_ns)
-    rows = np.flatnonzero(known)
+    poses, known = log.ego.at(t_ns)
+    rows = np.flatnonzero(known & is_during(t_ns, during_ns))
     if len(rows) < 2:
         return []
     place = poses[rows, :3, 3]
@@ -147,7 +146,6 @@ class MountCheck:
     """What the mounts of a log are checked with, and what came of it."""
 
     log: Log
-    lidar: str  # "" without one to check against
     views: Mapping[str, list[EdgeView]]  # by camera, of those beside the LiDAR
     yaws: Mapping[str, YawEstimate | None]  # by camera, with its own mount; None where it is not known
 
@@ -247,7 +245,6 @@ MIN_TOLD_RAD = 0.01
 MIN_SIGMAS = 4.0
 # Up to half of that, a camera is sound whatever more frames say.
 SOUND_RAD = MIN_TOLD_RAD / 2
-Progress = Callable[[str, int, int], None]
 
 
 def check_cameras(
@@ -286,11 +283,10 @@ def check_cameras(
     if turns_together(check.yaws):
         # The mount of the LiDAR is told, with which that of no camera agrees; corrected are those of the cameras.
         angle, sigma = np.array([(yaw.yaw_rad, yaw.sigma_rad) for yaw in off.values()]).T
-        mean = {
-            "yaw_deg": np.rad2deg(np.average(angle, weights=1 / sigma**2)),
-            "yaw_sigma_deg": np.rad2deg(sigma.max()),
+        values = {
+            "yaw_deg": float(np.rad2deg(np.average(angle, weights=1 / sigma**2))),
+            "yaw_sigma_deg": float(np.rad2deg(sigma.max())),
         }
-        values = {key: float(value) for key, value in mean.items()}
         faults.append(Finding("lidar_rotation", lidar, treatment, values=values, other=", ".join(off), case="edges"))
     else:
         case = "either" if sum(yaw is not None for yaw in check.yaws.values()) == 1 else "camera"
@@ -331,7 +327,7 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Prog
     unknown = dict.fromkeys(sensors.cameras)
     names = [name for name in sensors.cameras if lidar and is_near(log, name, lidar)]
     if not names:
-        return MountCheck(log, lidar, {}, unknown)
+        return MountCheck(log, {}, unknown)
     reference = log.reference_camera if log.reference_camera in names else names[0]
     moments = choose_moments(log, lidar, reference, during_ns(log, config))
     seen = EdgeViews(log, moments, lambda done, total: progress("check cameras", done, total))
@@ -344,7 +340,7 @@ def _look(log: Log, lidar: str, config: Config, sensors: Sensors, progress: Prog
             if found is not None and abs(found.yaw_rad) < SOUND_RAD:
                 break
     progress("check cameras", len(moments.sweeps), len(moments.sweeps))
-    return MountCheck(log, lidar, views, unknown | yaws)
+    return MountCheck(log, views, unknown | yaws)
 
 
 def check_calibration(

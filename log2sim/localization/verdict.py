@@ -9,7 +9,7 @@ street has many walls across and little that shows an error along it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import ModuleType
 
@@ -44,6 +44,7 @@ from log2sim.localization.odometry import (
     NEIGHBORS,
     EgoSweep,
     Odometry,
+    Progress,
     densest_lidar,
     is_installed,
     load_small_gicp,
@@ -267,8 +268,6 @@ MIN_FITTED, MIN_FITTED_M = 5, 1.0
 MAX_STEP_S = 0.6
 # Odometry drifts by up to this share of its path and by this much per m of it: centimeters over twenty meters.
 DRIFT_SHARE, DRIFT_RAD_PER_M = 0.005, 2e-4
-
-Progress = Callable[[int, int], None]
 
 
 def bridge_by_lidar(log: Log, checked: CheckedPoses, progress: Progress) -> CheckedPoses:
