@@ -221,7 +221,7 @@ def _near_image(camera: Camera, view: EdgeView) -> tuple[Array, NDArray[np.bool_
     near = np.zeros(len(view.left), dtype=bool)
     for angle in np.linspace(-REACH_RAD, REACH_RAD, 3).tolist():
         cam_T_mount = inverse(turn_mount(camera.mount_T_cam, np.array([0.0, 0.0, angle])))
-        near |= project(camera, view.points_mount @ cam_T_mount[:3, :3].T + cam_T_mount[:3, 3])[1]
+        near |= project(camera, apply(cam_T_mount, view.points_mount))[1]
     rows = np.flatnonzero(near)
     rows = rows[:: max(-(-len(rows) // MAX_EDGES), 1)]
     return view.points_mount[rows], view.left[rows]

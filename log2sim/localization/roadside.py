@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import erf
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from log2sim.config import Config
 from log2sim.datatypes import Finding, Log
 from log2sim.geometry import NS_PER_S, Array, PoseTrack, apply, inverse, transform, yaw_of
-from log2sim.localization.choice import during_ns
+from log2sim.localization.choice import Progress, during_ns
 from log2sim.localization.odometry import lidars_on_ego
 from log2sim.localization.replaced import shift_stream
 from log2sim.localization.roadside_fit import (
@@ -112,7 +112,6 @@ TRIED_DELAYS_S = np.arange(-0.2, 0.51, 0.1)
 JUDGED_WITHIN_M = 0.5
 # Of the vehicle's way, to see how far its poses drift.
 PARTS, HELD_SHARE = 3, 0.3
-POSE = slice(0, DELAY)
 # Of the sides of the ego's box and its yaw, which GNSS with an IMU gives.
 OWN_SIGMA_M, OWN_SIGMA_RAD = 0.05, 0.005
 # Where structure holds the pose in the plane, objects are needed for the delay alone, for which fewer moments do.
@@ -156,11 +155,6 @@ class Estimate:
     # `structure`, `objects`: without and with the correction, by the same limit
     structure: tuple[MatchedStructure | None, MatchedStructure | None]
     objects: tuple[Matched | None, Matched | None]
-
-    @property
-    def correction(self) -> Array:
-        """The twist as a transform (4, 4)."""
-        return exp_of(self.values[:DELAY])
 
 
 def collect_sight(log: Log, config: Config, unit: Unit, report: Callable[[int, int], None]) -> Sight:
@@ -225,7 +219,7 @@ def covariance_of_poses(track: PoseTrack, view: VehicleView) -> Array:
     sigma_m, sigma_rad = track.sigmas_at(view.t_ns).mean(axis=0)
     site_T_ego = adjoint_of(transform(np.eye(3), view.sensor_m.mean(axis=0)))
     out, count = np.zeros((7, 7)), independent_parts(float(np.ptp(view.t_ns)) / NS_PER_S)
-    out[POSE, POSE] = site_T_ego @ np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3) @ site_T_ego.T / count
+    out[:DELAY, :DELAY] = site_T_ego @ np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3) @ site_T_ego.T / count
     return out
 
 
@@ -400,11 +394,6 @@ class Findings:
         # A delay that is not certain is not applied, but may well be there: the pose is not what it would be without.
         return self.found.values * np.isin(np.arange(7), rows)
 
-    @property
-    def correction(self) -> Array:
-        """The pose of what is corrected, (4, 4)."""
-        return exp_of(self.applied[POSE])
-
     def faults(self) -> list[Finding]:
         """Describe what is wrong, and what cannot be said."""
         if self.contradicted:
@@ -415,19 +404,19 @@ class Findings:
         if self.moved:
             case = "all" if len(self._looked_rows) == DELAY else "height_and_tilt"
             structure, objects = self.found.structure[1], self.found.objects[1]
-            values = values | {
+            of_pose = values | {
                 "shift_m": float(np.linalg.norm(self.applied[:3])),
                 "turn_deg": float(np.degrees(np.linalg.norm(self.applied[3:DELAY]))),
                 "points": 0.0 if structure is None else float(structure.points),
                 "pairs": 0.0 if objects is None else float(objects.pairs),
             }
-            faults.append(Finding("road_pose", lidar, "corrected", values=values, case=case))
+            faults.append(Finding("road_pose", lidar, "corrected", values=of_pose, case=case))
         if self.late:
-            faults.append(Finding("road_clock", lidar, "corrected", values=self._values()))
+            faults.append(Finding("road_clock", lidar, "corrected", values=values))
         if not self.verified:
-            faults.append(Finding("unknown_road_pose", lidar, values=self._values()))
+            faults.append(Finding("unknown_road_pose", lidar, values=values))
         if not self.clock_verified:
-            faults.append(Finding("unknown_road_clock", lidar, values=self._values()))
+            faults.append(Finding("unknown_road_clock", lidar, values=values))
         return faults
 
     def _values(self) -> dict[str, float]:
@@ -464,8 +453,6 @@ class Findings:
         }
 
 
-Progress = Callable[[str, int, int], None]
-
 # GNSS with an IMU errs by less; a larger error is the unit's.
 MAX_POSE_ERROR_M, MAX_POSE_ERROR_RAD = 0.4, np.radians(1.5)
 
@@ -499,12 +486,11 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
         return RoadRegistration(log)
     units = []
     for unit in units_of(used, at_road):
-        stage = f"register {unit.lidars[0]}"
-        sight = collect_sight(used, config, unit, lambda done, total, stage=stage: progress(stage, done, total))  # type: ignore[misc]
+        sight = collect_sight(used, config, unit, partial(progress, f"register {unit.lidars[0]}"))
         found, upright = estimate_error(sight), upright_points(sight.road.steady_m)
         before, after = (
             None if sight.view is None else compare_visibility(sight.view, apply(correction, upright))
-            for correction in (np.eye(4), found.correction)
+            for correction in (np.eye(4), exp_of(found.values[:DELAY]))
         )
         findings = Findings(unit, found, (before, after))
         shift_m, turn_rad = np.linalg.norm(found.values[:3]), np.linalg.norm(found.values[3:DELAY])
@@ -512,6 +498,6 @@ def register_road(log: Log, config: Config, sensors: Sensors, *, progress: Progr
             # It may be an error of the ego's poses.
             findings = replace(findings, found=add_drift(sight, found))
         if findings.applied.any():
-            log = correct_unit(log, unit, findings.correction, float(findings.applied[-1]))
+            log = correct_unit(log, unit, exp_of(findings.applied[:DELAY]), float(findings.applied[DELAY]))
         units.append(findings)
     return RoadRegistration(log, tuple(units))

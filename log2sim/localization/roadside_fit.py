@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from log2sim.config import AUTO, GIVEN_PREFIX, LIDAR_PREFIX, Config
 from log2sim.datatypes import Log, Sweep
-from log2sim.geometry import NS_PER_S, Array, nearest_index, wrap_angle
+from log2sim.geometry import NS_PER_S, Array, apply, nearest_index, wrap_angle
 from log2sim.geometry.transforms import USUAL_SIGMA_M, USUAL_SIGMA_RAD
 from log2sim.localization.odometry import MIN_RANGE_M, is_during, lidars_on_ego
 from log2sim.localization.surfaces import (
@@ -57,11 +58,6 @@ class Surfaces:
     normals: Array
     reach_m: Array  # (P,): how far along itself each piece goes
     tree: cKDTree  # of `xyz_m`
-
-    @property
-    def post(self) -> NDArray[np.bool_]:
-        """Whether each piece (P,) is one of a post."""
-        return np.isfinite(self.normals[:, 1, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,12 +263,7 @@ def _nearest(off: Array) -> Array:
     place, range_m = _bins(off)
     nearest = np.full(ROWS * COLUMNS, np.inf)
     np.minimum.at(nearest, place, range_m)
-    grid = nearest.reshape(ROWS, COLUMNS)
-    wide = np.minimum(np.minimum(grid, np.roll(grid, 1, axis=1)), np.roll(grid, -1, axis=1))
-    out = wide.copy()
-    out[1:] = np.minimum(out[1:], wide[:-1])
-    out[:-1] = np.minimum(out[:-1], wide[1:])
-    return out.ravel()
+    return np.asarray(minimum_filter(nearest.reshape(ROWS, COLUMNS), 3, mode=("nearest", "wrap"))).ravel()
 
 
 SPACING_S = 0.2
@@ -382,7 +373,7 @@ def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within
 
     Point-to-plane ICP (Chen, Medioni, IVC 1992) with Cauchy weights; posts hold points in two directions.
     """
-    at = road_m @ correction[:3, :3].T + correction[:3, 3]
+    at = apply(correction, road_m)
     away, index = surfaces.tree.query(at, distance_upper_bound=np.hypot(within_m, surfaces.reach_m.max()))
     found = np.flatnonzero(np.isfinite(away))
     off = at[found] - surfaces.xyz_m[index[found]]
@@ -393,7 +384,7 @@ def match_structure(surfaces: Surfaces, road_m: Array, correction: Array, within
     if len(found) < FEW_PIECES:
         return None
     at, piece = at[found], index[found]
-    post = surfaces.post[piece]
+    post = np.isfinite(surfaces.normals[piece, 1, 0])
     normals = np.concatenate([surfaces.normals[piece, 0], surfaces.normals[piece[post], 1]])
     at, off = np.concatenate([at, at[post]]), np.concatenate([off, off[post]])
     residual = np.einsum("kj,kj->k", normals, off)
@@ -502,7 +493,7 @@ def common_ground(view: VehicleView, road_m: Array) -> CommonGround | None:
 
 def match_ground(ground: CommonGround, correction: Array, within_m: float) -> Evidence | None:
     """Compare heights of the unit's ground points, corrected by a transform (4, 4), with the vehicle's surface."""
-    at = ground.road_m @ correction[:3, :3].T + correction[:3, 3]
+    at = apply(correction, ground.road_m)
     away = ground.known.query(at[:, :2], distance_upper_bound=MAX_GAP_M)[0]
     residual = at[:, 2] - ground.surface.at(at[:, :2])
     kept = np.isfinite(away) & (np.abs(residual) < within_m)
@@ -719,7 +710,7 @@ def _best_match(
         known &= np.hypot(*(velocity - seen.velocity_mps).T) < MAX_VELOCITY_APART_MPS
         if not known.any():
             continue
-        box[:, :3] = box[:, :3] @ correction[:3, :3].T + correction[:3, 3]
+        box[:, :3] = apply(correction, box[:, :3])
         box[:, YAW] += np.arctan2(correction[1, 0], correction[0, 0])
         off, sigma = _offsets(seen.box, box, walks=seen.group == GROUPS["pedestrian"])
         away = np.hypot(*off[:, :2].T)
