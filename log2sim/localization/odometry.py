@@ -5,6 +5,7 @@ Voxelized GICP (Koide et al., ICRA 2021) as the library small_gicp implements it
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -45,7 +46,7 @@ def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T
     bins = min(-(-span // KNOT_NS), MAX_KNOTS)
     if bins == 0:
         dst_T_src, known = dst_T_src_at(np.array([first], dtype=np.int64))
-        return _moved(np.asarray(xyz_m, dtype=np.float64), dst_T_src[0]) if known.all() else None
+        return apply(dst_T_src[0], xyz_m) if known.all() else None
     knots = first + (np.arange(bins + 1) * span) // bins
     dst_T_src, known = dst_T_src_at(knots)
     if not known.all():
@@ -58,15 +59,11 @@ def move_points(xyz_m: NDArray[np.floating[Any]], t_ns: NDArray[np.int64], dst_T
     out = np.empty_like(points)
     for b in np.flatnonzero(np.diff(edges)).tolist():
         rows = slice(edges[b], edges[b + 1])
-        begin = _moved(points[rows], dst_T_src[b])
-        out[rows] = begin + fraction[rows] * (_moved(points[rows], dst_T_src[b + 1]) - begin)
+        begin = apply(dst_T_src[b], points[rows])
+        out[rows] = begin + fraction[rows] * (apply(dst_T_src[b + 1], points[rows]) - begin)
     unsorted = np.empty_like(out)
     unsorted[order] = out
     return unsorted
-
-
-def _moved(points: Array, dst_T_src: Array) -> Array:
-    return np.asarray(points @ dst_T_src[:3, :3].T + dst_T_src[:3, 3])
 
 
 # Nearer returns are of the ego's own body; farther ones are too sparse for surfaces.
@@ -276,11 +273,6 @@ def weakest_direction(information: Array, points: int) -> tuple[float, Array]:
     return float(values[0]) / points / INFORMATION_OF_POINT, vectors[:, 0]
 
 
-def motion_between(first: Array, second: Array) -> Array:
-    """Compute the pose (4, 4) of the second in the frame of the first."""
-    return np.asarray(inverse(first) @ second)
-
-
 # Room for the error of two fits.
 MAX_JUMP_M = 0.5
 # The first motion is searched forward and backward in steps within which a fit finds its way, up to these speeds.
@@ -334,7 +326,7 @@ def run_odometry(
         run.add(read_ego_sweep(log, lidar, i))
         if progress is not None:
             progress(done, len(index))
-    paths = [p for p in run.finished() if any(step.fit is not None for step in p)]
+    paths = [p for p in (*run.paths, run.path) if any(step.fit is not None for step in p)]
     if not paths:
         found = ", ".join(f"{reason}: {count}" for reason, count in run.problems.items()) or "too few sweeps"
         raise LogError(
@@ -381,28 +373,21 @@ class _Run:
     first: EgoSweep | None = None
     motion: Array = field(default_factory=lambda: np.eye(4))
     motion_s: float = 0.0
-    problems: dict[str, int] = field(default_factory=dict)
+    problems: Counter[str] = field(default_factory=Counter)
 
     def add(self, sweep: EgoSweep | None) -> None:
         """Take the next sweep; None for one that cannot be read."""
         last_ns = self.path[-1].t_ns if self.path else None if self.first is None else self.first.t_ref_ns
         if sweep is None:
-            self._count("unreadable or without a pose")
+            self.problems["unreadable or without a pose"] += 1
         elif last_ns is not None and sweep.t_ref_ns <= last_ns:
-            self._count("stamp not after the one before")
+            self.problems["stamp not after the one before"] += 1
         elif not self.path:
             self._begin(sweep)
         elif (sweep.t_ref_ns - self.path[-1].t_ns) / NS_PER_S > MAX_COASTING_S:
             self._break(sweep)
         else:
             self._follow(sweep)
-
-    def finished(self) -> list[list[_Step]]:
-        """Return all paths."""
-        return [*self.paths, self.path] if self.path else self.paths
-
-    def _count(self, reason: str) -> None:
-        self.problems[reason] = self.problems.get(reason, 0) + 1
 
     def _begin(self, sweep: EgoSweep) -> None:
         """Find the first motion of a path by trying speeds; the first sweep stays as it is until then."""
@@ -413,7 +398,7 @@ class _Run:
         dt_s = (sweep.t_ref_ns - first.t_ref_ns) / NS_PER_S
         found = None if dt_s > MAX_COASTING_S else self._first_fit(first, sweep, dt_s)
         if found is None:
-            self._count("no overlap with the sweep before")
+            self.problems["no overlap with the sweep before"] += 1
             return
         fit, held = found
         self.path = [_Step(first.t_ref_ns, np.eye(4), held=held), _Step(sweep.t_ref_ns, fit.pose, fit, held=held)]
@@ -423,17 +408,15 @@ class _Run:
         """Fit two sweeps without a motion before them, and once more with this motion taken out of both; whether it is held."""
         reach = np.arange(-MAX_REVERSE_MPS * dt_s, MAX_SPEED_MPS * dt_s + SEARCH_STEP_M, SEARCH_STEP_M)
         shifts = reach[np.argsort(np.abs(reach))]
-        best = None
         self.map = SurfaceMap()
         target, source = self.map.surfaces_of(first.xyz_m), self.map.surfaces_of(sweep.xyz_m)
         if target is None or source is None:
             return None
         self.map.insert(target, np.eye(4))
-        for shift in shifts.tolist():
-            fit = self.map.fit(source, transform(np.eye(3), np.array([shift, 0.0, 0.0])))
-            if best is None or _rate(fit) > _rate(best):
-                best = fit
-        if best is None or best.overlap < MIN_OVERLAP:
+        fits = [self.map.fit(source, transform(np.eye(3), np.array([shift, 0.0, 0.0]))) for shift in shifts.tolist()]
+        # The best has many points, near to their surfaces.
+        best = max(fits, key=lambda fit: fit.overlap / (1.0 + fit.residual))
+        if best.overlap < MIN_OVERLAP:
             return None
         self.map = SurfaceMap()
         target = self.map.surfaces_of(compensated(first, best.pose, dt_s))
@@ -455,16 +438,16 @@ class _Run:
         expected = share_of_motion(self.motion, np.array([dt_s / self.motion_s]))[0]
         fit, surfaces = self._fit(sweep, expected, dt_s)
         if fit is None:
-            self._count("too few points")
+            self.problems["too few points"] += 1
         elif fit.overlap < MIN_OVERLAP:
-            self._count("no overlap with the sweeps before")
-        elif not _is_possible(expected, motion_between(last.pose, fit.pose), dt_s):
-            self._count("a motion that no vehicle makes")
+            self.problems["no overlap with the sweeps before"] += 1
+        elif not _is_possible(expected, (motion := inverse(last.pose) @ fit.pose), dt_s):
+            self.problems["a motion that no vehicle makes"] += 1
         else:
             held = self.map.holds(surfaces, fit)
             self.map.insert(surfaces, fit.pose)
             self.path.append(_Step(sweep.t_ref_ns, fit.pose, fit, held=held))
-            self.motion, self.motion_s = motion_between(last.pose, fit.pose), dt_s
+            self.motion, self.motion_s = motion, dt_s
             return
         registered = next(step for step in reversed(self.path) if not step.predicted)
         if (sweep.t_ref_ns - registered.t_ns) / NS_PER_S > MAX_COASTING_S:
@@ -486,19 +469,14 @@ class _Run:
         if surfaces is None:
             return None, None
         fit = self.map.fit(surfaces, last @ expected)
-        found = motion_between(last, fit.pose)
-        off = motion_between(expected, found)
+        found = inverse(last) @ fit.pose
+        off = inverse(expected) @ found
         sweep_s = 0.0 if sweep.t_ns is None else float(np.ptp(sweep.t_ns)) / NS_PER_S
         moved_m, turned = np.linalg.norm(off[:3, 3]), np.linalg.norm(off[:3, :3] - np.eye(3)) / np.sqrt(2)
         if max(moved_m / REPEAT_FROM_M, turned / REPEAT_FROM_RAD) * sweep_s / dt_s < 1 or fit.overlap < MIN_OVERLAP:
             return fit, surfaces
         surfaces = self.map.surfaces_of(compensated(sweep, found, dt_s))
         return self.map.fit(surfaces, fit.pose), surfaces
-
-
-def _rate(fit: Fit) -> float:
-    """Rate a fit among those from several guesses: many points, near to their surfaces."""
-    return fit.overlap / (1.0 + fit.residual)
 
 
 def _is_possible(expected: Array, found: Array, dt_s: float) -> bool:

@@ -256,8 +256,7 @@ def find_parts(samples: Samples) -> list[Part]:
     cores = [np.arange(first, end) for first, end in runs_of(~broken)]
     if not cores:
         return []
-    parts = [Part(rows) for rows in _grown(samples, cores)]
-    return _choose(samples, _marked_at_rest(samples, parts))
+    return _choose(samples, _marked_at_rest(samples, _grown(samples, cores)))
 
 
 def find_breaks(samples: Samples) -> NDArray[np.bool_]:
@@ -278,8 +277,8 @@ def find_breaks(samples: Samples) -> NDArray[np.bool_]:
     return broken
 
 
-def _grown(samples: Samples, cores: list[NDArray[np.intp]]) -> list[NDArray[np.intp]]:
-    """Add to parts the samples beside them that continue their motion."""
+def _grown(samples: Samples, cores: list[NDArray[np.intp]]) -> list[Part]:
+    """Make parts of their cores and the samples beside them that continue their motion."""
     grown, taken = [], 0
     for k, core in enumerate(cores):
         limit = cores[k + 1][0] if k + 1 < len(cores) else len(samples.t_s)
@@ -289,7 +288,7 @@ def _grown(samples: Samples, cores: list[NDArray[np.intp]]) -> list[NDArray[np.i
             start -= 1
         while stop < limit and _continues(samples, tail, stop):
             stop += 1
-        grown.append(np.arange(start, stop))
+        grown.append(Part(np.arange(start, stop)))
         taken = stop
     return grown
 
@@ -305,15 +304,13 @@ def _continues(samples: Samples, end: _End, row: int) -> bool:
 
 def _end(samples: Samples, rows: NDArray[np.intp], *, first: bool) -> _End:
     """Fit value and rate at an end of a part: a parabola to its last samples, a line to few of them."""
-    t, t_end = samples.t_s[rows], float(samples.t_s[rows[0 if first else -1]])
-    near = np.abs(t - t_end) <= END_S
-    if near.sum() < 3 and len(rows) >= 3:
-        near = np.zeros(len(rows), dtype=bool)
-        near[: 3 if first else None] = first
-        near[None if first else -3 :] |= not first
-    used, span = rows[near], float(np.ptp(t[near]))
+    end = rows[0 if first else -1]
+    t_end, value = float(samples.t_s[end]), samples.values[end]
+    used = rows[np.abs(samples.t_s[rows] - t_end) <= END_S]
+    if len(used) < 3 <= len(rows):
+        used = rows[:3] if first else rows[-3:]
+    span = float(np.ptp(samples.t_s[used]))
     if len(used) < 2 or span < MIN_END_S:
-        value = samples.values[rows[0 if first else -1]]
         none = np.zeros_like(value)
         return _End(t_end, value, none, none, samples.sigma, 0.0, UNKNOWN_RATE)
     degree = 2 if len(used) > 2 and span >= END_S / 2 else 1

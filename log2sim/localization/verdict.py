@@ -46,6 +46,7 @@ from log2sim.localization.odometry import (
     Odometry,
     Progress,
     densest_lidar,
+    is_during,
     is_installed,
     load_small_gicp,
     move_points,
@@ -294,8 +295,7 @@ def _bridge(
     """Replace the poses of a stretch by those of odometry; None where it is not sure of them."""
     margin_ns = round(MARGIN_S * NS_PER_S)
     window = stretch.first_ns - margin_ns, stretch.last_ns + margin_ns
-    t_ns = log.streams[lidar].t_ns
-    if np.sum((t_ns >= window[0]) & (t_ns <= window[1])) < 2:
+    if is_during(log.streams[lidar].t_ns, window).sum() < 2:
         return None
     try:
         found = run_odometry(log, lidar, during_ns=window, progress=progress)
