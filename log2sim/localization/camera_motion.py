@@ -174,10 +174,9 @@ def follow_camera(
     index = np.flatnonzero(is_during(stream.t_ns, during_ns))
     follower, records = _Follower(log, log.cameras[name]), RecordSource(log)
     t_ns, poses, predicted = [], [np.eye(4)], [False]
-    last, motion, motion_s, dark, unreadable = None, np.eye(4), 1.0, 0, 0
+    last, motion, motion_s, dark = None, np.eye(4), 1.0, 0
     for done, i in enumerate(index.tolist(), 1):
         image = records.get(name, i)
-        unreadable += image is None
         if image is not None:
             gray = follower.prepare(image)
             dark += float(gray.mean()) < MIN_BRIGHTNESS

@@ -154,8 +154,7 @@ class EdgeView:
 class FrameScores:
     """How well a frame and its depth edges agree."""
 
-    # (2, D): sum of the strength of the image at edges on the left and on the right of what is near, for every yaw
-    # angle
+    # (2, D): sum of the image's strength at edges on the left and on the right of what is near, for every yaw angle
     scores: Array
     edges: NDArray[np.int64]  # (2,): numbers of edges in the image at yaw 0
     # Sum of the squared numbers of edges on one upright line, over the lines: the variance of `scores` by chance
@@ -205,9 +204,7 @@ def score_angles(camera: Camera, view: EdgeView) -> FrameScores:
     scores = np.stack([strength[:, left].sum(axis=1), strength[:, ~left].sum(axis=1)])
     line = 2 * np.floor(np.arctan2(y, x) / LINE_RAD) + left
     _, on_line = np.unique(line[shown], return_counts=True)
-    return FrameScores(
-        scores, np.array([(shown & left).sum(), (shown & ~left).sum()]), float((on_line.astype(np.float64) ** 2).sum())
-    )
+    return FrameScores(scores, np.array([(shown & left).sum(), (shown & ~left).sum()]), float((on_line**2).sum()))
 
 
 def yaw_angles() -> Array:

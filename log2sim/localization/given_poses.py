@@ -177,12 +177,12 @@ def _smoothed(t_s: Array, path: RepairedPath, measured: NDArray[np.bool_]) -> Re
     return replace(path, values=values, sigma=sigma, noise=float(np.median(sigma[measured])))
 
 
-def _sigmas(level: RepairedPath, yaw: RepairedPath) -> Array:
-    """Return the standard deviations (P, 2) of positions, m, and yaws, rad, after their repair.
+def _sigmas(position: RepairedPath | FittedPath, yaw: RepairedPath | FittedPath) -> Array:
+    """Return the standard deviations (P, 2) of positions, m, and yaws, rad, that are repaired or bridged.
 
     Errors that last do not show in the noise of poses: they are not counted.
     """
-    return np.stack([np.hypot(level.sigma, USUAL_SIGMA_M), np.hypot(yaw.sigma, USUAL_SIGMA_RAD)], axis=1)
+    return np.stack([np.hypot(position.sigma, USUAL_SIGMA_M), np.hypot(yaw.sigma, USUAL_SIGMA_RAD)], axis=1)
 
 
 def _placed(map_T_ego: Array, xyz_m: Array, turn_rad: Array) -> Array:
@@ -212,13 +212,13 @@ def _filled(
         paths = bridge_gap((at_ns - track.t_ns[0]) / NS_PER_S) if short else None
         ends, worst_m = np.array([first, last]), 0.0
         if paths is not None:
-            sigma_m, sigma_rad = np.hypot(paths[0].sigma, USUAL_SIGMA_M), np.hypot(paths[1].sigma, USUAL_SIGMA_RAD)
-            known = (sigma_m <= MAX_SIGMA_M) & (sigma_rad <= MAX_SIGMA_RAD)
+            sigmas = _sigmas(*paths)
+            known = (sigmas <= [MAX_SIGMA_M, MAX_SIGMA_RAD]).all(axis=1)
             if known.any():
                 straight = line.at(at_ns[known])[0]
                 poses = _placed(straight, paths[0].value[known], paths[1].value[known, 0] - yaw_of(straight))
-                parts.append(PoseTrack(at_ns[known], poses, sigma_m=sigma_m[known], sigma_yaw_rad=sigma_rad[known]))
-                ends, worst_m = np.concatenate([[first], at_ns[known], [last]]), float(sigma_m[known].max())
+                parts.append(PoseTrack(at_ns[known], poses, sigma_m=sigmas[known, 0], sigma_yaw_rad=sigmas[known, 1]))
+                ends, worst_m = np.concatenate([[first], at_ns[known], [last]]), float(sigmas[known, 0].max())
         between = np.diff(ends) / NS_PER_S
         unknown_s = float(between[between > MAX_LINEAR_S].sum())
         stretches.append(Stretch("gap", first, last, sigma_m=worst_m, unknown_s=unknown_s))

@@ -80,8 +80,7 @@ class EgoSweep:
 
     t_ref_ns: int  # stamp of the pose that the sweep gives, and to which it is compensated where `t_ns` is None
     xyz_m: Array  # (N, 3): points in the ego's frame; at their own times where `t_ns` is given
-    # (N,) or None: stamps at which the points were measured; None where the ego's motion is out of them or their
-    # times are not known
+    # (N,): stamps of the points; None where the ego's motion is out of them or their times are not known
     t_ns: NDArray[np.int64] | None
 
 
@@ -116,16 +115,14 @@ def _coverage(log: Log, lidar: str) -> int:
 
 
 def read_ego_sweep(log: Log, lidar: str, index: int) -> EgoSweep | None:
-    """Read a sweep into the ego's frame; None where it cannot be read or, in the map frame, where the ego's pose is not known."""
-    sweep: Sweep | None = RecordSource(log).get(lidar, index)
-    return None if sweep is None else ego_sweep_of(log, lidar, sweep)
+    """Read a sweep into the ego's frame; None where it cannot be read or, in the map frame, where the ego's pose is not known.
 
-
-def ego_sweep_of(log: Log, lidar: str, sweep: Sweep) -> EgoSweep | None:
-    """Bring a sweep into the ego's frame; points of the map frame go back by the log's own poses at their own times.
-
-    Of more than `MAX_POINTS` every second, third ... is taken.
+    Points of the map frame go back by the log's own poses at their own times. Of more than `MAX_POINTS` every second, third ...
+    is taken.
     """
+    sweep: Sweep | None = RecordSource(log).get(lidar, index)
+    if sweep is None:
+        return None
     ego_T_lidar = log.lidars[lidar].mount_T_lidar
     sweep = sweep.thinned(MAX_POINTS)
     stamp_ns, t_ns, measured = int(sweep.stamp_ns), sweep.t_ns, sweep.xyz_m

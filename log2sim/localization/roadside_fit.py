@@ -306,8 +306,6 @@ def detect_boxes(
             continue
         before = index
         sweeps = {name: sweep for name, i in index.items() if (sweep := records.get(name, i)) is not None}
-        if not sweeps:
-            continue
         cloud = assemble_cloud(log, sweeps, origin=floor, ground_z=float(floor[2]), max_range_m=MAX_REACH_M)
         if cloud is not None:
             boxes = detector.detect(cloud)
