@@ -361,6 +361,7 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
     """Draw the legend and the recommendations."""
     ax.set_axis_off()
     ax.set(xlim=(0, 1), ylim=(0, 1))
+    look: dict[str, Any] = {"family": style.FONT, "va": "top", "parse_math": False}
     mark: dict[str, Any] = {"ls": "none", "mew": 1.1}
     handles = [
         (Line2D([], [], marker="D", ms=6.5, mfc=FRONT, mec=style.PAPER, **mark), "present setting, on the front"),
@@ -381,15 +382,13 @@ def _draw_recommendations(ax: Axes, result: Benchmark) -> None:
     for panel in result.panels:
         for k, line in enumerate(wrap(style.printable_label(panel.recommendation.reason, 240), 50)):
             head = panel.stage if k == 0 else ""
-            ax.text(
-                0, y, head, fontsize=7.2, family=style.FONT, color=style.INK, weight="bold", va="top", parse_math=False
-            )
-            ax.text(0.23, y, line, fontsize=7.2, family=style.FONT, color=style.INK, va="top", parse_math=False)
+            ax.text(0, y, head, fontsize=7.2, color=style.INK, weight="bold", **look)
+            ax.text(0.23, y, line, fontsize=7.2, color=style.INK, **look)
             y -= 0.058
         y -= 0.03
     for note in result.notes:
         for line in wrap(style.printable_label(f"Note: {note}", 240), 70):
-            ax.text(0, y, line, fontsize=6.6, family=style.FONT, color=style.MUTED, va="top", parse_math=False)
+            ax.text(0, y, line, fontsize=6.6, color=style.MUTED, **look)
             y -= 0.05
 
 

@@ -171,7 +171,7 @@ def run_settings(
     observed: tuple[Observations, dict[str, float]],
     report: Progress,
 ) -> list[BenchRun]:
-    """Reconstruct and score the scenario with every setting from the result of `first_pass`.
+    """Reconstruct and score the scenario with every setting from the result of `timed_first_pass`.
 
     Settings take turns `REPEATS` times; the least time of each stage counts.
     """
@@ -304,11 +304,7 @@ def ends_settings(log: Log, config: Config) -> tuple[Setting, ...]:
 
 
 def whole_points(
-    log: Log,
-    settings: Sequence[Setting],
-    truth: Scenario | None,
-    scope: scoring.ScoreScope,
-    report: Callable[[str, int, int], None],
+    log: Log, settings: Sequence[Setting], truth: Scenario | None, scope: scoring.ScoreScope, report: Progress
 ) -> list[Point]:
     """Run every setting once, as `reconstruct` does, and score its scenario.
 

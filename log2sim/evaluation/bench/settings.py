@@ -174,7 +174,6 @@ def _detector_settings(log: Log, config: Config, detectors: Sequence[str]) -> li
     return out
 
 
-NO_ERROR = "no error of the present setting is known; objects have to be in sight for a second"
 # Relative difference of errors that counts as none: on short logs a few objects more or less change them by as much.
 ERROR_TOLERANCE = 0.05
 # Fraction of bootstrap resamples in which a setting must be no worse than the present one to be recommended.
@@ -245,7 +244,8 @@ def recommend(points: Sequence[Point], unit: str, whole_ms: float) -> Recommenda
     present = next(p for p in points if p.present)
     others = [p for p in points if p.error is not None and p is not present]
     if present.error is None:
-        return Recommendation(None, present.setting, NO_ERROR)
+        reason = "no error of the present setting is known; objects have to be in sight for a second"
+        return Recommendation(None, present.setting, reason)
     if not others:
         return Recommendation(present.setting, present.setting, f"there is nothing but {present.setting} to choose")
     # Those with less error than the present one, or about the same in clearly less time.
