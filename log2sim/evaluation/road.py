@@ -105,8 +105,7 @@ def sampled(points_m: Array) -> tuple[Array, Array, float]:
 
 
 MATCH_M = 0.3
-# Found points farther from every true line than this, about a third of a lane, belong to none and have no lateral
-# error.
+# Found points farther from every true line than this, a third of a lane, belong to none and have no lateral error.
 LATERAL_REACH_M = 1.0
 Line = Marking | RoadBorder
 Counts = Callable[[Array], NDArray[np.bool_]]  # which of places (N, 2) count
@@ -215,10 +214,8 @@ def shape_figures(found: Sequence[Marking], true: Sequence[Marking], area: Area)
         matched = same[rows, columns] > 0
         seen = np.array([mostly(area.expects, g) for g in theirs], dtype=bool)
         near = np.array([mostly(area.counts, g) for g in ours], dtype=bool)
-        right = np.zeros(len(ours), dtype=bool)
-        right[rows[matched]] = True
-        hit = np.zeros(len(theirs), dtype=bool)
-        hit[columns[matched]] = True
+        right = np.isin(np.arange(len(ours)), rows[matched])
+        hit = np.isin(np.arange(len(theirs)), columns[matched])
         out[name] = {
             "true": int(seen.sum()),
             "found": int((hit & seen).sum()),
@@ -414,7 +411,7 @@ def road_verdict(result: Mapping[str, Any]) -> list[tuple[str, str]]:
             for name, f in named
             if f["true_m"]
         ]
-        shapes = [f"{_count(figures[key])} {name}" for key, name in _SHAPES if _any(figures[key])]
+        shapes = _shape_texts(figures)
         out += [("road", "; ".join([*parts, *shapes]))] if parts or shapes else []
     colors, signals = result.get("colors"), result.get("signals")
     if colors is not None and colors["vehicles"]:
@@ -437,8 +434,8 @@ def map_lines(result: Mapping[str, Any]) -> list[str]:
             f"lane lines: {_line_text(figures['lane_lines'])}{right}",
             f"borders:    {_line_text(figures['borders'])}",
         ]
-        counted = [f"{_count(figures[key])} {name}" for key, name in _SHAPES if _any(figures[key])]
-        out += [f"markings:   {', '.join(counted)}"] if counted else []
+        shapes = _shape_texts(figures)
+        out += [f"markings:   {', '.join(shapes)}"] if shapes else []
         lanes = figures["lanes"]
         out.append(
             f"lanes:      precision {cell(lanes['precision'], 2)}, recall {cell(lanes['recall'], 2)}, center off by "
@@ -459,16 +456,15 @@ def map_lines(result: Mapping[str, Any]) -> list[str]:
     return ["", *lines] if lines else []
 
 
-_SHAPES = (("stop_lines", "stop lines"), ("crosswalks", "crosswalks"), ("others", "other markings"))
-
-
-def _any(counts: Mapping[str, int]) -> bool:
-    return bool(counts["true"] or counts["false"])
-
-
-def _count(counts: Mapping[str, int]) -> str:
-    false = f" (+{counts['false']} false)" if counts["false"] else ""
-    return f"{counts['found']} of {counts['true']}{false}"
+def _shape_texts(figures: Mapping[str, Any]) -> list[str]:
+    """Say of each kind of marking with a shape, where there are any, how many are found."""
+    out = []
+    for key, name in (("stop_lines", "stop lines"), ("crosswalks", "crosswalks"), ("others", "other markings")):
+        counts = figures[key]
+        false = f" (+{counts['false']} false)" if counts["false"] else ""
+        if counts["true"] or counts["false"]:
+            out.append(f"{counts['found']} of {counts['true']}{false} {name}")
+    return out
 
 
 def _line_text(figures: Mapping[str, Any]) -> str:

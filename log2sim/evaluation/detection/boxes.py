@@ -29,8 +29,7 @@ class SceneBoxes(Columns):
     score: Array  # (M,) of found boxes; 1 for true ones
     points: NDArray[np.int64] | None  # (M,) number of LiDAR points in each box; None when it was not counted
     range_m: Array  # (M,) horizontal distance from the sensor
-    # (M,) boxes that are neither right nor wrong: true ones that nobody has to find, found ones that truth cannot
-    # judge.
+    # (M,) neither right nor wrong: true boxes that nobody has to find, found ones that truth cannot judge
     ignored: NDArray[np.bool_]
 
     def __post_init__(self) -> None:

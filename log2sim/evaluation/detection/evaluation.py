@@ -222,13 +222,13 @@ def class_figures(boxes: BothBoxes, of_class: ObjectClass, min_score: float) -> 
         beyond, elsewhere = ((b.range_m < low) | (b.range_m >= high) for b in (truth, found))
         name = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g}+ m"
         by_range.append(figures(name, found, enough.ignoring(beyond), far | elsewhere, main))
-    for low, high in POINTS if truth.points is not None else ():
-        assert truth.points is not None
-        outside = (truth.points < low) | (truth.points > high)
-        own = found.points
-        elsewhere = np.zeros(len(found), dtype=bool) if own is None else (own < low) | (own > high)
-        name = f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points"
-        by_points.append(figures(name, found, truth.ignoring(outside), far | elsewhere, main))
+    if truth.points is not None:
+        for low, high in POINTS:
+            outside = (truth.points < low) | (truth.points > high)
+            own = found.points
+            elsewhere = np.zeros(len(found), dtype=bool) if own is None else (own < low) | (own > high)
+            name = f"{low}-{high} points" if np.isfinite(high) else f"{low}+ points"
+            by_points.append(figures(name, found, truth.ignoring(outside), far | elsewhere, main))
     matches = assign_boxes(found, enough, pairs[main], main).excusing(far).excusing(unlabeled)
     return {
         "categories": list(of_class.categories),
@@ -396,7 +396,7 @@ def evaluate_boxes(
     camera = None
     if protocol.of_camera:  # the difficulties are those in a camera whose objects are labeled
         labeled = log.labels.cameras if log.labels is not None else None
-        names = [*(labeled or ()), *([log.reference_camera] if log.reference_camera else []), *log.cameras]
+        names = [*(labeled or ()), log.reference_camera, *log.cameras]
         camera = next((name for name in names if name in log.cameras), None)
         if camera is None:
             raise ConfigError(

@@ -22,8 +22,7 @@ MAX_PAIRS_AT_ONCE = 2_000_000  # limits memory to some 100 MB
 class Criterion:
     """When a found and a true box match."""
 
-    # {"iou_3d", "iou_bev", "center_m"}, ioU of the boxes, IoU of their outlines on the ground, or horizontal distance
-    # of their centers.
+    # IoU of the boxes, IoU of their outlines on the ground, or horizontal distance of their centers.
     measure: Measure
     limit: float  # IoU above which, or distance in m below which, boxes match
 
@@ -49,7 +48,7 @@ class BoxPairs:
     # found, truth: (P,) rows of both tables.
     found: NDArray[np.int64]
     truth: NDArray[np.int64]
-    value: Array  # (P,) ioU or distance
+    value: Array  # (P,) IoU or distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ class Matches:
     """The true box of each found one."""
 
     truth: NDArray[np.int64]  # (M,) row of the true box; -1 without
-    value: Array  # (M,) ioU or distance of the match, NaN without
+    value: Array  # (M,) IoU or distance of the match, NaN without
     right: NDArray[np.bool_]  # (M,) found boxes that match a counted true box
     false: NDArray[np.bool_]  # (M,) found boxes that match nothing; ignored ones are neither right nor false
     truths: int  # number of counted true boxes
@@ -76,7 +75,7 @@ def match_detections(found: SceneBoxes, truth: SceneBoxes, criterion: Criterion)
 
 
 def assign_boxes(found: SceneBoxes, truth: SceneBoxes, pairs: BoxPairs, criterion: Criterion) -> Matches:
-    """Choose among candidate pairs, which do not depend on what is ignored; see `match`.
+    """Choose among candidate pairs, which do not depend on what is ignored; see `match_detections`.
 
     A found box takes the best true box that is free, a counted one before an ignored one. Ignored found boxes come last. So
     the matches of the boxes above a score do not depend on those below. This is the order of PASCAL VOC and nuScenes; KITTI
@@ -137,8 +136,7 @@ def _pairs_in_scenes(
         yield np.repeat(rows, n).astype(np.int64), order[np.repeat(begin[rows], n) + within].astype(np.int64)
 
 
-# True boxes with fewer points are ignored, outside KITTI's difficulties: they show no extent (Waymo's level 1 asks
-# for more than 5).
+# True boxes with fewer points are ignored outside KITTI's difficulties: they show no extent (Waymo's level 1: over 5).
 MIN_POINTS = 5
 
 

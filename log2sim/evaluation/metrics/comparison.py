@@ -327,8 +327,7 @@ class Comparison:
     pairs: AgentPairs
     match: Index  # (A, T) index of the reconstructed agent, -1 for none
     counted: Mask  # (A, T) ticks at which a truth agent counts
-    # (A, T) where it is labeled: 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not
-    # labeled.
+    # (A, T) 0 where it counts, else 1 + the place of the reason in `REASONS`; -1 where it is not labeled
     why_not: Index
     switched: Mask  # (A, T) identity switches
     selected: Mask  # (B, T) ticks at which a reconstructed agent is present, within range and of a selected category

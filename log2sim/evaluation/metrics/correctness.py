@@ -100,9 +100,8 @@ def correctness(c: Comparison, agents: Sequence[Agent], ticks_s: Array, ego: Sta
             if (sigma := getattr(agent.waypoints, name)) is not None:
                 out[k] = np.interp(ticks_s, agent.waypoints.t_s, sigma)
 
-    def share(
-        ticks: Mask, mask: Mask
-    ) -> dict[str, Any]:  # of one measure: of the ticks, and the agents that are wrong by it
+    def share(ticks: Mask, mask: Mask) -> dict[str, Any]:
+        # Of one measure: of the ticks, and the agents that are wrong by it.
         hit = int((ticks & mask).sum())
         return {"share": _mean(mask[ticks]), "ticks": hit, "agents": int(_wrong_agents(ticks, mask).sum())}
 

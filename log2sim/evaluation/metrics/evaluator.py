@@ -57,12 +57,11 @@ def hota(
     union = truth_count[:, None] + other_count[None] - potential
     alignment = np.divide(potential, union, out=np.zeros_like(potential), where=union > 0)
     score = alignment[pairs.truth, pairs.other] * pairs.similarity
-    parts = pairwise(pairs.bounds(ticks))
-    matched = pairs.take(
-        np.concatenate(
-            [a + geometry.choose_pairs(pairs.truth[a:b], pairs.other[a:b], -score[a:b], 0.0) for a, b in parts]
-        )
-    )
+    chosen = [
+        a + geometry.choose_pairs(pairs.truth[a:b], pairs.other[a:b], -score[a:b], 0.0)
+        for a, b in pairwise(pairs.bounds(ticks))
+    ]
+    matched = pairs.take(np.concatenate(chosen))
     det_a, ass_a = np.zeros(len(ALPHAS)), np.zeros(len(ALPHAS))
     total = int(truth_count.sum() + other_count.sum())
     for k, alpha in enumerate(ALPHAS):
@@ -164,9 +163,8 @@ def place_truth(truth: Scenario, scenario: Scenario) -> tuple[Scenario, dict[str
         def reproject(states: geometry.Array, _t_s: geometry.Array) -> geometry.Array:
             return np.asarray(target.forward(states) + np.array([0, 0, rise_m, 0]))
 
-        def around_ego(
-            states: geometry.Array, t_s: geometry.Array
-        ) -> geometry.Array:  # what is around the ego is kept as it is, and the ego moved
+        def around_ego(states: geometry.Array, t_s: geometry.Array) -> geometry.Array:
+            # What is around the ego is kept as it is, and the ego moved.
             assert truth.ego is not None
             s = truth.ego.at(np.clip(t_s, truth.ego.waypoints.t_s[0], truth.ego.waypoints.t_s[-1]))
             before = np.stack([s.x_m, s.y_m, s.z_m, s.yaw_rad], axis=1)
@@ -333,11 +331,11 @@ def evaluate(
         if name in names
     }
     # The agent that each truth agent is matched with most often, by its id.
-    by_id, partners = {agent.id: agent for agent in scenario.others}, {}
+    partners = {}
     for row, agent in enumerate(compared.truth.agents):
         hits = compared.match[row][compared.counted[row] & (compared.match[row] >= 0)]
         if len(hits):
-            partners[agent.id] = by_id[compared.other.agents[int(np.bincount(hits).argmax())].id]
+            partners[agent.id] = compared.other.agents[int(np.bincount(hits).argmax())]
     of_ego, shift_m = None, truth.shift_to(scenario)
     if truth.ego is not None and scenario.ego is not None:
         true = comparison.truth_states((truth.ego,), truth_ticks_s, shift_m, None)

@@ -46,13 +46,11 @@ def image_shares(camera: Camera, cam_T_map: Array, center_m: Array, size_m: Arra
     straight for any lens. The share is that of a grid of samples, accurate to 1 or 2 %: exact clipping would need the
     image border on that plane, which does not exist for every strong distortion.
     """
-    corners = box_corners(center_m, size_m, yaw_rad)
-    in_cam = apply(cam_T_map, corners.reshape(-1, 3))
-    _, in_image = project(camera, in_cam)
-    corner_inside = in_image.reshape(-1, 8)
+    in_cam = apply(cam_T_map, box_corners(center_m, size_m, yaw_rad).reshape(-1, 3))
+    whole = project(camera, in_cam)[1].reshape(-1, 8).all(axis=1)
     in_cam = in_cam.reshape(-1, 8, 3)
-    shares = np.where(corner_inside.all(1), 1.0, 0.0)
-    for k in np.flatnonzero(~corner_inside.all(1) & (in_cam[..., 2] > MIN_DEPTH_M).any(1)):
+    shares = np.where(whole, 1.0, 0.0)
+    for k in np.flatnonzero(~whole & (in_cam[..., 2] > MIN_DEPTH_M).any(axis=1)):
         samples = _samples(outline(in_cam[k]))
         if len(samples):
             _, inside = project(camera, np.column_stack([samples, np.ones(len(samples))]))
@@ -233,7 +231,7 @@ def truth_from_log(
     else:
         visible = np.ones(len(labels.t_ns), dtype=bool) if counts is None else counts >= MIN_POINTS
         if used:
-            # Mark (L,) those of the boxes `candidates` (L,) that are at least half inside some camera's image
+            # Mark (L,) the boxes that are at least half inside some camera's image
             found = np.zeros(len(labels.t_ns), dtype=bool)
             for name in used:
                 stream = log.streams.get(name)

@@ -106,10 +106,9 @@ class Verdicts:
     judged: Mask  # (B, T) where the labels are complete or the agent matches one; no other mask is true elsewhere
     undecided: Mask  # (B, T) the other selected ticks
     matched: Index  # (B, T) index of the matched truth agent at judged ticks, -1 for none
-    # (B, T) index of the truth agent that is there: the matched one, else the nearest of the same kind within its
-    # gate, else the nearest of another kind within its gate; -1 for none.
+    # (B, T) index of the matched truth agent, else the nearest within the gate, those of the same kind first; -1 for none
     taken_for: Index
-    measures: Mapping[str, Mask]  # T) bool, by the names in `REPORTED`
+    measures: Mapping[str, Mask]  # (B, T) by the names in `REPORTED`
     error_m: Array  # (B, T, 2) position error of matched agents; NaN elsewhere
     error_rad: Array  # (B, T) error of their heading up to half turns; NaN elsewhere and where heading does not count
     error_mps: Array  # (B, T) error of their speed; NaN elsewhere
@@ -161,7 +160,6 @@ def judge_against_truth(c: Comparison, ego: StateTable | None) -> Verdicts:
     }
     for name, wrong in states.items():
         measures[name] = _marked(judged.shape, errors.other[wrong], errors.tick[wrong])
-    # (B, T) the matched truth agent, else the nearest within the gate, those of the same kind first; -1 for none.
     p = c.pairs
     place = p.other * matched.shape[1] + p.tick
     order = np.lexsort((p.distance_m, ~p.same_group, place))
