@@ -43,8 +43,7 @@ class RoundedPath:
 
         chord = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
         at = np.concatenate([[0.0], np.cumsum(chord)])
-        margin = rounding_m
-        s = np.arange(-margin - 1.0, at[-1] + margin + 1.0, STEP_M)
+        s = np.arange(-rounding_m - 1.0, at[-1] + rounding_m + 1.0, STEP_M)
         first, last = ((waypoints[k + 1] - waypoints[k]) / (at[k + 1] - at[k]) for k in (0, len(at) - 2))
         line = np.stack([np.interp(s, at, column) for column in waypoints.T], 1)
         line = line + first * np.minimum(s - at[0], 0)[:, None] + last * np.maximum(s - at[-1], 0)[:, None]
@@ -178,7 +177,7 @@ class Actor:
 
     spec: AgentSpec
     path: TimedPath | None  # None for a parked one
-    parked: tuple[float, float, float] | None = None  # x, y in m and heading in rad of a parked one
+    parked: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y in m and heading in rad of a parked one
     offset_m: float = 0.0  # distance from the guided point forward to the box center
     seed: int = 0  # of its steps and of the folds of its clothes
 
@@ -188,7 +187,7 @@ class Actor:
         if self.path is not None:
             xy, yaw, speed, distance = self.path.at(t)
         else:
-            x, y, heading = self.parked or (0.0, 0.0, 0.0)
+            x, y, heading = self.parked
             xy, yaw = np.tile([x, y], (len(t), 1)), np.full(len(t), heading)
             speed, distance = np.zeros(len(t)), np.zeros(len(t))
         xy = xy + self.offset_m * np.stack([np.cos(yaw), np.sin(yaw)], 1)

@@ -134,9 +134,7 @@ class RoadLine:
     width_m: float
     color: PaintColor
     dashes: tuple[Array, ...]  # tuple of (Q, 2) float64, m: what is painted of it
-    boundary: (
-        int  # of lanes that it marks: 0 at the right of the road as its line runs, its number of lanes at the left
-    )
+    boundary: int  # of lanes, 0 at the right of the road as its line runs, its number of lanes at the left
 
     @property
     def strokes(self) -> list[Stroke]:

@@ -20,7 +20,7 @@ from log2sim.geometry import Array
 from log2sim.synth.ground import GROUND_M_PER_PX, TILE_PX, Ground, Surface
 from log2sim.synth.returns import BEAM_RAD
 from log2sim.synth.scene import AgentSpec
-from log2sim.synth.shapes import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line
+from log2sim.synth.shapes import BELT, WHEEL_AT, WHEEL_RADIUS_M, Material, roof_line, truck_axles
 
 Index = NDArray[np.int64]
 
@@ -132,8 +132,8 @@ def _wheel(patch: Patch) -> None:
     length = spec.box_m[0]
     big = spec.category in ("truck", "bus")
     radius = 0.48 if big else WHEEL_RADIUS_M
-    axles = np.array([WHEEL_AT, -WHEEL_AT]) * length if not big else truck_axles(spec)
-    d = p[:, 0][:, None] - axles
+    axles = truck_axles(spec.category, length) if big else (WHEEL_AT * length, -WHEEL_AT * length)
+    d = p[:, 0][:, None] - np.array(axles)
     dx = np.take_along_axis(d, np.abs(d).argmin(1)[:, None], 1)[:, 0]
     dz = z - radius
     r, angle = np.hypot(dx, dz) / radius, np.arctan2(dz, dx)
@@ -147,15 +147,6 @@ def _wheel(patch: Patch) -> None:
         return
     patch.set(rim & (r < 0.63) & (r > 0.2) & (np.cos(5 * angle) < 0.15), (0.03, 0.03, 0.03))
     patch.set(face & (r < 0.09), (0.1, 0.1, 0.1))
-
-
-def truck_axles(spec: AgentSpec) -> Array:
-    """Axle positions (K,) in m along a truck or bus, as its shape has them."""
-    length = spec.box_m[0]
-    if spec.category == "bus":
-        return np.array([-0.26, 0.27]) * length
-    front, rear = length / 2, -length / 2
-    return np.array([front - 0.95, rear + 1.1] if length < 8 else [front - 0.95, rear + 2.4, rear + 1.2])
 
 
 def _cab(patch: Patch) -> None:
@@ -212,7 +203,7 @@ def _bus(patch: Patch) -> None:
     patch.set(front & (np.abs(y) > 0.32 * width) & (z > 0.7) & (z < 0.95), (0.8, 0.8, 0.8), 0.2, 0.3)
     patch.set(rear & (np.abs(y) > 0.38 * width) & (z > 0.7) & (z < 1.2), (0.02, 0.02, 0.5), 0.1, 0.25)
     patch.set((front | rear) & (np.abs(y) < 0.26) & (z > 0.5) & (z < 0.62), (0.75, 0.75, 0.75))
-    fender = np.min(np.hypot(x[:, None] - truck_axles(spec), z[:, None] - 0.48), 1)
+    fender = np.min(np.hypot(x[:, None] - np.array(truck_axles("bus", length)), z[:, None] - 0.48), 1)
     patch.set(side & (fender < 0.57), (0.01, 0.01, 0.01))
 
 

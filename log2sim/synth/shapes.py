@@ -168,7 +168,7 @@ class Material(IntEnum):
 
     CAR_BODY, WHEEL, CAB, CARGO, CHASSIS, BUS_BODY = range(6)
     SKIN, SHIRT, TROUSERS, SHOE, HAIR = range(6, 11)
-    FRAME, TIRE, MIRROR, BARK, LEAVES = range(11, 16)
+    FRAME, TIRE, MIRROR = range(11, 14)
 
 
 # Side view of a sedan and a hatchback: position along the length and height of the top as fractions, rear to front.
@@ -226,6 +226,14 @@ def _mirrored(x: float, side: list[tuple[float, float]]) -> list[tuple[float, fl
     return [(x, y, z) for y, z in side + [(-y, z) for y, z in side[-2:0:-1]]]
 
 
+def truck_axles(category: str, length_m: float) -> tuple[float, ...]:
+    """Axle positions in m along a truck or bus."""
+    if category == "bus":
+        return -0.26 * length_m, 0.27 * length_m
+    front, rear = length_m / 2, -length_m / 2
+    return (front - 0.95, rear + 1.1) if length_m < 8 else (front - 0.95, rear + 2.4, rear + 1.2)
+
+
 @lru_cache(maxsize=32)
 def truck(size_m: tuple[float, float, float]) -> Mesh:
     """Shape a box truck: cab in front, cargo box behind, three axles."""
@@ -239,10 +247,8 @@ def truck(size_m: tuple[float, float, float]) -> Mesh:
         block([rear + 0.1, -0.3 * width, 0.5], [front - 0.4, 0.3 * width, 0.36 * height + 0.02], Material.CHASSIS),
     ]
     radius = 0.48
-    axles = (front - 0.95, rear + 1.1) if length < 8 else (front - 0.95, rear + 2.4, rear + 1.2)
-    parts += [
-        disc_wheel([x, side * (half - 0.17), radius], radius, 0.3, Material.WHEEL) for x in axles for side in (-1, 1)
-    ]
+    hubs = [[x, side * (half - 0.17), radius] for x in truck_axles("truck", length) for side in (-1, 1)]
+    parts += [disc_wheel(hub, radius, 0.3, Material.WHEEL) for hub in hubs]
     return merged(parts).fitted(size_m)
 
 
@@ -272,7 +278,7 @@ def bus(size_m: tuple[float, float, float]) -> Mesh:
         side = [(0.0, 0.28), (0.97 * h, 0.28), (h, 0.4), (h, ti - 0.3), (0.97 * h, ti - 0.1), (0.88 * h, ti), (0.0, ti)]
         rings.append(_mirrored(xi, side))
     radius = 0.48
-    hubs = [[s * length, side * (half - 0.165), radius] for s in (-0.26, 0.27) for side in (-1, 1)]
+    hubs = [[x, side * (half - 0.165), radius] for x in truck_axles("bus", length) for side in (-1, 1)]
     wheels = [disc_wheel(hub, radius, 0.3, Material.WHEEL) for hub in hubs]
     return merged([loft(np.array(rings), Material.BUS_BODY), *wheels]).fitted(size_m)
 

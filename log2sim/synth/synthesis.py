@@ -162,10 +162,8 @@ def map_features_of(scene: Scene) -> MapFeatures:
         crossed = area_of([ground.Stroke(np.array(r.line), r.width_m) for n, r in enumerate(plan.roads) if n != k])
         sides: list[list[RoadBorder]] = []  # the ends of the road at its right and its left, as its line runs
         for name, side in (("right", -1), ("left", 1)):
-            edge, kind = (
-                ground.parallel(np.array(road.line), side * road.width_m / 2),
-                "curb" if road.sidewalk_m > 0 else "edge",
-            )
+            edge = ground.parallel(np.array(road.line), side * road.width_m / 2)
+            kind = "curb" if road.sidewalk_m > 0 else "edge"
             left = _along(LineString(edge), LineString(edge).difference(crossed))
             free = [_on_ground(ground.stretch(edge, *interval)) for interval in left]
             sides.append([RoadBorder(f"border_{k}_{name}_{n}", kind, points) for n, points in enumerate(free)])
@@ -247,12 +245,10 @@ def _lanes(
         if own:
             a, b = np.array(road.line[:2])
             ahead = (b - a) / np.linalg.norm(b - a)
-            offsets = [
-                float((line.line[0] - a) @ [-ahead[1], ahead[0]]) for line, _ in own
-            ]  # to the left of the road's line
-            at[boundary] = np.mean(offsets)
+            left_m = [float((line.line[0] - a) @ [-ahead[1], ahead[0]]) for line, _ in own]
+            at[boundary] = np.mean(left_m)
             # Of a double line each lane has the one that is nearer.
-            sides.append((own[int(np.argmin(offsets))][1], own[int(np.argmax(offsets))][1]))
+            sides.append((own[int(np.argmin(left_m))][1], own[int(np.argmax(left_m))][1]))
         else:
             border = borders[0] if boundary == 0 else borders[1] if boundary == road.lanes else []
             sides.append((border, border))

@@ -150,17 +150,16 @@ class _Layout:
             _, radius, draw = clutter.SMALL[kind]
             self.add_thing(kind, xy, yaw, draw(self.rng), spacing * radius)
 
-    def add_thing(self, kind: str, xy: Array, yaw: float, parts: tuple[Polytope, ...], radius: float = 0.0) -> bool:
+    def add_thing(self, kind: str, xy: Array, yaw: float, parts: tuple[Polytope, ...], radius: float = 0.0) -> None:
         """Add clutter; with a radius only where its place is free."""
-        circle = np.array([[*xy, radius]])
-        if radius and not self.is_free(circle):
-            return False
         if radius:
+            circle = np.array([[*xy, radius]])
+            if not self.is_free(circle):
+                return
             self.take(circle)
         low, high = np.min([p.low for p in parts], axis=0), np.max([p.high for p in parts], axis=0)
         size = (float(high[0] - low[0]), float(high[1] - low[1]), float(high[2]))
         self.objects.append(TrafficObject("", np.append(xy, self.surface.elevation(xy)), yaw, size, parts, kind=kind))
-        return True
 
 
 def _covering(xy: Array, yaw: float, size: tuple[float, float, float]) -> Array:
@@ -179,7 +178,7 @@ def draw_layout(
     surface: Surface,
     rng: np.random.Generator,
     forward: float,
-    without: frozenset[str] = frozenset(),
+    without: frozenset[str],
 ) -> list[TrafficObject]:
     """Draw the objects of a scene, without some kinds; a sensor's car heads `forward`."""
     out = _Layout(surface, roads, rng, without)
@@ -267,7 +266,7 @@ def _parked(out: _Layout, road: Road) -> None:
                 xy, direction = road.at(s, side * d)
                 yaw = direction + side * angle + (np.pi if rng.random() < 0.5 else 0.0) + rng.normal(0, 0.03)
                 out.add_user(category, xy, yaw, margin=0.1)
-            s += (rng.uniform(5.6, 7) if angle == 0 else rng.uniform(2.6, 3.4)) / max(0.7, np.cos(0.0))
+            s += rng.uniform(5.6, 7) if angle == 0 else rng.uniform(2.6, 3.4)
 
 
 def _car_park(out: _Layout, road: Road) -> None:
@@ -406,15 +405,10 @@ def _fronts(out: _Layout, road: Road) -> None:
                     if kind == "person":
                         out.add_user("pedestrian", place, rng.uniform(-np.pi, np.pi), margin=0.0)
                     elif kind in ("bicycle", "motorcycle"):
-                        lean = (
-                            yaw
-                            + np.pi * rng.integers(2)
-                            + rng.normal(0, 0.3)
-                            + (np.pi / 2 if rng.random() < 0.3 else 0.0)
-                        )
-                        out.add_user(
-                            kind, place, lean, margin=-0.2, kinds="parked motorcycle" if kind == "motorcycle" else ""
-                        )
+                        lean = yaw + np.pi * rng.integers(2) + rng.normal(0, 0.3)
+                        lean += np.pi / 2 if rng.random() < 0.3 else 0.0
+                        kinds = "parked motorcycle" if kind == "motorcycle" else ""
+                        out.add_user(kind, place, lean, margin=-0.2, kinds=kinds)
                     else:
                         out.add_small(kind, place, yaw, 0.5)
             s += length + (rng.uniform(1, 9) if rng.random() < 0.4 else 0.0)
@@ -615,9 +609,8 @@ def sensor_named(name: str | None, mount: Mount) -> LidarModel | None:
 
 def draw_environment(rng: np.random.Generator, light: str | None, weather: str | None) -> Environment:
     """Draw light and weather; what is given stays, and does not change what else is drawn."""
-    lights, weathers = list(LIGHT_SHARES), list(WEATHER_SHARES)
-    drawn_light = str(rng.choice(lights, p=list(LIGHT_SHARES.values())))
-    drawn_weather = str(rng.choice(weathers, p=list(WEATHER_SHARES.values())))
+    drawn_light = str(rng.choice(list(LIGHT_SHARES), p=list(LIGHT_SHARES.values())))
+    drawn_weather = str(rng.choice(list(WEATHER_SHARES), p=list(WEATHER_SHARES.values())))
     visibility, rain = rng.uniform(*VISIBILITY_M), rng.uniform(*RAIN_MM_H)
     drawn = {"light": light or drawn_light, "weather": weather or drawn_weather}
     amounts = {"visibility_m": round(float(visibility), 1), "rain_mm_h": round(float(rain), 1)}

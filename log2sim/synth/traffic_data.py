@@ -114,7 +114,6 @@ ACCELERATION_MPS2, DECELERATION_MPS2, HEADWAY_S, STANDSTILL_M = 1.5, 2.5, 1.2, 1
 MAX_BRAKING_MPS2 = 9.0
 SIDE_MARGIN_M = 0.25
 MAX_ROAD_ANGLE_RAD = 0.2  # between the sensor's car and a road that it follows
-CAR_SIZE_M = (4.4, 1.8, 1.5)
 CAR_AHEAD_M = 0.3  # of the car's middle before its LiDAR
 
 
@@ -161,7 +160,7 @@ def run_of(scene: traffic.TrafficScene, duration_s: float) -> TrafficRun:
         along = np.cos(yaw - scene.roads[0].yaw_rad)
         follows = abs(along) > np.cos(MAX_ROAD_ANGLE_RAD)
         turn = pace * scene.roads[0].curvature_per_m * float(np.sign(along)) if follows else 0.0
-        ego = traffic.TrafficObject("car", middle, yaw, CAR_SIZE_M, (), pace, turn)
+        ego = traffic.TrafficObject("car", middle, yaw, traffic.OWN_CAR_M, (), pace, turn)
     movers = [*scene.objects, *([] if ego is None else [ego])]
     count = int(np.ceil(duration_s / STEP_S)) + 2
     distance = np.zeros((count, len(movers)))
@@ -265,7 +264,7 @@ def log_of(
             LIDAR: Stream(LIDAR, stamps_of(t_sweep + period / 2), sweep),
         },
         ego=poses_of(run, mount_T_lidar, t_pose) if mount == "ego" else None,
-        ego_vehicle=EgoVehicle(CAR_SIZE_M, REAR_AXLE_OFFSET_M),
+        ego_vehicle=EgoVehicle(traffic.OWN_CAR_M, REAR_AXLE_OFFSET_M),
         labels=film.labels(t_image),
         image_labels={CAMERA: film.image_labels(t_image)} if image_labels else {},
         reference_camera=CAMERA,

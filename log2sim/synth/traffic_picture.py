@@ -53,9 +53,7 @@ PEOPLE = ("pedestrian", "cyclist", "motorcycle")
 class Look:
     """Appearance of an object, by part."""
 
-    category: str
-    kind: str
-    size_m: tuple[float, float, float]
+    item: TrafficObject
     material: NDArray[np.int64]  # (K,)
     color: NDArray[np.float32]  # (K, 3)
     gloss: NDArray[np.float32]  # (K,)
@@ -83,16 +81,16 @@ def draw_look(item: TrafficObject, rng: np.random.Generator) -> Look:
     gloss = np.array([GLOSS.get(Material(m), 0.0) for m in material], np.float32)
     skin, hair = SKINS[rng.integers(len(SKINS))], HAIRS[rng.integers(len(HAIRS))]
     person = (linear_bgr(rgb) for rgb in (trousers, skin, hair))
-    return Look(item.category, item.kind, item.size_m, material, color, gloss, *person)
+    return Look(item, material, color, gloss, *person)
 
 
 def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values) -> Paint:
     out = Paint(look.color[part], look.gloss[part], np.zeros((len(part), 3), np.float32))
-    z = points[:, 2] + np.float32(look.size_m[2] / 2)
+    category, (length, width, height) = look.item.category, look.item.size_m
+    z = points[:, 2] + np.float32(height / 2)
     material = look.material[part]
-    if look.category in VEHICLES:
+    if category in VEHICLES:
         # Paint lamps, plates and the sills of windows
-        length, width, height = look.size_m
         low = min(1.1, 0.62 * height)
         x, y = points[:, 0], np.abs(points[:, 1])
         end = material == Material.PAINT
@@ -104,16 +102,16 @@ def _paint(look: Look, part: NDArray[np.int64], points: Values, normals: Values)
         ):
             out.albedo[mask] = color
             out.glow[mask] = glow * np.asarray(color, np.float32)
-    elif look.category in PEOPLE:
+    elif category in PEOPLE:
         # Paint trousers, hands' height, face and hair by their heights
         cloth = material == Material.CLOTH
-        share = z / np.float32(look.size_m[2])
+        share = z / np.float32(height)
         out.albedo[cloth & (share < 0.5)] = look.trousers
         head = cloth & (share > 0.855)
         out.albedo[head] = look.hair
         out.albedo[head & (normals[:, 0] > 0.2) & (share < 0.965)] = look.skin
-        out.albedo[cloth & (share < 0.045) & (look.category == "pedestrian")] = (0.03, 0.03, 0.03)
-    elif look.kind == "building":
+        out.albedo[cloth & (share < 0.045) & (category == "pedestrian")] = (0.03, 0.03, 0.03)
+    elif look.item.kind == "building":
         _front(out, material, points, z, normals)
     leaves = material == Material.LEAVES
     if leaves.any():

@@ -43,15 +43,14 @@ _CARS = {
     "pickup": _Body((5.6, 0.25), (1.95, 0.06), (1.85, 0.07), (0.38, 0.5), 0.05, 0.15, 0.15),
 }
 _CAR_SHARES = {
-    "small": 0.11, "hatch": 0.2, "sedan": 0.22, "wagon": 0.1, "suv": 0.17, "large suv": 0.08, "van": 0.05, "pickup": 0.07,
+    "small": 0.11, "hatch": 0.2, "sedan": 0.22, "wagon": 0.1, "suv": 0.17, "large suv": 0.08, "van": 0.05, "pickup": 0.07, "delivery": 0.14,
 }  # fmt: skip
 
 
 def car(rng: Rng) -> Shape:
     """Draw a car: a body, a cabin of glass under a solid roof, seats, wheels; one in eight is a delivery van."""
-    kinds = [*_CAR_SHARES, "delivery"]
-    shares = np.array([*_CAR_SHARES.values(), 0.14])
-    kind = kinds[rng.choice(len(kinds), p=shares / shares.sum())]
+    shares = np.array(list(_CAR_SHARES.values()))
+    kind = list(_CAR_SHARES)[rng.choice(len(shares), p=shares / shares.sum())]
     return _delivery_van(rng) if kind == "delivery" else _car(kind, rng)
 
 
@@ -60,7 +59,7 @@ def _car(kind: str, rng: Rng) -> Shape:
     length, width, height = (rng.normal(*body.length), rng.normal(*body.width), rng.normal(*body.height))
     half, sill = length / 2, rng.uniform(0.15, 0.3)
     belt = height * rng.uniform(0.56, 0.64)
-    hood = belt - rng.uniform(0.02, 0.15) * (1 if kind not in ("van",) else 0.3)
+    hood = belt - rng.uniform(0.02, 0.15) * (0.3 if kind == "van" else 1)
     nose = rng.uniform(0.12, 0.35)
     lower = prism(
         [
