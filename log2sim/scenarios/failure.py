@@ -12,7 +12,7 @@ import numpy as np
 
 from log2sim.datatypes import EGO, GROUP_OF, Scenario
 from log2sim.errors import ConfigError
-from log2sim.geometry import Array
+from log2sim.geometry import Array, runs_of
 from log2sim.scenarios.hits import page
 from log2sim.scenarios.logical import Base, Logical
 from log2sim.simulation.driver_paths import LIGHT_M, stop_stations
@@ -124,11 +124,9 @@ def red_light_s(ego: AgentReplay, scenario: Scenario) -> float:
         if not station <= way[-1]:  # NaN, too
             continue
         t_s = ego.t_s[int(np.argmax(way >= station))]
-        red = np.isin(signal.state, ("red", "red_yellow"))
-        begins = signal.t_s[red & ~np.concatenate([[False], red[:-1]])]
-        ends = np.append(signal.t_s[~red & np.concatenate([[False], red[:-1]])], np.inf)[: len(begins)]
-        lasts = t_s - begins[ends > t_s]  # of the red that is, or else of the next
-        longest = max(longest, float(lasts.max(initial=-np.inf)))
+        for begin, end in runs_of(np.isin(signal.state, ("red", "red_yellow"))):
+            if end == len(signal.t_s) or signal.t_s[end] > t_s:  # the red that is, or else the next
+                longest = max(longest, float(t_s - signal.t_s[begin]))
     return longest
 
 

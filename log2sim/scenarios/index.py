@@ -109,9 +109,8 @@ def table_of_rows(rows: Sequence[Row]) -> Any:
 
 def find_scenarios(folder: Path) -> Iterator[str]:
     """Yield the names below a folder of scenario files: of a batch those of its logs, elsewhere all JSON files that begin as one."""
-    top = os.path.join(
-        folder, ""
-    )  # strings, since a path object for each of ten thousand files takes longer than a question
+    # Strings, since a path object for each of ten thousand files takes longer than a question.
+    top = os.path.join(folder, "")
     logs = os.path.join(top, "logs")
     for root, folders, files in os.walk(logs if (folder / "batch.json").is_file() and os.path.isdir(logs) else top):
         folders[:] = sorted(name for name in folders if not name.startswith("."))

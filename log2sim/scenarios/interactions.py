@@ -185,9 +185,8 @@ def _overtaking(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> It
         if np.abs(aside[part]).max() > 4.5 * b.half_m or np.diff(ahead[part]).max() > MOST_PER_TICK_M:
             continue
         middle = start + int(np.argmin(np.abs(ahead[part])))
-        sure = motion.probability_above(-ahead[start], 0.0, sigma[start]) * motion.probability_above(
-            ahead[n], 0.0, sigma[n]
-        )
+        sure = motion.probability_above(-ahead[start], 0.0, sigma[start])
+        sure *= motion.probability_above(ahead[n], 0.0, sigma[n])
         clearance = abs(aside[middle]) - traffic.table.size_m[[r, o], 1].sum() / 2
         yield tag_of(traffic, "overtaking", o, (start, middle, n), sure, r, lateral_gap_m=clearance, side=np.sign(aside[middle]),
                      relative_speed_mps=faster[middle], duration_s=(n - start) * TICK_S)  # fmt: skip
@@ -239,9 +238,8 @@ def _hidden(traffic: motion.Traffic, eye: Array, place: Array, ticks: Array, pai
 
     t = traffic.table
     hidden = np.zeros(len(ticks), dtype=bool)
-    sight = shapely.linestrings(
-        np.stack([np.column_stack([eye.real, eye.imag]), np.column_stack([place.real, place.imag])], axis=1)
-    )
+    ends = np.stack([eye, place], axis=1)
+    sight = shapely.linestrings(np.stack([ends.real, ends.imag], axis=2))
     for k in range(len(traffic.ids)):
         if k in pair or not traffic.wheeled[k] or t.size_m[k, 2] <= 1.0:
             continue

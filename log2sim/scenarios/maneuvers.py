@@ -138,9 +138,8 @@ def _in_lane(traffic: Traffic, k: int, lane: int, first: int, last: int) -> tupl
         np.nan_to_num(traffic.course_rad[k, first : last + 1]),
     )
     share = at.s_m / max(line.length_m, 1e-9)
-    return np.where(np.isfinite(place), at.aside_m, np.nan), np.interp(
-        share, np.linspace(0, 1, len(known.width_m)), known.width_m
-    ) / 2
+    width = np.interp(share, np.linspace(0, 1, len(known.width_m)), known.width_m)
+    return np.where(np.isfinite(place), at.aside_m, np.nan), width / 2
 
 
 def lateral_extent(aside_m: Array, crossing: int) -> tuple[int, int, float]:

@@ -71,7 +71,7 @@ class Condition:
         self.parts = _conjuncts(self.tree)
         self.main = tuple(dict.fromkeys(_main_tags(self.tree)))
         self.joined: dict[str, str] = {}
-        self.where([*self.parts])  # so that what is wrong is said at once
+        self.where(self.parts)  # so that what is wrong is said at once
 
     def where(self, parts: Sequence[ast.expr]) -> _Sql:
         """Return SQL for all of some parts, and for the tags that the rows are of."""
@@ -87,37 +87,32 @@ class Condition:
         return sql
 
     def _sql(self, node: ast.expr) -> _Sql:
-        if isinstance(node, ast.BoolOp):
-            parts = [self._truth(v) for v in node.values]
-            word = " AND " if isinstance(node.op, ast.And) else " OR "
-            return _Sql(f"({word.join(p.text for p in parts)})", [v for p in parts for v in p.values])
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            part = self._truth(node.operand)
-            return _Sql(f"NOT ({part.text})", part.values)
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            part = self._number(node.operand)
-            return _Sql(f"(-{part.text})", part.values, "number")
-        if isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
-            left, right = self._number(node.left), self._number(node.right)
-            divisor = f"nullif({right.text}, 0)" if isinstance(node.op, ast.Div) else right.text
-            return _Sql(f"({left.text} {ARITHMETIC[type(node.op)]} {divisor})", left.values + right.values, "number")
-        if isinstance(node, ast.Compare):
-            return self._comparison(node)
-        if (
-            isinstance(node, ast.Call)
-            and isinstance(node.func, ast.Name)
-            and node.func.id == "abs"
-            and len(node.args) == 1
-            and not node.keywords
-        ):
-            part = self._number(node.args[0])
-            return _Sql(f"abs({part.text})", part.values, "number")
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float, str):
-            return _Sql("?", [node.value], "text" if isinstance(node.value, str) else "number")
-        if isinstance(node, ast.Name):
-            return self._name(node.id)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-            return self._attribute(node.value.id, node.attr)
+        match node:
+            case ast.BoolOp(op, operands):
+                parts = [self._truth(v) for v in operands]
+                word = " AND " if isinstance(op, ast.And) else " OR "
+                return _Sql(f"({word.join(p.text for p in parts)})", [v for p in parts for v in p.values])
+            case ast.UnaryOp(ast.Not(), operand):
+                part = self._truth(operand)
+                return _Sql(f"NOT ({part.text})", part.values)
+            case ast.UnaryOp(ast.USub(), operand):
+                part = self._number(operand)
+                return _Sql(f"(-{part.text})", part.values, "number")
+            case ast.BinOp(one, op, two) if type(op) in ARITHMETIC:
+                left, right = self._number(one), self._number(two)
+                divisor = f"nullif({right.text}, 0)" if isinstance(op, ast.Div) else right.text
+                return _Sql(f"({left.text} {ARITHMETIC[type(op)]} {divisor})", left.values + right.values, "number")
+            case ast.Compare():
+                return self._comparison(node)
+            case ast.Call(ast.Name("abs"), [operand], []):
+                part = self._number(operand)
+                return _Sql(f"abs({part.text})", part.values, "number")
+            case ast.Constant(value) if type(value) in (int, float, str):
+                return _Sql("?", [value], "text" if isinstance(value, str) else "number")
+            case ast.Name(name):
+                return self._name(name)
+            case ast.Attribute(ast.Name(of), name):
+                return self._attribute(of, name)
         raise self._wrong(
             node,
             "is not understood; expected tags, fields, numbers and texts with and, or, not, < <= > >= == != in + - * /",
@@ -214,8 +209,7 @@ def _main_tags(node: ast.expr) -> list[str]:
 def ask(index: Index, text: str, *, min_probability: float = 0.3) -> Found:
     """Find the tags of an index that fulfil a condition.
 
-    Raises `ConfigError` for a condition that is not understood, or that has unknown names. Raises `MissingExtra`
-    without DuckDB.
+    Raises `ConfigError` for a condition that is not understood or has unknown names, `MissingExtra` without DuckDB.
 
     `text`: such as "cut_in and ttc_s < 2 and ego.speed_mps > 10": a tag is true for its rows; a second one where such a tag shares a
     road user and a time with the first, whose fields then are "hard_braking.deceleration_mps2". What is not known fulfils no

@@ -40,8 +40,7 @@ def tag(scenario: Scenario) -> Scenario:
 def criticality_table(scenario: Scenario) -> dict[str, Array]:
     """Measure how critical it is for each vehicle and the one ahead of it in its lane, at each tick of 0.1 s.
 
-    Returns `agent`, `other`, `t_s` and measures of `log2sim.scenarios.criticality`, in SI units; what has no value, such as a TTC of
-    who falls behind, is infinite.
+    Returns `agent`, `other`, `t_s` and measures of `log2sim.scenarios.criticality`, in SI units; what has no value is infinite.
     """
     traffic = Traffic(scenario.active)
     ids = np.array(traffic.ids, dtype=object)
@@ -55,11 +54,8 @@ def criticality_table(scenario: Scenario) -> dict[str, Array]:
         n = np.flatnonzero(b.leader >= 0)
         o = b.leader[n]
         usual = lane_measures(traffic, b, r, o, n)
-        gap, closing, accel = (
-            usual["gap_m"],
-            -usual["relative_speed_mps"],
-            traffic.accel_mps2[o, n] * np.cos(b.turn_rad[o, n]),
-        )
+        gap, closing = usual["gap_m"], -usual["relative_speed_mps"]
+        accel = traffic.accel_mps2[o, n] * np.cos(b.turn_rad[o, n])
         width = (traffic.table.size_m[r, 1] + traffic.table.size_m[o, 1]) / 2
         parts.append((
             np.full(len(n), ids[r], dtype=object), ids[o], traffic.table.t_s[n], *usual.values(), c.modified_deceleration(gap, closing),

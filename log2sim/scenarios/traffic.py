@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import STANDSTILL_MPS, Agent, MapLane, Scenario
-from log2sim.geometry import Array, Polyline, fit_windows, wrap_angle
+from log2sim.geometry import Array, Polyline, fit_windows, runs_of, wrap_angle
 from log2sim.simulation.prediction.motion_table import TICK_S, Complex, MotionTable, table_of
 from log2sim.simulation.prediction.prediction import MOVING, drift_variance
 
@@ -332,9 +332,9 @@ class Traffic:
             if not len(near):
                 continue
             at = line.project(xy[near], course[near])
-            half = np.interp(at.s_m, Polyline.through(lane.points_m).s_m, np.interp(
-                np.linspace(0, 1, len(line.s_m)), np.linspace(0, 1, len(lane.width_m)), lane.width_m)) / 2  # fmt: skip
-            fits = at.inside & (np.abs(at.aside_m) <= half)
+            vertices, widths = (np.linspace(0, 1, len(values)) for values in (line.s_m, lane.width_m))
+            width = np.interp(at.s_m, line.s_m, np.interp(vertices, widths, lane.width_m))
+            fits = at.inside & (np.abs(at.aside_m) <= width / 2)
             # Where lanes overlap, the nearer center line and the direction decide; who goes against a lane is in it last.
             cost = np.abs(at.aside_m) + 3.0 * np.abs(at.turn_rad)
             better = fits & (cost < best[a[near], n[near]])
@@ -405,8 +405,7 @@ def latched(on: Mask, off: Mask, start: Mask) -> Mask:
 
 def runs(state: Mask, least: int = 1, bridged: int = 0) -> list[tuple[int, int]]:
     """Return first and last tick of each time (T,) that a state lasts for at least so many ticks, breaks of up to `bridged` included."""
-    edge = np.diff(np.concatenate([[False], state, [False]]).astype(np.int8))
-    begin, end = np.flatnonzero(edge > 0), np.flatnonzero(edge < 0)
+    begin, end = np.array(runs_of(state), dtype=np.intp).reshape(-1, 2).T
     apart = begin[1:] - end[:-1] > bridged
     begin, end = begin[np.concatenate([[True], apart])[: len(begin)]], end[np.concatenate([apart, [True]])[: len(end)]]
     return [(i, j - 1) for i, j in zip(begin.tolist(), end.tolist()) if j - i >= least]
