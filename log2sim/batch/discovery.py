@@ -36,8 +36,7 @@ def find_logs(
     `root`: a folder, or the file of one log. `format`: name of the only format that is looked for, "auto", or "scenario" for
     scenario files: of a batch those of its logs, elsewhere all that begin as one.
     `leave_out`: folder that is not looked into. `max_folders`: that are looked into before the search is given up.
-    Raises `LogError` when the root is missing, or there is no log. Raises `ConfigError` for an unknown format, or more
-    folders than can be searched.
+    Raises `LogError` when the root is missing or holds no log, `ConfigError` for an unknown format or too many folders.
 
     A log is reported at the deepest folder that its reader accepts. Nothing below a folder that is a log itself is another one. Hidden
     folders are skipped, and links are followed only where that was asked for (`log2sim.files.inputs.following_links`).

@@ -9,13 +9,14 @@ from statistics import median
 from typing import Any
 
 from log2sim.batch.discovery import FoundLog, find_logs
-from log2sim.batch.folder import LOGS, SCENARIO_FILE, BatchFolder
+from log2sim.batch.folder import LOGS, BatchFolder
 from log2sim.datatypes import Scenario
 from log2sim.errors import Log2SimError, LogError
 from log2sim.evaluation.metrics import table
 from log2sim.evaluation.metrics.comparison import mota
 from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.files.documents import rounded
+from log2sim.scenarios.index import SCENARIO_FILE
 
 Figures = dict[str, Any]
 LoadTruth = Callable[[FoundLog, Scenario], Scenario]

@@ -27,6 +27,7 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.files.documents import first_problem, read_json, replaced, write_json
 from log2sim.files.outputs import claim, is_left_over, is_temporary, remove, replaced_folder
 from log2sim.files.version import __version__
+from log2sim.scenarios.index import write_table
 
 MAX_NAME_CHARS = 80  # of a folder; file systems take 255 bytes, and temporary names are longer
 HASH_DIGITS = 8
@@ -89,20 +90,18 @@ class Row(BaseModel):
     attempts: Annotated[int, Field(ge=1)] = 1  # how often it was run, 2 after a repetition
     ticks: Count = None
     duration_s: Amount = None
-    # agents, static, doubtful: agents without the ego, those of them that stand all the time, and all that the
-    # scenario doubts.
+    # Agents without the ego, those of them that stand all the time, and all that the scenario doubts.
     agents: Count = None
     static: Count = None
     doubtful: Count = None
-    # faults, unreadable: faults of sensors and poses, and records that could not be read.
+    # Faults of sensors and poses, and records that could not be read.
     faults: Count = None
     unreadable: Count = None
-    # seconds, cpu_s: wall time and time of the processor, from opening the log to writing its files.
+    # Wall time and time of the processor, from opening the log to writing its files.
     seconds: Amount = None
     cpu_s: Amount = None
     peak_memory_mib: Amount = None  # MiB, largest resident memory of the worker so far
-    # Of the replay, where there is one: its time on the processor, the greatest distance of an agent from its path, and
-    # collisions that the scenario does not have.
+    # Of the replay: time of the processor, greatest distance of an agent from its path, collisions that the scenario lacks.
     replay_s: Amount = None
     cross_track_max_m: Amount = None
     new_collisions: Count = None
@@ -141,7 +140,6 @@ SUMMED = ("ticks", "duration_s", "agents", "static", "doubtful", "faults", "unre
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
     """Write the rows, one for each log, with the columns of `Row`."""
     import pyarrow as pa
-    from pyarrow import parquet
 
     def kind_of(annotation: Any) -> pa.DataType:
         parts = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)  # it may be absent
@@ -149,9 +147,7 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
 
     fields = [(name, kind_of(field.annotation)) for name, field in Row.model_fields.items()]
     values = {name: [getattr(row, name) for row in rows] for name, _ in fields}
-    table = pa.table(values, schema=pa.schema(fields))
-    with replaced(path) as temporary:
-        parquet.write_table(table, temporary)
+    write_table(path, pa.table(values, schema=pa.schema(fields)))
 
 
 def sum_up(rows: Sequence[Row]) -> dict[str, float]:
@@ -163,7 +159,7 @@ def sum_up(rows: Sequence[Row]) -> dict[str, float]:
 
 SETTINGS_FILE = "batch.json"
 LOGS = "logs"
-SCENARIO_FILE, REPORT_FILE, ROW_FILE, ERROR_FILE = "scenario.json", "report.json", "row.json", "error.txt"
+REPORT_FILE, ROW_FILE, ERROR_FILE = "report.json", "row.json", "error.txt"
 REPLAY_FILE = "replay.json"
 TOKEN_BYTES = 8
 
@@ -222,28 +218,25 @@ class BatchFolder:
     def start(cls, path: Path, wanted: BatchSettings, *, overwrite: bool) -> BatchFolder:
         """Go on with the batch in a folder, or begin one.
 
-        Raises `ConfigError` when the folder holds something else, a batch of other settings, or is in use by another
-        run.
+        Raises `ConfigError` when the folder holds something else or a batch of other settings, or another run uses it.
         """
         claim(path / SETTINGS_FILE, overwrite=False)
-        if not is_batch(path):
-            if path.exists() and any(entry.name != f".{SETTINGS_FILE}.lock" for entry in path.iterdir()):
-                raise ConfigError(f"{path}: holds something else than a batch; give an empty or a new folder")
-            write_json(path / SETTINGS_FILE, wanted.model_dump())
-            return cls(path, wanted)
-        earlier = cls.load(path)
-        changed = wanted.differences(earlier.settings)
-        if overwrite:
+        if is_batch(path):
+            earlier = cls.load(path)
+            changed = wanted.differences(earlier.settings)
+            if changed and not overwrite:
+                more = f" and {len(changed) - MAX_LISTED} more" if len(changed) > MAX_LISTED else ""
+                raise ConfigError(
+                    f"{path}: holds a batch of other settings ({'; '.join(changed[:MAX_LISTED])}{more}); choose another "
+                    "folder, the same settings to go on, or --overwrite to start over"
+                )
+            if not overwrite:
+                return earlier
             shutil.rmtree(path / LOGS, ignore_errors=True)
-            write_json(path / SETTINGS_FILE, wanted.model_dump())
-            return cls(path, wanted)
-        if changed:
-            more = f" and {len(changed) - MAX_LISTED} more" if len(changed) > MAX_LISTED else ""
-            raise ConfigError(
-                f"{path}: holds a batch of other settings ({'; '.join(changed[:MAX_LISTED])}{more}); choose another folder, the "
-                "same settings to go on, or --overwrite to start over"
-            )
-        return earlier
+        elif path.exists() and any(entry.name != f".{SETTINGS_FILE}.lock" for entry in path.iterdir()):
+            raise ConfigError(f"{path}: holds something else than a batch; give an empty or a new folder")
+        write_json(path / SETTINGS_FILE, wanted.model_dump())
+        return cls(path, wanted)
 
     def log_folder(self, name: str) -> Path:
         """Return the folder for a log."""

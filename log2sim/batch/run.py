@@ -23,7 +23,6 @@ from log2sim.batch.folder import (
     REPLAY_FILE,
     REPORT_FILE,
     ROW_FILE,
-    SCENARIO_FILE,
     BatchFolder,
     BatchSettings,
     Job,
@@ -47,6 +46,7 @@ from log2sim.files.version import __version__
 from log2sim.logs.opening import open_log
 from log2sim.perception.run_detectors import check_detectors
 from log2sim.pipeline import reconstruct
+from log2sim.scenarios.index import SCENARIO_FILE
 from log2sim.simulation.runner import replay
 
 if TYPE_CHECKING:

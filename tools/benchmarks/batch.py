@@ -24,11 +24,12 @@ from worlds import CAR, tiny_table
 from benchmarks.tag_worlds import traffic
 from log2sim.batch import plan_batch, run_batch
 from log2sim.batch.discovery import SCENARIO
-from log2sim.batch.folder import SCENARIO_FILE, sum_up
+from log2sim.batch.folder import sum_up
 from log2sim.batch.run import local_workers
 from log2sim.cli.progress import progress
 from log2sim.config import Config
 from log2sim.logs.native.writer import write_log
+from log2sim.scenarios.index import SCENARIO_FILE
 from log2sim.synth.scene import scene_from_table
 from log2sim.synth.synthesis import synthesize
 
