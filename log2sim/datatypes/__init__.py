@@ -29,7 +29,6 @@ from log2sim.datatypes.categories import (
     TYPICAL_SIZE_M,
 )
 from log2sim.datatypes.detections import (
-    TUPLES,
     Boxes3D,
     BoxEvidence,
     Detections,
@@ -65,12 +64,7 @@ from log2sim.datatypes.log import (
     seen_from,
 )
 from log2sim.datatypes.scenario import (
-    BORDER_KINDS,
     EGO,
-    LANE_LINE_KINDS,
-    LANE_ORIGINS,
-    MARKING_KINDS,
-    SIGNAL_STATES,
     TAGS,
     VERSION,
     MapFeatures,
@@ -85,9 +79,9 @@ from log2sim.datatypes.scenario import (
 )
 
 __all__ = [
-    "BORDER_KINDS", "CATEGORIES", "CATEGORY", "COLOR_NAMES", "EGO", "ENDS", "FIRST_SPEED_MPS", "GROUPS",
-    "GROUP_OF", "KINDS", "LANE_LINE_KINDS", "LANE_ORIGINS", "MARGIN_S", "MARKING_KINDS", "MAX_SIZE_M", "MAX_SPEED_MPS", "MIN_SIZE_M",
-    "MIN_TRUSTED_CONFIDENCE", "RELATED_GROUPS", "ROAD", "SIGNAL_STATES", "STANDSTILL_DRIFT_M", "STANDSTILL_MPS", "TAGS", "TUPLES",
+    "CATEGORIES", "CATEGORY", "COLOR_NAMES", "EGO", "ENDS", "FIRST_SPEED_MPS", "GROUPS",
+    "GROUP_OF", "KINDS", "MARGIN_S", "MAX_SIZE_M", "MAX_SPEED_MPS", "MIN_SIZE_M",
+    "MIN_TRUSTED_CONFIDENCE", "RELATED_GROUPS", "ROAD", "STANDSTILL_DRIFT_M", "STANDSTILL_MPS", "TAGS",
     "TYPICAL_SIZE_M", "VEHICLE", "VERSION", "Agent", "AgentTable", "BoxEvidence", "Boxes3D", "Deferred", "Detections",
     "EgoVehicle", "Finding", "Frame", "IgnoreRegions", "ImageLabels", "ImageRegions", "LabelView", "Labels", "Lidar",
     "Log", "MapFeatures", "MapFrame", "MapLane", "Marking", "Measurements", "Obstacles", "OtherView", "Rays",

@@ -137,8 +137,7 @@ class Trajectory:
     def at(self, t_s: Array) -> TrajectoryStates:
         """Interpolate at times (N,); before the first and after the last waypoint the end is held."""
         x, y, yaw, speed = self.relative(t_s)
-        z = np.interp(t_s, self.t_s, self.z_m)
-        return TrajectoryStates(x + self.origin_m[0], y + self.origin_m[1], z, wrap_angle(yaw), speed)
+        return TrajectoryStates(x + self.origin_m[0], y + self.origin_m[1], self.heights(t_s), wrap_angle(yaw), speed)
 
     def _since(self, t: Array) -> tuple[NDArray[np.intp], Array, Array, NDArray[np.bool_]]:
         """Return the number of the step that times (N,) are in, how long it has lasted then, its duration, and whether it is a jump."""
@@ -148,8 +147,7 @@ class Trajectory:
     def relative(self, t_s: Array) -> tuple[Array, Array, Array, Array]:
         """Interpolate x, y relative to the origin, unwrapped yaw and speed at times (N,); the ends are held.
 
-        Position by cubics with the velocities of the waypoints (Hermite), yaw and speed linearly. Up to a discontinuity the
-        agent goes straight on.
+        Position by cubics with the waypoints' velocities (Hermite), straight on up to a discontinuity; yaw and speed linearly.
         """
         t = np.clip(t_s, self.t_s[0], self.t_s[-1])
         yaw, speed = np.interp(t, self.t_s, self.yaw_rad), np.interp(t, self.t_s, self.speed_mps)
@@ -231,8 +229,7 @@ class Agent:
     waypoints: Waypoints
     static: bool = False  # whether it never moves
     rear_axle_offset_m: float = 0.0  # from the rear axle forward to the center of the box
-    # {"rgb": [r, g, b], "name": ...}; of a reconstruction the name is one of `COLOR_NAMES`, and "confidence" the probability
-    # that it is right
+    # {"rgb": [r, g, b], "name": ...}; of a reconstruction one of `COLOR_NAMES`, with "confidence", its probability
     color: Mapping[str, Any] | None = None
     confidence: float = 1.0  # in [0, 1]
     quality: Mapping[str, Any] = field(default_factory=dict)  # figures such as the number of detections

@@ -12,16 +12,13 @@ Size = tuple[float, float, float]
 class Category:
     """What is known of a category before anything was measured; sizes are length, width, height in m."""
 
-    group: (
-        str  # categories of one group are confused by detectors and labelers, and therefore associated with each other
-    )
+    group: str  # of categories that detectors and labelers confuse, which are therefore associated with each other
     typical_size_m: Size  # of an object that was not observed from end to end
     min_size_m: Size  # a smaller object was hardly observed whole, a larger one than `max_size_m` is several objects
     max_size_m: Size
     max_speed_mps: float  # what is faster is hardly one
     max_length_per_height: float = float("inf")  # longest side as a share of the height
-    # What points show of the longer horizontal side at least, where that is less than `min_size_m`: bodies are round, and sparse
-    # rays miss their ends
+    # Least horizontal length that points show, where less than `min_size_m`: bodies are round, sparse rays miss their ends
     min_seen_m: float | None = None
 
 
@@ -73,8 +70,7 @@ MAX_SIZE_M: Mapping[str, Size] = {name: category.max_size_m for name, category i
 
 # Groups of which a detector takes one for the other now and then: a rider for a pedestrian.
 RELATED_GROUPS = (("pedestrian", "two_wheeler"), ("two_wheeler", "pedestrian"))
-# Standard deviation of the speed of an object of which no more than the group is known. A bicycle without a rider stands, but for
-# those whose rider the detector missed.
+# Standard deviation of the speed where only the group is known. A bicycle stands, unless its rider was missed.
 FIRST_SPEED_MPS = {"vehicle": 8.0, "two_wheeler": 4.0, "pedestrian": 1.5, "other": 3.0, "bicycle": 1.0}
 # Beyond these a vehicle's motion is infeasible for Waymax (Gulino et al., 2023).
 MAX_ACCELERATION_MPS2 = 10.4

@@ -98,12 +98,10 @@ class BoxEvidence:
     camera: NDArray[np.str_]  # (M,): "" for an object that no camera detected
     box_px: Array  # (M, 4): u0, v0, u1, v1; NaN without camera
     truncated: NDArray[np.bool_]  # (M,): whether the image border cuts the box
-    # (M,): height in m that the image box spans at the object's depth, or above where a homography places its foot; NaN where neither
-    # is known
+    # (M,), m: height that the image box spans at the object's depth, or where a homography places its foot; NaN where unknown
     height_px_m: Array
     points: NDArray[np.int64]  # (M,): number of LiDAR points on the object
-    # M arrays (n, 4) or (n, 3): these points, subsampled: x, y, z in m, and where it is known the time after `t_ns` in s at which each
-    # was measured
+    # M arrays (n, 4) or (n, 3): these points, subsampled: x, y, z in m, and where it is known the time after `t_ns` in s
     cluster: Sequence[NDArray[np.float64]]
     sensor_m: Array  # (M, 3): viewpoint
     yaw_rad: Array  # (M,): direction of the object's length up to half turns, for short sides up to quarter turns; NaN without points
@@ -306,8 +304,7 @@ class Track:
     category: str
     tick: NDArray[np.int64]  # (n,): strictly increasing indices of ticks
     measurements: Measurements  # n rows, one at each of these ticks
-    # (U,): increasing indices of ticks at which no sensor that measured it recorded anything: that it was not measured there says
-    # nothing
+    # (U,): increasing indices of ticks at which no sensor that measured it recorded, so that its absence there says nothing
     unrecorded: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     # Share of its ticks, above 0, at which pictures of a camera that measured it were searched; 1 for a track of sweeps alone
     searched: float = 1.0

@@ -25,8 +25,7 @@ T = TypeVar("T")
 class Deferred(Generic[T]):
     """A dataclass field that also takes a function of no arguments; it is called when the field is first read.
 
-    For parts of a log that have to be read from large files: opening a log does not wait for what is not used. Without
-    arguments the field has no default.
+    So opening a log does not wait for large files that are not used. Without arguments the field has no default.
     """
 
     def __init__(self, *default: T) -> None:
@@ -205,8 +204,7 @@ class Sweep:
     frame: Literal["lidar", "map"] = "lidar"  # "lidar": the sensor's frame; "map": already motion-compensated
     # (N,): absolute stamps at which the points were measured; None when the log has none
     t_ns: NDArray[np.int64] | None = None
-    # For the frame "lidar": the stamp of the sensor's pose to which all points are compensated already; None where each point is in the
-    # sensor's frame at its own time
+    # For the frame "lidar": stamp of the pose to which all points are compensated; None where each is at its own time
     compensated_ns: int | None = None
     # (N,): how strong each return is, on the scale of its LiDAR; NaN where the log does not tell. None where the log has none.
     intensity: NDArray[np.float32] | None = None
@@ -225,8 +223,7 @@ class Tick:
 
     t_ns: int  # absolute stamp
     t_s: float  # since the first tick of the log
-    # (H, W, 3) uint8 BGR by camera, without cameras that have no frame near the tick. A frame is decoded when it is asked for, and
-    # `RecordError` says which one cannot be read.
+    # (H, W, 3) uint8 BGR by camera with a frame near the tick, decoded when asked for; `RecordError` for an unreadable one
     images: Mapping[str, NDArray[np.uint8]]
     sweeps: Mapping[str, Sweep]  # by LiDAR, likewise
     image_ns: Mapping[str, int]  # absolute stamps of the frames
@@ -301,9 +298,7 @@ class Log:
     map: MapFrame = field(default_factory=MapFrame)
     labels: Deferred[Labels | None] = Deferred(None)
     image_labels: Mapping[str, ImageLabels] = field(default_factory=dict)  # by camera
-    ignored_regions: Mapping[str, ImageRegions] = field(
-        default_factory=dict
-    )  # by camera: where `labels` are incomplete
+    ignored_regions: Mapping[str, ImageRegions] = field(default_factory=dict)  # by camera
     ground_z_ego_m: Deferred[float] = Deferred(0.0)  # of the road in the ego frame; 0 when its origin is on the ground
     reference_camera: str | None = None  # the camera whose stamps make the ticks
     digest: str = ""  # SHA-256 over the log's index

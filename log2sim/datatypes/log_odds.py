@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# Nearer to 0 or 1 no probability is believed: something may be right or wrong for a reason that no evidence shows, and networks are
-# surer than right.
+# Nearer to 0 or 1 no probability is believed: no evidence shows every reason, and networks are surer than right.
 MIN_PROBABILITY, MAX_PROBABILITY = 0.01, 0.99
 
 

@@ -21,13 +21,8 @@ from log2sim.files.documents import check, from_entry, kind_of, read_json, repla
 from log2sim.files.plugins import nearest
 from log2sim.geometry import NS_PER_S, Array
 
-MARKING_KINDS = ("solid", "dashed", "stop_line", "crosswalk", "other")
-"""Kinds of markings; lane lines are the first two, arrows and letters are "other"."""
-LANE_LINE_KINDS = ("solid", "dashed")
 BORDER_KINDS = ("curb", "edge")
 """Kinds of road borders: a step in height, or where asphalt ends."""
-LANE_ORIGINS = ("markings", "paths", "both")
-"""What lanes are inferred from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +32,8 @@ class Marking:
     __repr__ = short_repr
 
     id: str  # unique among markings and borders
-    kind: str  # one of `MARKING_KINDS`
-    # (N, 3), m: map frame. Of lines, dashed ones included, the middle from end to end; of crosswalks and others the outline, whose
-    # first point is not repeated.
+    kind: str  # "solid" or "dashed" lane line, "stop_line", "crosswalk", or "other" for arrows and letters
+    # (N, 3), m: map frame. Of lines, also dashed, the middle from end to end; of others the outline, its first point once
     points_m: Array
     width_m: float  # m: of the line; of a crosswalk its extent along the road
     color: str | None = None  # "white" or "yellow", None where unknown
@@ -49,7 +43,7 @@ class Marking:
     @property
     def is_lane_line(self) -> bool:
         """Whether it runs along lanes."""
-        return self.kind in LANE_LINE_KINDS
+        return self.kind in ("solid", "dashed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +76,7 @@ class MapLane:
     right_lane: str | None = None
     opposite: str | None = None  # lane beside it in the other direction
     junction: str | None = None  # junction that it crosses
-    inferred_from: str = "markings"  # one of `LANE_ORIGINS`
+    inferred_from: str = "markings"  # or "paths", or "both"
     confidence: float = 1.0  # probability that it is a lane, in this direction, in [0, 1]
 
 
@@ -156,10 +150,6 @@ def unique_ids(what: str, items: Sequence[Any]) -> set[str]:
     return seen
 
 
-SIGNAL_STATES = ("red", "red_yellow", "yellow", "green", "off", "unknown")
-"""States of a traffic light; off: no lamp is lit; unknown: no camera shows it."""
-
-
 @dataclass(frozen=True, eq=False)
 class Signal:
     """A signal head of a traffic light."""
@@ -170,7 +160,8 @@ class Signal:
     position_m: Array  # (3,), m: middle of its housing, map frame
     heading_rad: float | None  # direction that its lamps face, None where unknown
     t_s: Array  # (T,), s: strictly increasing times at which its state changes; the last state lasts to the end of the scenario
-    state: NDArray[np.str_]  # (T,): of `SIGNAL_STATES`, from each time on
+    # (T,), from each time on: "red", "red_yellow", "yellow", "green", "off" (no lamp is lit), "unknown" (no camera shows it)
+    state: NDArray[np.str_]
     sigma_m: float = 0.0  # m: standard deviation of the position along the axis on which it is largest
     confidence: float = 1.0  # probability that it is a traffic light, there, in [0, 1]
     cameras: tuple[str, ...] = ()  # that saw it
@@ -219,9 +210,8 @@ class Tag:
     probability: float  # that it is so, by the standard deviations and the confidence of the agents, in [0, 1]
     other: str | None = None  # id of the agent that it is done to
     lane: str | None = None  # the lane that the agent is in then, or changes to
-    quantities: Mapping[str, float] = field(
-        default_factory=dict
-    )  # what defines it, in SI units, which the names end with
+    # What defines it, in SI units, which the names end with
+    quantities: Mapping[str, float] = field(default_factory=dict)
 
 
 COLUMNS: dict[str, tuple[str, str]] = {
