@@ -86,8 +86,7 @@ def edit(scenario: Scenario, edits: Sequence[Edit]) -> Edited:
     """Apply edits in the order given.
 
     Raises `ConfigError` for no edits, an unknown or removed agent, the same edit twice, no agent left, or an impossible
-    edit: the speed of a static agent, a path shifted beyond its center of curvature, a trajectory without waypoints
-    left.
+    edit: the speed of a static agent, a path shifted beyond its center of curvature, a trajectory without waypoints.
 
     `edits`: each kind of motion at most once for an agent. Returns the scenario, longer where an agent now lives beyond its end, with
     the edits and the digest of the source appended to `provenance["edits"]`; and warnings of new collisions and infeasible motion.
@@ -135,15 +134,13 @@ def find_problems(source: Scenario, changed: Scenario, agents: Sequence[Agent]) 
     for agent in agents:  # acceleration and curvature beyond their limits and beyond those of the source
         before = _peaks(known[agent.id]) if agent.id in known else {}
         for what, (peak, t_s) in _peaks(agent).items():
-            limit, unit = (MAX_ACCELERATION_MPS2, "m/s2")
+            limit, unit = MAX_ACCELERATION_MPS2, "m/s2"
             if what == "curvature":
                 limit, unit = CURVATURE_LIMITS_1PM.get(GROUP_OF[agent.category], np.inf), "1/m"
             if peak > max(limit, before.get(what, (0.0, 0.0))[0]) * RELATIVE_TOLERANCE:
                 lines.append(f"agent '{agent.id}': {what} {peak:.3g} {unit} at {t_s:.2f} s, limit {limit:g} {unit}")
     moving = tuple(a for a in agents if not a.static and GROUP_OF[a.category] != "pedestrian")
-    if (
-        not lines and moving
-    ):  # agents that their vehicle model cannot keep on the path, though it could on that of the source
+    if not lines and moving:  # agents that their vehicle model cannot keep on the path, though it could on the source's
 
         def off_path(scenario: Scenario) -> dict[str, float]:  # with the largest distance across it, m
             figures = replay(scenario, dt_s=STEP_S).metrics["by_agent"]

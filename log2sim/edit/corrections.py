@@ -69,9 +69,8 @@ def load_corrections(path: Path | str) -> dict[str, Any]:
 def correct(scenario: Scenario, corrections: Mapping[str, Any]) -> Corrected:
     """Apply corrections in the order of the file.
 
-    Raises `ConfigError` when two corrections contradict each other, or one cannot be: a split outside of the life of an
-    agent. Raises `ScenarioError` when they are of another log: its name differs, and none of them finds what it is
-    about.
+    Raises `ConfigError` when two corrections contradict each other, or one cannot be: a split outside of an agent's life.
+    Raises `ScenarioError` when they are of another log: its name differs, and none of them finds what it is about.
 
     `corrections`: a document of `schemas/corrections-1.json`, as `load_corrections` returns it. Returns the scenario, with the
     corrections that were applied and the digest of its source appended to `provenance["corrections"]`.

@@ -321,7 +321,6 @@ class Lateral(_WaypointEdit):
             )
         if self.window is not None:
             return lane_changed(agent, self.meters, *self.window.of(agent, self.kind)), None
-        # Return waypoints `meters` to the left of their headings, to the right where negative
         yaw = np.unwrap(w.yaw_rad)
         rate = np.gradient(yaw, w.t_s, edge_order=2 if len(w) > 2 else 1) if len(w) > 1 else np.zeros(len(w))
         return replace(

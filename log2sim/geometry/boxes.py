@@ -108,8 +108,7 @@ def project_boxes(center_m: Array, size_m: Array, yaw_rad: Array, camera: Camera
     A box is clipped to the view before projection, so that one that extends behind the camera keeps its visible part. A box
     that contains the camera is the vehicle that carries it and is not valid.
 
-    `center_m`, `size_m`, `yaw_rad` (L, 3), (L, 3), (L,): boxes in the map frame; size is length, width, height. `cam_T_map`
-    (4, 4).
+    `center_m`, `size_m` (L, 3), `yaw_rad` (L,): boxes in the map frame; size is length, width, height. `cam_T_map` (4, 4).
     """
     count = len(center_m)
     box = np.full((count, 4), np.nan)

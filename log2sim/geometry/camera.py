@@ -297,8 +297,7 @@ def ground_homography(camera: Camera, dst_T_cam: Array, ground_z_m: float = 0.0)
 def apply_homography(ground_H_image: Array, uv_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """Map pixels (N, 2) to the ground.
 
-    Returns `xy_m`: (N, 2): ground positions; NaN at and above the horizon; `below`: (N,): whether the pixels lie below the
-    horizon.
+    Returns `xy_m`: (N, 2): ground positions; NaN at and above the horizon; `below`: (N,): whether the pixels lie below it.
     """
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
     q = uv @ ground_H_image[:, :2].T + ground_H_image[:, 2]

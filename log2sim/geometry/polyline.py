@@ -15,8 +15,7 @@ from log2sim.geometry.transforms import Array, wrap_angle
 SPACING_M = 0.5
 # Headings that differ by a radian count as much as so many meters when the nearest vertex is looked for.
 TURN_M = 6.0
-# Length of the chords whose intersections are computed: on a curve of 10 m they are 5 cm off, which only shifts a junction's
-# edge.
+# Of the chords whose intersections are computed: on a curve of 10 m they are 5 cm off, which only shifts a junction's edge.
 CROSSING_STEP_M = 2.0
 # Feet this far beyond an end are on the line: resampling moves ends by less.
 INSIDE_M = 0.01

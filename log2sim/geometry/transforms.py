@@ -188,8 +188,7 @@ class PoseTrack:
 
     `t_ns` (P,): strictly increasing absolute stamps. `map_T_ego` (P, 4, 4). `max_gap_s`, s: poses are not interpolated
     between stamps farther apart than this. `extrapolate_s`, s: poses are extrapolated up to this far outside the track.
-    `sigma_m`, `sigma_yaw_rad` (P,), optional: standard deviations of the position along each axis, m, and of the yaw, rad;
-    None where they are not known.
+    `sigma_m`, `sigma_yaw_rad` (P,): standard deviations of the position along each axis, m, and the yaw, rad; None if unknown.
     """
 
     __repr__ = short_repr
@@ -217,8 +216,7 @@ class PoseTrack:
     def at(self, t_ns: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Interpolate the pose at stamps (N,) int64 ns: rotation by slerp, translation linearly.
 
-        Returns `map_T_ego`: (N, 4, 4); `valid`: (N,): false in gaps longer than `max_gap_s` and farther than `extrapolate_s`
-        outside the track.
+        Returns `map_T_ego` (N, 4, 4) and `valid` (N,): not in gaps over `max_gap_s` or over `extrapolate_s` outside the track.
         """
         t = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
         if len(self.t_ns) == 1:

@@ -26,8 +26,7 @@ WET_ALBEDO = 0.62  # of a wet road relative to a dry one
 class Light:
     """Light on a scene and what the air does to it; colors are linear BGR at the exposure of the camera.
 
-    `sun_color`, `sky_color` (float, float, float): light on a white surface that faces the sun, and on one that sees
-    the whole sky.
+    `sun_color`, `sky_color`: light on a white surface that faces the sun, and on one that sees the whole sky.
     """
 
     sun: Color  # unit direction towards the sun
@@ -334,8 +333,7 @@ def street_lights(roads: Sequence[Road], around_m: Array) -> tuple[Lamp, ...]:
     """Lamps that hang over roads near a point (2,)."""
     lamps: list[Lamp] = []
     for road in roads:
-        line = np.array(road.line)
-        for a, b in pairwise(line):
+        for a, b in pairwise(np.array(road.line)):
             length = float(np.linalg.norm(b - a))
             middle = float(np.dot(around_m - a, b - a)) / max(length, 1e-9)
             first = np.ceil((middle - MAX_LAMP_DISTANCE_M) / STREET_SPACING_M) * STREET_SPACING_M

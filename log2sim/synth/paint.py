@@ -9,7 +9,6 @@ machine vision, Case Studies in Construction Materials 18, 2023).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -284,11 +283,10 @@ def spot_m(range_m: NDArray[np.float64], incidence: NDArray[np.float64]) -> NDAr
     return np.asarray(BEAM_RAD * range_m / np.sqrt(np.maximum(incidence, 0.01)))
 
 
-def body_reflectance(color: Sequence[int]) -> float:
+def body_reflectance(color: tuple[int, int, int]) -> float:
     """Return the reflectance of a body of an sRGB color."""
-    red, green, blue = (int(c) for c in color)
     low, high = BODY_REFLECTANCE
-    return float(low + (high - low) * linear_bgr((red, green, blue)).mean())
+    return float(low + (high - low) * linear_bgr(color).mean())
 
 
 def intensity_of(

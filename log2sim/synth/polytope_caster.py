@@ -1,7 +1,6 @@
 """A fast LiDAR for objects made of convex polytopes over a smooth terrain.
 
-Every object is tested only against the rays of its angular window, nearest objects first, and what is wholly hidden is
-not tested at all.
+Every object is tested only against the rays of its angular window, nearest first, and what is wholly hidden not at all.
 """
 
 from __future__ import annotations

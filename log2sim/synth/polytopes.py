@@ -56,8 +56,7 @@ def _made(normals: Array, offsets: Array, low: Sequence[float], high: Sequence[f
 def prism(profile: Sequence[tuple[float, float]], width: float, material: Material, *, taper: float = 0.0) -> Polytope:
     """Extrude a convex side profile over the width.
 
-    `profile` sequence of (x, z), m: counter-clockwise. `width` m: at the lowest point of the profile. `taper`: lean of
-    the sides inward, m per m of height.
+    `profile`: (x, z), m, counter-clockwise. `width`, m: at its lowest point. `taper`: lean of the sides inward, m per m.
     """
     points = np.asarray(profile, np.float64)
     edges = points[np.r_[1 : len(points), 0]] - points

@@ -125,9 +125,8 @@ class Samples:
     ) -> Samples:  # fmt: skip
         """Cover the faces of a mesh for a pinhole camera; `passes` (F,) is the share of samples to leave out of each.
 
-        `vertices_cam` (V, 3) float64, m, cam frame. `faces` (F, 3) int: counter-clockwise from outside; faces that look
-        away are left out, and so is what is nearer than `NEAR_M`. `K` (3, 3) float64, px: pixel centers are whole
-        numbers, as in OpenCV.
+        `vertices_cam` (V, 3), m, cam frame. `faces` (F, 3): counter-clockwise from outside; those that look away are left
+        out, and so is what is nearer than `NEAR_M`. `K` (3, 3), px: pixel centers are whole numbers, as in OpenCV.
 
         Edge functions in homogeneous coordinates, so that faces which reach behind the camera need no clipping: Olano &
         Greer, Triangle Scan Conversion using 2D Homogeneous Coordinates (Graphics Hardware 1997).

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.datatypes import Sweep
-from log2sim.geometry import NS_PER_S, Array, cross_slab, inverse, rotation_from_rpy, transform
+from log2sim.geometry import NS_PER_S, Array, apply, cross_slab, inverse, rotation_from_rpy, transform
 from log2sim.synth.actors import EGO_COLOR, MovingScene
 from log2sim.synth.paint import AIR_REFLECTANCE, GroundReflectance, body_reflectance, intensity_of, spot_m
 from log2sim.synth.raster import first_hit
@@ -108,7 +108,7 @@ def cast_sweep(
             continue
         mesh = actor.mesh(float(t_s[column[rows]].mean()))
         agent_T_map = inverse(states.map_T_agent())[column[rows]]
-        o = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], origin[rows]) + agent_T_map[:, :3, 3]
+        o = apply(agent_T_map, origin[rows])
         d = np.einsum("nij,nj->ni", agent_T_map[:, :3, :3], ray[rows])
         meets = np.isfinite(slab_distance(box + 2 * MESH_MARGIN_M, o, d, from_inside=True))
         rows, nearer = rows[meets], first_hit(o[meets], d[meets], mesh.vertices_m[mesh.faces])
@@ -132,8 +132,7 @@ def cast_sweep(
         xyz = np.rint(xyz / spec.resolution_m) * spec.resolution_m
     intensity = None
     if ground is not None:
-        # What is no ground is taken to face the sensor. The last four are those of `GROUND`, `BUILDING`, `EGO` and `AIR`,
-        # counted from the end.
+        # What is no ground is taken to face the sensor. `GROUND`, `BUILDING`, `EGO` and `AIR` count from the end.
         bodies = [body_reflectance(agent.color) for agent in scene.agent]
         by_hit = [*bodies, AIR_REFLECTANCE, body_reflectance(EGO_COLOR), BUILDING_REFLECTANCE, 0.0]
         reflectance = np.array(by_hit, np.float32)[hit[keep]]

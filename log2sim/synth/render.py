@@ -243,8 +243,7 @@ def triangles_of(scene: Scene) -> tuple[Array, ...]:
     out = []
     for light in scene.traffic_light:
         mesh, pose = _housing(light)
-        vertices = mesh.vertices_m @ pose[:3, :3].T + pose[:3, 3]
-        out.append(vertices[mesh.faces])
+        out.append(apply(pose, mesh.vertices_m)[mesh.faces])
     return tuple(out)
 
 

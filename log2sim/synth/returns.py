@@ -153,8 +153,7 @@ def reflected(
 ) -> NDArray[np.float32]:
     """Signal (N,) of returns relative to a target of reflectance 1 at `REFERENCE_RANGE_M` in clear air.
 
-    `range_m` (N,) float32, m. `reflectance` (N,) float32. `incidence` (N,) float32: cosine of the angle between ray and
-    normal.
+    `range_m`, m, `reflectance`, and `incidence`, the cosine of the angle between ray and normal: (N,) float32.
     """
     lost = np.exp(np.float32(-2 * weather.extinction_per_m) * range_m)
     nearness = np.maximum(range_m / np.float32(REFERENCE_RANGE_M), np.float32(0.05))

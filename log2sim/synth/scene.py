@@ -335,8 +335,7 @@ class Scene(Table):
 def load_scene(path: Path | str) -> Scene:
     """Read a scene file.
 
-    Raises `ConfigError` when the file is missing, is no TOML, or holds an unknown key or an impossible value; names the file
-    and the key.
+    Raises `ConfigError`, which names file and key, when it is missing, no TOML, or holds an unknown key or impossible value.
     """
     path = Path(path)
     text = read_text(path, MAX_SCENE_BYTES, ConfigError)

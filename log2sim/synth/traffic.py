@@ -572,9 +572,7 @@ class Rig:
     camera: Camera
     map_T_cam: Array  # (4, 4)
     map_T_lidar: Array  # (4, 4)
-    # (4, 4) float64: a frame at the camera with x right, y down along gravity and z forward: the camera's own where it
-    # looks level
-    map_T_level: Array
+    map_T_level: Array  # (4, 4): at the camera, x right, y down along gravity, z forward; its own where it looks level
     lidar_height_m: float  # above the ground below it
 
 

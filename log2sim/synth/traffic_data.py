@@ -365,8 +365,7 @@ def write_traffic(
 ) -> None:
     """Write random scenes below a folder, whole or not at all, by so many processes; the same settings write the same bytes.
 
-    Raises `ConfigError` for an unknown sensor, KITTI's layout without pictures, or when the folder may not be replaced
-    or cannot be written.
+    Raises `ConfigError` for an unknown sensor, KITTI's layout without pictures, or a folder that may not be replaced or written.
     """
     if settings.layout == "kitti" and not settings.pictures:
         raise ConfigError("KITTI's layout labels what pictures show; without pictures choose the layout log2sim")

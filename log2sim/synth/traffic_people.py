@@ -1,7 +1,6 @@
 """Random people and riders made of convex polytopes: all sizes and postures, alone and with what they push, carry or ride.
 
-Each kind of a category has a share and a way to draw it, so that training can leave kinds out that its report then meets for the
-first time.
+Each kind of a category has a share and a way to draw it, so that training can leave out some, which are new to its report.
 """
 
 from __future__ import annotations
