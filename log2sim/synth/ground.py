@@ -286,11 +286,9 @@ class Ground:
         sidewalk = canvas.drawn(self._sidewalks)
         if sidewalk is not None:
             # Slabs are darker by the share of joints in a pixel.
-            factor = 2**level
-            fine = [
-                np.arange(first * TILE_PX * factor, (first + 1) * TILE_PX * factor) % SLAB_PX == 0 for first in (j, i)
-            ]
-            joints = [np.asarray(f.reshape(TILE_PX, factor).mean(1), np.float32) for f in fine]
+            count = TILE_PX * 2**level  # of fine pixels along a side
+            fine = [np.arange(first * count, (first + 1) * count) % SLAB_PX == 0 for first in (j, i)]
+            joints = [np.asarray(f.reshape(TILE_PX, -1).mean(1), np.float32) for f in fine]
             plain = np.outer(1 - joints[0], 1 - joints[1])
             _blend(planes, PAVING, sidewalk, np.asarray(1 - (1 - JOINT_SHADE) * (1 - plain), np.float32))
             _blend(planes, CURB, canvas.drawn(self._curbs))

@@ -210,9 +210,8 @@ def car(size_m: tuple[float, float, float], kind: str) -> Mesh:
         # Both ends lie in the middle; the one at the top is drawn once, from the right.
         rings.append([(u, y, z) for y, z in side[:-1] + [(-y, z) for y, z in side[:0:-1]]])
     skin = loft(np.array(rings) * [length, width, height], Material.CAR_BODY)
-    floor = block(
-        [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height], Material.CHASSIS
-    )
+    low, high = [-0.42 * length, -0.36 * width, 0.14 * height], [0.42 * length, 0.36 * width, 0.3 * height]
+    floor = block(low, high, Material.CHASSIS)
     hubs = [[s * WHEEL_AT * length, side * (width / 2 - 0.115), WHEEL_RADIUS_M] for s in (-1, 1) for side in (-1, 1)]
     wheels = [disc_wheel(hub, WHEEL_RADIUS_M, 0.22, Material.WHEEL) for hub in hubs]
     mirrors, x, z = [], 0.165 * length, 0.63 * height
@@ -391,9 +390,8 @@ def _rider(step: int) -> Mesh:
     hip_z = 1.0
     for side, shift in ((1, 0.0), (-1, np.pi)):
         pedal = crank + [0.17 * np.cos(phase + shift), side * 0.11, -0.17 * np.sin(phase + shift)]
-        parts.append(
-            limb([crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]], [0.014, 0.014], Material.MIRROR, count=6)
-        )
+        arm = [crank + [0, side * 0.07, 0], pedal + [0, -side * 0.02, 0]]
+        parts.append(limb(arm, [0.014, 0.014], Material.MIRROR, count=6))
         hip, ankle = np.array([-0.22, side * 0.09, hip_z]), pedal + [-0.06, 0, 0.1]
         # The knee bends forward between hip and ankle.
         reach = ankle - hip

@@ -414,11 +414,9 @@ def _write_scene(settings: TrafficSettings, folder: Path, index: int) -> dict[st
 
 def draw_traffic(settings: TrafficSettings, index: int) -> tuple[traffic.TrafficScene, Environment]:
     """Draw scene `index`; it depends on the seed and the index, not on how many there are."""
-    environment = traffic.draw_environment(
-        np.random.default_rng([settings.seed, index, 1]), settings.light, settings.weather
-    )
+    rng, of_air = (np.random.default_rng([settings.seed, index, k]) for k in (0, 1))
+    environment = traffic.draw_environment(of_air, settings.light, settings.weather)
     lidar = traffic.sensor_named(settings.sensor, settings.mount)
-    rng = np.random.default_rng([settings.seed, index, 0])
     return traffic.draw_scene(settings.mount, rng, lidar=lidar, weather=environment), environment
 
 

@@ -314,12 +314,8 @@ def _motorcycle(rng: Rng, *, scooter: bool) -> tuple[float, float, list[Polytope
             box((0.1, -0.16, seat - 0.15), (reach * 0.6, 0.16, seat + 0.15), PAINT),
         ]
     if rng.random() < 0.4:
-        screen = [
-            (reach * 0.5, seat),
-            (reach * 0.9, seat - 0.1),
-            (reach * 0.65, seat + 0.5),
-            (reach * 0.55, seat + 0.5),
-        ]
+        top = seat + 0.5
+        screen = [(reach * 0.5, seat), (reach * 0.9, seat - 0.1), (reach * 0.65, top), (reach * 0.55, top)]
         parts.append(prism(screen, 0.35, GLASS))
     return length, seat, parts
 

@@ -120,10 +120,8 @@ def _delivery_van(rng: Rng) -> Shape:
     half, hood = length / 2, rng.uniform(1.1, 1.3)
     foot = half - rng.uniform(0.6, 1.0)
     top = foot - (height - hood) * rng.uniform(0.4, 0.6)
-    body = prism(
-        [(-half, 0.35), (half - 0.1, 0.3), (half, 0.5), (half, hood - 0.2), (foot, hood), (-half, hood)],
-        width, PAINT,
-    )  # fmt: skip
+    lower = [(-half, 0.35), (half - 0.1, 0.3), (half, 0.5), (half, hood - 0.2), (foot, hood), (-half, hood)]
+    body = prism(lower, width, PAINT)
     side = [(-half, hood), (foot - 0.9, hood), (top - 0.5, height), (-half + 0.05, height)]
     upper = prism(side, width * 0.99, PAINT, taper=0.04)
     front = [(foot - 1.0, hood), (foot, hood), (top, height), (top - 0.6, height)]
@@ -222,11 +220,9 @@ def caravan(rng: Rng) -> Shape:
     """Draw a caravan."""
     length, width, height = rng.uniform(4.5, 7.5), rng.uniform(2.0, 2.5), rng.uniform(2.4, 2.8)
     half = length / 2
-    body = prism(
-        [(-half + 0.2, 0.4), (half - 0.5, 0.4), (half, 1.2), (half - 0.4, height), (-half, height)], width, PAINT
-    )
+    side = [(-half + 0.2, 0.4), (half - 0.5, 0.4), (half, 1.2), (half - 0.4, height), (-half, height)]
     return (length, width, height), (
-        body,
+        prism(side, width, PAINT),
         box((half - 0.5, -0.05, 0.4), (half + 0.9, 0.05, 0.5), METAL),
         *(wheel(0.33, 0.2, 0.0, s * (width / 2 - 0.1)) for s in (1, -1)),
     )
@@ -430,13 +426,11 @@ def fence(length: float, rng: Rng) -> Parts:
             return (wall,)
         # Climbing plants, shrubs and heaps before it.
         tops = height * rng.uniform(0.2, 1.1, rng.integers(1, 6))
-        plants = (
-            ellipsoid(
-                (rng.uniform(0.3, 1.2), rng.uniform(0.1, 0.6), top / 2), (x, -rng.uniform(0.1, 0.5), top / 2), LEAVES
-            )
-            for x, top in zip(rng.uniform(-half, half, len(tops)), tops)
-        )
-        return (wall, *plants)
+        parts = [wall]
+        for x, top in zip(rng.uniform(-half, half, len(tops)), tops):
+            radii = rng.uniform(0.3, 1.2), rng.uniform(0.1, 0.6), top / 2
+            parts.append(ellipsoid(radii, (x, -rng.uniform(0.1, 0.5), top / 2), LEAVES))
+        return tuple(parts)
     if kind < 0.72:
         return (
             box((-half, -0.04, 0.5), (half, 0.04, 0.8), METAL),
@@ -447,9 +441,8 @@ def fence(length: float, rng: Rng) -> Parts:
         # A gate between pillars, one with a letterbox or a bell.
         wide, thick = min(rng.uniform(0.9, 4.0), length) / 2, rng.uniform(0.04, 0.25)
         posts += [block(x, 0.0, thick, thick, (0, height + rng.uniform(-0.2, 0.3)), WALL) for x in (-wide, wide)]
-        posts.append(
-            block(wide, -thick, rng.uniform(0.1, 0.25), rng.uniform(0.05, 0.2), (0.7, rng.uniform(1.0, 1.6)), METAL)
-        )
+        along, across, top = rng.uniform(0.1, 0.25), rng.uniform(0.05, 0.2), rng.uniform(1.0, 1.6)
+        posts.append(block(wide, -thick, along, across, (0.7, top), METAL))
     return (box((-half, -0.02, 0.1), (half, 0.02, height), MESH), *posts)
 
 
@@ -472,9 +465,8 @@ def building(length: float, entrances: Sequence[float], rng: Rng) -> Parts:
         wide, tall = min(rng.uniform(0.8, 6.0), length) / 2, rng.uniform(1.8, 4.0) if rng.random() < 0.5 else height
         parts.append(box((x - wide, -rng.uniform(0.3, 2.5), 0), (x + wide, 0.1, tall), WALL))
     if not entrances:
-        parts += [
-            box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in np.arange(-half + 1.5, half - 1, 3.2)
-        ][:2]
+        places = np.arange(-half + 1.5, half - 1, 3.2)[:2]
+        parts += [box((x - 0.6, -0.02, 1.0), (x + 0.6, 0.1, 2.3), GLASS) for x in places]
         if rng.random() < 0.5:
             x = rng.uniform(-half * 0.6, half * 0.6)
             parts.append(box((x - 0.8, -rng.uniform(0.2, 1.2), 0), (x + 0.8, 0.1, rng.uniform(1.0, 3.2)), WALL))
