@@ -98,9 +98,7 @@ class _Search:
             for place in (log.path.relative_to(folder).as_posix(),)
             for name in (place, f"{place}/{log.sequence}", *({log.sequence} - stems))
         }
-        own = [
-            (name, s) for name, sequences in held.items() for s in sequences if (name, s) not in known and s[0] != "."
-        ]
+        own = [(name, s) for name, some in held.items() for s in some if (name, s) not in known and s[0] != "."]
         return [*deeper, *(self._log(folder, name, sequence) for name, sequence in own)]
 
     def _held(self, folder: Path) -> dict[str, list[str]]:

@@ -133,9 +133,8 @@ def format_batch_verdict(document: Figures) -> str:
         lines.append(("wrong", f"{table.percent(total['wrong_share'])} of the reconstructed agents' ticks"))
     low = sorted((e["recall"], e["log"]) for e in compared if e["recall"] is not None and e["recall"] < 1)
     if low and len(compared) > 1:
-        lines.append(
-            ("lowest", "; ".join(f"{log} recall {table.percent(recall)}" for recall, log in low[: table.MAX_NAMED]))
-        )
+        named = [f"{log} recall {table.percent(recall)}" for recall, log in low[: table.MAX_NAMED]]
+        lines.append(("lowest", "; ".join(named)))
     missing = document["without_truth"]
     notes = [f"{missing} logs are not below the folder with the truth"] if missing else []
     notes += [f"{entry['log']}: {entry['error']}" for entry in document["logs"] if "error" in entry]

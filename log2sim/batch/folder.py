@@ -350,9 +350,8 @@ def _failures(rows: Sequence[Row]) -> str:
     """Return the section of the logs that failed, with a count of each kind of error; empty without any."""
     if not rows:
         return ""
-    kinds = ", ".join(
-        f"{count} {html.escape(kind)}" for kind, count in Counter(r.error_kind for r in rows).most_common()
-    )
+    counts = Counter(row.error_kind for row in rows)
+    kinds = ", ".join(f"{count} {html.escape(kind)}" for kind, count in counts.most_common())
     lines = [
         f"<tr><td>{_linked(row)}</td><td>{html.escape(row.format)}</td><td>{html.escape(row.error_kind)}</td>"
         f"<td class=error>{html.escape(row.error)}</td><td class=n>{row.attempts}</td></tr>"

@@ -341,13 +341,9 @@ def _run_on_worker(job: Job) -> tuple[dict[str, Any], bool]:
                 scenario, report = result.scenario, result.report
                 scenario.save(unfinished / SCENARIO_FILE)
                 write_json(unfinished / REPORT_FILE, report)
+                faults = len(report["faults"])
                 unreadable = sum(stream["count"] for stream in report["unreadable"].values())
-                figures = {
-                    "ticks": report["ticks"],
-                    "faults": len(report["faults"]),
-                    "unreadable": unreadable,
-                    **spent(),
-                }
+                figures = {"ticks": report["ticks"], "faults": faults, "unreadable": unreadable, **spent()}
             if folder.settings.replay:
                 begun = time.process_time()
                 replayed = replay(scenario)

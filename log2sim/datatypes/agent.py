@@ -186,9 +186,8 @@ def hermite(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Arr
     f = t / span
     begin, end = value.take(i, axis=-1), value.take(i + 1, axis=-1)
     begin_rise, end_rise, rise = span * slope.take(i, axis=-1), span * slope.take(i + 1, axis=-1), end - begin
-    return begin + f * (
-        begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * (begin_rise + end_rise - 2 * rise))
-    )
+    cubic = begin_rise + end_rise - 2 * rise
+    return begin + f * (begin_rise + f * (3 * rise - 2 * begin_rise - end_rise + f * cubic))
 
 
 def hermite_slope(value: Array, slope: Array, i: NDArray[np.intp], t: Array, span: Array) -> Array:

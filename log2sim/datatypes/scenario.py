@@ -389,9 +389,8 @@ class Scenario:
         shift = np.array([dx, dy, dz])
         features = None if self.map_features is None else self.map_features.moved(lambda points_m: points_m + shift)
         signals = tuple(replace(s, position_m=s.position_m + shift, t_s=s.t_s + later_s) for s in self.signals)
-        sensors = tuple(
-            {**s, **{k: s[k] + d for k, d in zip(("x_m", "y_m", "z_m"), (dx, dy, dz))}} for s in self.sensors
-        )
+        by_axis = {"x_m": dx, "y_m": dy, "z_m": dz}
+        sensors = tuple({**s, **{k: s[k] + d for k, d in by_axis.items()}} for s in self.sensors)
         tags = self.tags and tuple(
             replace(g, **{k: getattr(g, k) + later_s for k in ("start_s", "t_s", "end_s")}) for g in self.tags
         )

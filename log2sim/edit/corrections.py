@@ -405,10 +405,8 @@ def merge_agents(agent: Agent, other: Agent) -> Agent:
             stepped.append(replace(a, waypoints=resampled(a, t_s)) if len(t_s) > 1 else a)
         waypoints = _joined(*sorted(stepped, key=lambda a: float(a.waypoints.t_s[0])))
     doubts = tuple(dict.fromkeys(d for a in (agent, other) for d in a.doubts))
-    seen = {
-        side: (*agent.observed_by.get(side, ()), *other.observed_by.get(side, ()))
-        for side in {**agent.observed_by, **other.observed_by}
-    }
+    sides = {**agent.observed_by, **other.observed_by}
+    seen = {side: (*agent.observed_by.get(side, ()), *other.observed_by.get(side, ())) for side in sides}
     return replace(
         longer, id=agent.id, waypoints=waypoints, static=static, doubts=doubts, confidence=max(agent.confidence, other.confidence),
         quarantined=agent.quarantined and other.quarantined, color=longer.color or agent.color or other.color,
@@ -446,10 +444,8 @@ def _joined(first: Agent, last: Agent) -> Waypoints:
             states.append(agent.trajectory.at(t_s))
         total = weights[0] + weights[1]
         share = weights[1] / total
-        mean = {
-            k: (1 - share) * getattr(states[0], k) + share * getattr(states[1], k)
-            for k in ("x_m", "y_m", "z_m", "speed_mps")
-        }
+        columns = ("x_m", "y_m", "z_m", "speed_mps")
+        mean = {k: (1 - share) * getattr(states[0], k) + share * getattr(states[1], k) for k in columns}
         yaw = wrap_angle(states[0].yaw_rad + share * wrap_angle(states[1].yaw_rad - states[0].yaw_rad))
         known = [np.interp(t_s, w.t_s, w.observed.astype(np.float64), left=0.0, right=0.0) > 0.5 for w in (a, b)]
         return Waypoints(t_s=t_s, **mean, yaw_rad=yaw, observed=known[0] | known[1], sigma_xy_m=1 / np.sqrt(total))

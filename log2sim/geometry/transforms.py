@@ -227,10 +227,8 @@ class PoseTrack:
         fraction = (t - self.t_ns[i]).astype(np.float64) / span
         q = self._quaternions
         position = self.map_T_ego[:, :3, 3]
-        poses = transform(
-            rotation_from_quaternion(slerp(q[i], q[k], fraction)),
-            position[i] + fraction[:, None] * (position[k] - position[i]),
-        )
+        rotation = rotation_from_quaternion(slerp(q[i], q[k], fraction))
+        poses = transform(rotation, position[i] + fraction[:, None] * (position[k] - position[i]))
         margin = round(self.extrapolate_s * NS_PER_S)
         inside = (t >= self.t_ns[0] - margin) & (t <= self.t_ns[-1] + margin)
         recorded = (t == self.t_ns[i]) | (t == self.t_ns[k])

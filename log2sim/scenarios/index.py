@@ -66,9 +66,8 @@ def rows_of(scenario: Scenario, file: str) -> list[Row]:
             agent = agents.get(id or "")
             if agent is None:
                 continue
-            before, now, after = agent.at(
-                [tag.t_s - TICK_S, tag.t_s, tag.t_s + TICK_S], margin_s=1e-3
-            ).speed_mps.tolist()
+            states = agent.at([tag.t_s - TICK_S, tag.t_s, tag.t_s + TICK_S], margin_s=1e-3)
+            before, now, after = states.speed_mps.tolist()
             ends = (before if np.isfinite(before) else now), (after if np.isfinite(after) else now)
             span_s = TICK_S * (np.isfinite(before) + np.isfinite(after))
             row[f"{role}.category"], row[f"{role}.confidence"] = agent.category, agent.confidence

@@ -218,11 +218,10 @@ def _stepping_out(traffic: motion.Traffic, b: motion.Beside, r: int, o: int) -> 
         ticks = ticks[np.isfinite(traffic.place_m[r, ticks])]
         present = ticks[np.isfinite(traffic.place_m[o, ticks])]
         first = int(present[0])
-        velocity = (traffic.place_m[o, n] - traffic.place_m[o, first]) / (n - first) if n > first else 0.0
+        places = traffic.place_m[o]
+        velocity = (places[n] - places[first]) / (n - first) if n > first else 0.0
         # Before it was seen first it walked the same way.
-        place = np.where(
-            ticks < first, traffic.place_m[o, first] + (ticks - first) * velocity, traffic.place_m[o, ticks]
-        )
+        place = np.where(ticks < first, places[first] + (ticks - first) * velocity, places[ticks])
         hidden = _hidden(traffic, traffic.place_m[r, ticks], place, ticks, (r, o))
         if not hidden.any() or hidden[-1]:
             continue
@@ -246,10 +245,8 @@ def _hidden(traffic: motion.Traffic, eye: Array, place: Array, ticks: Array, pai
         there = np.flatnonzero(t.present[k, ticks])
         if len(there):  # half as wide as it is, since who is hidden in part is seen
             rows = ticks[there]
-            boxes = shapely.polygons(
-                box_corners_bev(t.xy_m[k, rows], t.size_m[k, 0], t.size_m[k, 1] / 2, t.yaw_rad[k, rows])
-            )
-            hidden[there] |= shapely.intersects(sight[there], boxes)
+            corners = box_corners_bev(t.xy_m[k, rows], t.size_m[k, 0], t.size_m[k, 1] / 2, t.yaw_rad[k, rows])
+            hidden[there] |= shapely.intersects(sight[there], shapely.polygons(corners))
     return hidden
 
 
@@ -284,11 +281,8 @@ def _crossings(traffic: motion.Traffic) -> Iterator[Tag]:
         for one, two, n in ((a, c, i), (c, a, j)):
             if traffic.wheeled[one] and traffic.wheeled[two] and _turns_across(traffic, one, two, n, begin):
                 yield tag_of(traffic, "turning_across", one, (min(begin, i), n, j), sure, two, **measures)
-        near = max(
-            motion.probability_above(NEAR_PET_S - pet, 0.0, sigma_s),
-            motion.probability_above(NEAR_TTC_S - ttc, 0.0, sigma_s),
-        )
         if pet < NEAR_PET_S or ttc < NEAR_TTC_S:
+            near = max(motion.probability_above(by_s, 0.0, sigma_s) for by_s in (NEAR_PET_S - pet, NEAR_TTC_S - ttc))
             yield tag_of(traffic, "near_miss", a, (min(touch, i), i, j), near, c, **measures)
 
 
@@ -317,8 +311,5 @@ def _turns_across(traffic: motion.Traffic, one: int, two: int, n: int, begin: in
     came = abs(wrap_angle(course[one, known] - course[two, known]))
     first = int(known[np.argmax(came)])
     straight = abs(float(wrap_angle(course[two, known[-1]] - course[two, first]))) < np.radians(30)
-    return bool(
-        came.max() > ONCOMING_RAD
-        and straight
-        and abs(float(wrap_angle(course[one, n] - course[one, first]))) > np.radians(25)
-    )
+    turns = abs(float(wrap_angle(course[one, n] - course[one, first]))) > np.radians(25)
+    return bool(came.max() > ONCOMING_RAD and straight and turns)

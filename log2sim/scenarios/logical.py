@@ -81,9 +81,8 @@ class Logical:
 
         centers, width = self._kernels
         at = np.linspace(centers.min(axis=0) - 5 * width, centers.max(axis=0) + 5 * width, GRID)
-        return at, np.stack(
-            [ndtr((at[:, None, k] - centers[:, k]) / width[k]).mean(axis=1) for k in range(len(self.names))], axis=1
-        )
+        p = [ndtr((at[:, None, k] - centers[:, k]) / width[k]).mean(axis=1) for k in range(len(self.names))]
+        return at, np.stack(p, axis=1)
 
     def cdf(self, x: Array) -> Array:
         """Return the cumulative probabilities (M, D) of each parameter alone."""

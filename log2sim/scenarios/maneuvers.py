@@ -133,10 +133,8 @@ def _in_lane(traffic: Traffic, k: int, lane: int, first: int, last: int) -> tupl
     """Return how far to the left of a lane's middle an agent is, and half the lane's width, at ticks from one to another."""
     place = traffic.place_m[k, first : last + 1]
     known, line = traffic.lanes[lane]
-    at = line.project(
-        np.column_stack([np.nan_to_num(place.real), np.nan_to_num(place.imag)]),
-        np.nan_to_num(traffic.course_rad[k, first : last + 1]),
-    )
+    xy = np.nan_to_num(np.column_stack([place.real, place.imag]))
+    at = line.project(xy, np.nan_to_num(traffic.course_rad[k, first : last + 1]))
     share = at.s_m / max(line.length_m, 1e-9)
     width = np.interp(share, np.linspace(0, 1, len(known.width_m)), known.width_m)
     return np.where(np.isfinite(place), at.aside_m, np.nan), width / 2

@@ -251,10 +251,9 @@ def _closest(connection: Any, condition: Condition, parts: list[ast.expr]) -> li
         left = count(rest) if rest or condition.main else 0
         if not left:
             continue
+        without = f"without '{_source(condition, part)}' there are {left}"
         nearest_value = _nearest_value(connection, condition, part, rest)
-        sentences.append(
-            ", ".join(filter(None, (f"without '{_source(condition, part)}' there are {left}", nearest_value)))
-        )
+        sentences.append(", ".join(filter(None, (without, nearest_value))))
     if sentences:
         return sentences
     alone = [f"'{_source(condition, part)}' {count([part])}" for part in parts]

@@ -140,9 +140,8 @@ class Traffic:
         self.course_rad = np.angle(np.where(self.speed_mps > 1.0, velocity, heading))
         jitter = np.array([_jitter(a) for a in t.agents]).reshape(-1, 1)
         self.sigma_m = np.where(t.sigma_m.any(axis=1, keepdims=True), t.sigma_m, jitter) if len(jitter) else t.sigma_m
-        self.sigma_speed_mps = np.array([_sigma_speed(t, k, s) for k, s in enumerate(self.sigma_m)]).reshape(
-            self.sigma_m.shape
-        )
+        sigma_speed = [_sigma_speed(t, k, s) for k, s in enumerate(self.sigma_m)]
+        self.sigma_speed_mps = np.array(sigma_speed).reshape(self.sigma_m.shape)
         self._paths: dict[int, Path | None] = {}
 
     def path(self, k: int) -> Path | None:
