@@ -88,9 +88,9 @@ class Condition:
 
     def _sql(self, node: ast.expr) -> _Sql:
         match node:
-            case ast.BoolOp(op, operands):
+            case ast.BoolOp(junction, operands):
                 parts = [self._truth(v) for v in operands]
-                word = " AND " if isinstance(op, ast.And) else " OR "
+                word = " AND " if isinstance(junction, ast.And) else " OR "
                 return _Sql(f"({word.join(p.text for p in parts)})", [v for p in parts for v in p.values])
             case ast.UnaryOp(ast.Not(), operand):
                 part = self._truth(operand)
