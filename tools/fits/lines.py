@@ -24,7 +24,7 @@ from shapely.geometry.base import BaseGeometry
 
 from fits.confidence import fit_weights
 from fits.line_maps import RoadMap
-from log2sim.datatypes import LANE_LINE_KINDS, Marking
+from log2sim.datatypes import Marking
 from log2sim.evaluation.road import MIN_ARROW_OVERLAP
 from log2sim.geometry import Array
 from log2sim.road.borders import find_edges
@@ -66,10 +66,8 @@ def judged_of(path: Path) -> list[Judged]:
     """Find what may be markings and borders in a map, and judge it by the truth."""
     road: RoadMap = pickle.loads(path.read_bytes())
     areas, lines = find_paint(road.ground)
-    lanes, stops, bars = (
-        _Paint([m for m in road.true.markings if m.kind in kinds])
-        for kinds in (LANE_LINE_KINDS, ("stop_line",), ("crosswalk",))
-    )
+    lanes = _Paint([m for m in road.true.markings if m.is_lane_line])
+    stops, bars = (_Paint([m for m in road.true.markings if m.kind == kind]) for kind in ("stop_line", "crosswalk"))
     out = []
     for line in lines:
         paint = stops if line.kind == "stop_line" else lanes
