@@ -270,6 +270,16 @@ def test_dashes_that_a_camera_sees_blurred_are_no_symbols() -> None:
     assert [m.kind for m in find_markings(replace(ground, color_bgr=blurred))[0]] == ["dashed"]
 
 
+@pytest.mark.parametrize("half_m", [1.3, 1.75, 2.6, 3.5])
+def test_what_lies_in_the_middle_of_a_lane_is_no_lane_line(half_m: float) -> None:
+    """Strokes between two lines, within a lane as arrows whose heads do not show, or between two lanes."""
+    painter = Painter(EXTENT)
+    painter.lines([line_of(lambda x, y=y: 0 * x + y, 0, 50) for y in (-half_m, half_m)])
+    painter.lines([np.array([[x, 0.0], [x + 4.0, 0.0]]) for x in (5.0, 17.0, 29.0)], 0.2)
+    lines = [m for m in find_markings(painter.ground())[0] if m.is_lane_line]
+    assert sorted(m.kind for m in lines) == ["dashed"] * (half_m > 2) + ["solid"] * 2
+
+
 def test_markings_turn_with_the_map() -> None:
     painter = Painter((0.0, 30.0, -15.0, 15.0))
     painter.lines([line_of(lambda x: 0.3 * x - 2, 0, 30)])
