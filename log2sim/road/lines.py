@@ -241,9 +241,6 @@ BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along h
 HALF_LANE_M = (1.25, 2.2)
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
 MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
-# Paint of the same time is about as bright; a fainter line next to another is what is left of removed paint. Contrasts below the least are
-# noise, and a line of less than a third of the contrast is as surely removed as can be.
-MIN_CONTRAST, MAX_FAINTER = 0.02, 1.0  # logarithms
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
 
@@ -360,7 +357,7 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     parallel = (turn < PARALLEL_RAD) & (np.abs(left) > BESIDE_M[0]) & (distance <= BESIDE_M[1])
     crossing = (turn > np.pi / 4) & (distance < 0.5)
     length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
-    half_lane = (turn < PARALLEL_RAD) & (np.abs(left) > HALF_LANE_M[0]) & (odds[owner[b]] > odds[owner[a]] - 1)
+    half_lane = (turn < PARALLEL_RAD) & (np.abs(left) > HALF_LANE_M[0]) & (odds[owner[b]] > 0)
     sides = np.zeros((len(points), 2))
     sides[a[half_lane], (left[half_lane] > 0).astype(int)] = 1
     mid_lane = np.bincount(owner, sides.all(axis=1)) / np.bincount(owner)
@@ -374,11 +371,12 @@ def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
     told = _alike(lines, odds, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
     crossings = np.bincount(k[told], minlength=len(lines))
     grid = (crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length)
+    # Paint of the same time is about as bright; a fainter line next to another is what is left of removed paint.
     fainter, likely = np.zeros(len(lines)), odds[j] > odds[i] - 1
     np.maximum.at(fainter, i[likely], _brighter(lines, i[likely], j[likely]))
     context = {
         "crowded": crowded.astype(float) + grid,
-        "fainter": np.minimum(fainter, MAX_FAINTER),
+        "fainter": fainter,
         "mid_lane": mid_lane,
     }
     return [
@@ -410,6 +408,6 @@ def _brighter(lines: list[PaintedLine], one: NDArray[np.intp], other: NDArray[np
     ratio = np.zeros(len(one))
     for name in ("reflected", "color"):
         contrast = np.array([median_known(getattr(line.pieces, name)) for line in lines])
-        found = np.log(np.maximum(contrast[other], MIN_CONTRAST) / np.maximum(contrast[one], MIN_CONTRAST))
+        found = np.log(np.maximum(contrast[other], 1e-3) / np.maximum(contrast[one], 1e-3))
         ratio = np.where(np.isfinite(found), found, ratio)
     return ratio

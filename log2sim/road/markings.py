@@ -46,7 +46,6 @@ MAX_LANE_LINE_WIDTH_M = 0.35
 # Arrows are 1.5 to 7.5 m long, letters less (MUTCD 3B.20; RMS 1).
 MAX_SYMBOL_M, MIN_SYMBOL_M2, MAX_SYMBOL_M2 = 9.0, 0.15, 12.0
 FLAKE_M = 0.1  # gaps in worn paint
-MIN_TEXTURE = 0.01  # of the road, logarithm of color
 MAX_SYMBOLS, SYMBOL_STEP_M, SAME_SYMBOL_M = 3, 20.0, 0.3  # in a row, from one to the next, and parts of one
 MAX_ACROSS_M = 3.0  # within a lane
 ROAD_AROUND_M = 4.0  # whose mean is nearly that of the road
@@ -233,7 +232,7 @@ def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea |
     x, y = x0 + (simple[:, 0] + columns.start + 0.5) * res, y1 - (simple[:, 1] + rows.start + 0.5) * res
     inside = own > 0
     contrast = float(np.median(paint[inside])) - float(np.median(road[inside]))
-    texture = max(float(np.median(np.abs(paint - road)[(mask == 0) & (seen > 0)])), MIN_TEXTURE)
+    texture = max(float(np.median(np.abs(paint - road)[(mask == 0) & (seen > 0)])), 1e-3)
     evidence = {
         "bias": 1.0,
         "clear": float(np.clip(np.log(max(contrast, 1e-3) / texture), 0, 4)),
