@@ -1,6 +1,6 @@
 """Make maps of random roads with their true markings, on which `fit.py lines` fits.
 
-    python tools/fit.py line_maps FOLDER --maps 160 --plain 40 --seed 0
+    python tools/fit.py line_maps FOLDER --maps 320 --plain 80 --seed 0
 
 Each road is straight or bent, a street or one side of a motorway, with traffic on either side, lines of any usual width, kind, color and
 wear, removed ones, crosswalks, stop lines, arrows, houses, shadows, sidewalks or grass beside it, in any light and weather; it is rendered,
@@ -288,7 +288,7 @@ def make_map(seed: int) -> RoadMap:
         return RoadMap(ground, moved.map_features or MapFeatures(), Area.of(scenario, moved, shift_m))
 
 
-def main(folder: Path, maps: int = 160, plain: int = 40, first: int = 0, seed: int = 0) -> None:
+def main(folder: Path, maps: int = 320, plain: int = 80, first: int = 0, seed: int = 0) -> None:
     """Make so many maps of roads, from the first index on, and of plain ground."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = [(f"{seed}-{index:04d}", index, make_map) for index in range(first, first + maps)]

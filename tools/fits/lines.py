@@ -1,6 +1,6 @@
 """Fit the weights of the evidence by which markings and borders of roads are judged, on maps of random roads.
 
-    python tools/fit.py line_maps FOLDER --maps 160 --plain 40
+    python tools/fit.py line_maps FOLDER --maps 320 --plain 80
     python tools/fit.py lines FOLDER ... > weights.py && mv weights.py log2sim/road/
 
 Judges every line, row of bars, symbol and edge that is found in the maps, also the unlikely ones, by how much of it is true, and prints the
