@@ -159,6 +159,16 @@ def test_crosswalk_stop_line_and_arrow_are_told_from_lane_lines() -> None:
     assert abs(cv2.contourArea(other.points_m[:, :2].astype(np.float32)) - 1.0) < 0.25
 
 
+@pytest.mark.parametrize("gap_m, crosswalks", [(2.0, 1), (4.0, 1), (8.0, 2)])
+def test_parts_of_a_crosswalk_less_than_a_lane_apart_are_one(gap_m: float, crosswalks: int) -> None:
+    painter = Painter(EXTENT)
+    away = gap_m / 2 + np.arange(5)
+    painter.lines([np.array([[34.0, 2 + y], [38.0, 2 + y]]) for y in (*-away, *away)], 0.5)
+    found = [m.points_m[:, 1] for m in find_markings(painter.ground())[0]]
+    assert len(found) == crosswalks
+    assert np.ptp(np.concatenate(found)) == pytest.approx(gap_m + 8.5, abs=0.3)
+
+
 def test_what_a_shadow_leaves_of_a_bar_is_no_dash_of_the_line_behind_the_crosswalk() -> None:
     painter = Painter(EXTENT)
     painter.lines([np.array([[34.0, y], [38.0, y]]) for y in (*range(-7, 0), *range(1, 8))], 0.5)

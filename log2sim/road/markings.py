@@ -37,6 +37,8 @@ from log2sim.road.weights import WEIGHTS
 BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
 MAX_BAR_TURN_RAD = np.deg2rad(10)
 MIN_BARS = 3
+# Parts of a crosswalk, between which bars are worn off, hidden by a vehicle or left out on an island, are less than a lane and a bar apart.
+MAX_PART_GAP_M = 5.0
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
 # Stop lines: 0.3 to 0.6 m wide (MUTCD 12 to 24 in; StVO sign 294: 0.5 m), as long as a lane or a carriageway is wide.
 STOP_WIDTH_M, STOP_LENGTH_M = (0.22, 0.85), (1.5, 20.0)
@@ -88,14 +90,9 @@ def evidence_of_bars(pieces: Pieces, lengths_m: Sequence[float], shares: Array =
 def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[list[PaintedArea], list[Chain]]:
     """Find crosswalks among chains of touching pieces; also the chains that are left."""
     bars = [(k, bar) for k, chain in enumerate(chains) if (bar := _bar_of(ground, pieces, chain)) is not None]
-    if len(bars) < MIN_BARS:
-        return [], chains
-    count, group = connected_components(coo_matrix(_beside([bar for _, bar in bars])), directed=False)
+    parts = [part for part in _beside(bars, BAR_STEP_M[1]) if len(part) >= MIN_BARS]
     areas, used = [], set()
-    for label in range(count):
-        chosen = [bars[k] for k in np.flatnonzero(group == label)]
-        if len(chosen) < MIN_BARS:
-            continue
+    for chosen in _beside([bar for part in parts for bar in part], MAX_PART_GAP_M):
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
@@ -133,8 +130,11 @@ def _bar_of(ground: GroundMap, pieces: Pieces, chain: Chain) -> _Bar | None:
     return _Bar(middle, direction, float(end - begin), width, chain.members)
 
 
-def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
-    """Mask (B, B) of bars that are parallel and side by side."""
+def _beside(numbered: list[tuple[int, _Bar]], max_step_m: float) -> list[list[tuple[int, _Bar]]]:
+    """Group bars that are parallel, alike and side by side, from one to the next at most `max_step_m`."""
+    if not numbered:
+        return []
+    bars = [bar for _, bar in numbered]
     middle, direction = np.array([b.middle for b in bars]), np.array([b.direction for b in bars])
     length, width = np.array([b.length_m for b in bars]), np.array([b.width_m for b in bars])
     turn = np.abs((direction[:, None] - direction + np.pi / 2) % np.pi - np.pi / 2)
@@ -142,11 +142,12 @@ def _beside(bars: list[_Bar]) -> NDArray[np.bool_]:
     c, s = np.cos(direction)[:, None], np.sin(direction)[:, None]
     along, across = np.abs(offset[..., 0] * c + offset[..., 1] * s), np.abs(offset[..., 1] * c - offset[..., 0] * s)
     shorter = np.minimum(length[:, None], length)
-    near = (across >= BAR_STEP_M[0]) & (across <= BAR_STEP_M[1]) & (along <= BARS_IN_LINE * shorter)
+    near = (across >= BAR_STEP_M[0]) & (across <= max_step_m) & (along <= BARS_IN_LINE * shorter)
     alike = np.maximum(width[:, None], width) <= 1.6 * np.minimum(width[:, None], width)
     alike &= np.maximum(length[:, None], length) <= 2.0 * shorter
     beside = near & alike & (turn <= MAX_BAR_TURN_RAD)
-    return np.asarray(beside | beside.T)
+    count, group = connected_components(coo_matrix(beside | beside.T), directed=False)
+    return [[numbered[k] for k in np.flatnonzero(group == label)] for label in range(count)]
 
 
 def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[PaintedLine]]:
