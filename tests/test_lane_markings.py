@@ -159,7 +159,7 @@ def test_crosswalk_stop_line_and_arrow_are_told_from_lane_lines() -> None:
     assert abs(cv2.contourArea(other.points_m[:, :2].astype(np.float32)) - 1.0) < 0.25
 
 
-@pytest.mark.parametrize("gap_m, crosswalks", [(2.0, 1), (4.0, 1), (8.0, 2)])
+@pytest.mark.parametrize(("gap_m", "crosswalks"), [(2.0, 1), (4.0, 1), (8.0, 2)])
 def test_parts_of_a_crosswalk_less_than_a_lane_apart_are_one(gap_m: float, crosswalks: int) -> None:
     painter = Painter(EXTENT)
     away = gap_m / 2 + np.arange(5)
