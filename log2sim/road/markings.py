@@ -90,9 +90,9 @@ def evidence_of_bars(pieces: Pieces, lengths_m: Sequence[float], shares: Array =
 def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[list[PaintedArea], list[Chain]]:
     """Find crosswalks among chains of touching pieces; also the chains that are left."""
     bars = [(k, bar) for k, chain in enumerate(chains) if (bar := _bar_of(ground, pieces, chain)) is not None]
-    parts = [part for part in _beside(bars, BAR_STEP_M[1]) if len(part) >= MIN_BARS]
+    parts = [part for part in _rows_of(bars, BAR_STEP_M[1]) if len(part) >= MIN_BARS]
     areas, used = [], set()
-    for chosen in _beside([bar for part in parts for bar in part], MAX_PART_GAP_M):
+    for chosen in _rows_of([bar for part in parts for bar in part], MAX_PART_GAP_M):
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
@@ -130,7 +130,7 @@ def _bar_of(ground: GroundMap, pieces: Pieces, chain: Chain) -> _Bar | None:
     return _Bar(middle, direction, float(end - begin), width, chain.members)
 
 
-def _beside(numbered: list[tuple[int, _Bar]], max_step_m: float) -> list[list[tuple[int, _Bar]]]:
+def _rows_of(numbered: list[tuple[int, _Bar]], max_step_m: float) -> list[list[tuple[int, _Bar]]]:
     """Group bars that are parallel, alike and side by side, from one to the next at most `max_step_m`."""
     if not numbered:
         return []
