@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -90,6 +91,20 @@ def test_the_lidar_detector_runs(examples: Path, tiny_folder: Path) -> None:
     cloud = cloud_of(log)
     found = create_lidar_detector("lidar:highest", log, Config().lidar).detect(cloud)
     assert found.center_m[0, 2] + 0.75 == pytest.approx(cloud.xyz[cloud.height.argmax(), 2] + cloud.origin[2])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"), [({"category": np.array(["bycicle"])}, "cyclist|bicycle"), ({"score": np.array([1.2])}, "1.2")]
+)
+def test_boxes_in_clouds_that_cannot_be_are_told(
+    examples: Path, tiny_folder: Path, monkeypatch: pytest.MonkeyPatch, wrong: dict, told: str
+) -> None:
+    log = open_log(tiny_folder)
+    detector, cloud = create_lidar_detector("lidar:highest", log, Config().lidar), cloud_of(log)
+    boxes = replace(detector.detect(cloud).take(np.arange(1)), **wrong)
+    monkeypatch.setattr(type(detector.inner), "detect", lambda *_: boxes)
+    with pytest.raises(PluginError, match=f"row 0: .*({told})"):
+        detector.detect(cloud)
 
 
 def test_the_exporter_writes(examples: Path, tiny_folder: Path, tmp_path: Path) -> None:

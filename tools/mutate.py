@@ -23,6 +23,8 @@ from mutation.harness import BAD, GOOD, Harness, Row, kind_of
 
 def main(seed: int = 0, count: int = 100, start: int = 0, only: list[str] = [], keep: bool = False) -> int:
     """Run the command; 1 when anything is as it must not be."""
+    if unknown := set(only) - set(KINDS):
+        raise SystemExit(f"--only {', '.join(sorted(unknown))}: expected some of {', '.join(KINDS)}")
     folder = Path(tempfile.mkdtemp(prefix="mutate-")).resolve()  # not a link
     wanted = (k for k in itertools.count(start) if not only or kind_of(k) in only)
     numbers, rows = list(itertools.islice(wanted, count)), []

@@ -147,16 +147,21 @@ def find_defect(found: Detections) -> str | None:
         return (
             f"box_px has the shape {np.shape(found.box_px)} and category {np.shape(found.category)} for {count} scores"
         )
-    for k, category in enumerate(found.category):
-        if category not in CATEGORIES:
-            hint = plugins.nearest(str(category), list(CATEGORIES))
-            return f"row {k}: unknown category '{category}'{hint}; known: {', '.join(CATEGORIES)}"
-    box, score = np.asarray(found.box_px, dtype=np.float64), np.asarray(found.score, dtype=np.float64)
+    box = np.asarray(found.box_px, dtype=np.float64)
     right = np.isfinite(box).all(axis=1) & (box[:, 2] > box[:, 0]) & (box[:, 3] > box[:, 1])
     if not right.all():
         k = int(np.argmin(right))
         return f"row {k}: the box is {box[k].tolist()}, expected x0 < x1 and y0 < y1"
-    right = (score >= 0) & (score <= 1)
+    return find_wrong_name_or_score(found.category, found.score)
+
+
+def find_wrong_name_or_score(category: NDArray[np.str_], score: NDArray[np.float64]) -> str | None:
+    """Return which of the categories (N,) or scores (N,) of a detector cannot be; None where nothing is wrong."""
+    for k, name in enumerate(category):
+        if name not in CATEGORIES:
+            hint = plugins.nearest(str(name), list(CATEGORIES))
+            return f"row {k}: unknown category '{name}'{hint}; known: {', '.join(CATEGORIES)}"
+    right = (np.asarray(score) >= 0) & (np.asarray(score) <= 1)
     if not right.all():
         k = int(np.argmin(right))
         return f"row {k}: the score is {score[k]:g}, expected a number from 0 to 1"

@@ -18,7 +18,12 @@ from log2sim.errors import ConfigError, Log2SimError, PluginError
 from log2sim.files import plugins
 from log2sim.files.plugins import DETECT_IN_CLOUD, require_members
 from log2sim.geometry import NS_PER_S, Array
-from log2sim.perception.detect.detectors import ForeignDetector, interpolate_boxes, road_users
+from log2sim.perception.detect.detectors import (
+    ForeignDetector,
+    find_wrong_name_or_score,
+    interpolate_boxes,
+    road_users,
+)
 from log2sim.perception.detect3d.box_points import PointsOfBoxes, bounding_reach, most_points, points_of_boxes
 from log2sim.perception.detect3d.boxes import MIN_SCORE, LevelBoxes, decode_centers, decode_votes, sigmoid, suppress
 from log2sim.perception.detect3d.network import (
@@ -313,7 +318,10 @@ class CheckedLidarDetector(ForeignDetector):
         require_members(self.inner, MEMBERS, DETECT_IN_CLOUD, self.source)
 
     def detect(self, cloud: Cloud, earlier: Sequence[Cloud] = ()) -> Boxes3D:
-        """Detect road users in one cloud; `PluginError` when the detector raises something, or returns no `Boxes3D`."""
+        """Detect road users in one cloud.
+
+        Raises `PluginError` when the detector raises something, or returns no `Boxes3D` of known categories.
+        """
         try:
             found = self.inner.detect(cloud, earlier)
         except (Log2SimError, MemoryError):
@@ -322,4 +330,7 @@ class CheckedLidarDetector(ForeignDetector):
             raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {plugins.exception_line(error)}") from error
         if not isinstance(found, Boxes3D):
             raise PluginError(f"{self.source}: detect returned {type(found).__name__}, expected Boxes3D")
+        defect = find_wrong_name_or_score(found.category, found.score)
+        if defect is not None:
+            raise PluginError(f"{self.source}: cloud at {cloud.stamp_ns}: {defect}")
         return found
