@@ -27,6 +27,7 @@ from log2sim.datatypes.categories import (
     MIN_SIZE_M,
     RELATED_GROUPS,
     TYPICAL_SIZE_M,
+    groups_of,
 )
 from log2sim.datatypes.detections import (
     Boxes3D,
@@ -86,6 +87,6 @@ __all__ = [
     "EgoVehicle", "Finding", "Frame", "IgnoreRegions", "ImageLabels", "ImageRegions", "LabelView", "Labels", "Lidar",
     "Log", "MapFeatures", "MapFrame", "MapLane", "Marking", "Measurements", "Obstacles", "OtherView", "Rays",
     "RoadBorder", "Scenario", "Signal", "Span", "Stream", "Sweep", "Tag", "Tick", "Track", "Trajectory", "Treatment",
-    "Turn", "Waypoints", "count_agents", "count_categories", "end_of", "explain_doubt", "format_confidence", "list_doubtful",
+    "Turn", "Waypoints", "count_agents", "count_categories", "end_of", "explain_doubt", "format_confidence", "groups_of", "list_doubtful",
     "retime_spans", "seen_from",
 ]  # fmt: skip

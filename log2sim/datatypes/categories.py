@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 Size = tuple[float, float, float]
 
 
@@ -62,6 +65,12 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     group: tuple(name for name in CATEGORIES if GROUP_OF[name] == group) for group in dict.fromkeys(GROUP_OF.values())
 }
 """Categories that detectors and labelers confuse and that are therefore associated with each other."""
+
+
+def groups_of(category: NDArray[np.str_]) -> NDArray[np.str_]:
+    """Return the groups (M,) of categories (M,); what is no category, as a traffic light, stays as it is."""
+    return np.array([GROUP_OF.get(name, name) for name in category.tolist()], dtype="<U16")
+
 
 TYPICAL_SIZE_M: Mapping[str, Size] = {name: category.typical_size_m for name, category in CATEGORY.items()}
 MIN_SIZE_M: Mapping[str, Size] = {name: category.min_size_m for name, category in CATEGORY.items()}

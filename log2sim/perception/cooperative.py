@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from log2sim.config import Config
-from log2sim.datatypes import FIRST_SPEED_MPS, ROAD, Boxes3D, Log, Measurements, end_of, seen_from
+from log2sim.datatypes import FIRST_SPEED_MPS, ROAD, Boxes3D, Log, Measurements, end_of, groups_of, seen_from
 from log2sim.datatypes.log_odds import log_odds_of, probability_of
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S, Array, choose_pairs, rectangle_iou, wrap_angle
 from log2sim.perception.boxes import corner_correction, oriented_covariance, real_ends, rotate
-from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.detect3d.boxes import suppress
 from log2sim.perception.detect3d.detectors import LidarDetector, create_lidar_detector

@@ -28,6 +28,7 @@ from log2sim.datatypes import (
     Rays,
     Sweep,
     end_of,
+    groups_of,
 )
 from log2sim.files.arrays import ArrayFile, ArrayList
 from log2sim.files.cluster import Sent, count_workers, map_on_workers
@@ -38,7 +39,6 @@ from log2sim.files.stages import StageClock, usable_threads
 from log2sim.geometry import Array, inverse, line_stamps_ns
 from log2sim.perception.boxes import subsample
 from log2sim.perception.cooperative import align_parts
-from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.detect3d.detectors import LidarDetector
 from log2sim.perception.frames import MAX_CROPS, FrameDetector, LightBox, PictureFindings, add_ranges
 from log2sim.perception.homography.correspondences import (

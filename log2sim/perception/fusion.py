@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import TYPICAL_SIZE_M, Measurements
+from log2sim.datatypes import TYPICAL_SIZE_M, Measurements, groups_of
 from log2sim.geometry import CHI2_2DOF_99, NS_PER_S
 from log2sim.perception.boxes import fit_extents, place_boxes, provisional_sizes, rotate, top_of
-from log2sim.perception.detect.layouts import groups_of
 
 # Clusters are one object when this share of the points of either is inside the extents of the other.
 MIN_SHARED_POINTS = 0.4

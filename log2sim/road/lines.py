@@ -237,7 +237,7 @@ REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 # Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
 BESIDE_M, MAX_BESIDE = (0.45, 1.7), 1
 BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
-# Half of a lane 2.5 to 4.4 m wide: no lane line has others so near on both sides, arrows have.
+# Half of a lane 2.5 to 4.4 m wide: no lane line has neighbors so near on both sides, arrows have.
 HALF_LANE_M = (1.25, 2.2)
 MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
 MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
@@ -338,7 +338,7 @@ def _dense(xy: Array) -> Array:
 
 
 def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
-    """Add to the evidence which lines form combs or grids, how much fainter they are than others beside them, and what lies in mid-lane."""
+    """Add to the evidence which lines form combs or grids, how much fainter they are than their neighbors, and which are in mid-lane."""
     if len(lines) < 2:
         return lines
     dense = [_dense(line.xy)[::5] for line in lines]

@@ -189,8 +189,9 @@ def vehicle_reference(
     """Build the table of a vehicle. Columns "..._ahead" are of a later time, to compensate for the lag of the actuators."""
     course, departure_m = feasible_trajectory_of(trajectory, limits)
     first, t = _grid_times(trajectory)
+    motion = _interpolated(course, t)
     # For every row the gear, +1 or -1, of the present or next movement, and whether the agent stands.
-    speed = _interpolated(course, t)[3]
+    speed = motion[3]
     direction = np.where(np.abs(speed) < REFERENCE_HOLD_MPS, 0, np.sign(speed)).astype(int)
     runs: list[NDArray[np.intp]] = np.split(np.arange(len(speed)), np.flatnonzero(np.diff(direction)) + 1)
     gear, stands, begin = np.ones(len(speed)), np.ones(len(speed)), 0
@@ -201,14 +202,17 @@ def vehicle_reference(
             stands[run] = 0.0
             begin = run[-1] + 1
 
-    def exact(at_s: Array) -> Array:
+    def rows_at(at_s: Array, motion: Array) -> Array:
         rows = np.empty((len(VEHICLE_COLUMNS), len(at_s)))
-        rows[:4] = _interpolated(course, at_s)
+        rows[:4] = motion
         rows[4] = np.interp(at_s + accel_ahead_s, course.t_s, course.accel_mps2)
         rows[5] = np.interp(at_s + curvature_ahead_s, course.t_s, course.curvature_1pm)
         k = np.minimum(np.searchsorted(t, at_s + accel_ahead_s), len(t) - 1)
         rows[6], rows[7] = gear[k], stands[k]
         return rows.T
+
+    def exact(at_s: Array) -> Array:
+        return rows_at(at_s, _interpolated(course, at_s))
 
     flags = _discontinuity_flags(trajectory)
     for name, values, limit, unit in (
@@ -219,7 +223,7 @@ def vehicle_reference(
         worst = int(np.argmax(np.abs(values)))
         if abs(values[worst]) > limit:
             flags += (f"{name} of {values[worst]:.2f} {unit} at {course.t_s[worst]:.2f} s, limit {limit:g}",)
-    return Reference(trajectory, first, exact(t), exact, limits.offset_m, flags)
+    return Reference(trajectory, first, rows_at(t, motion), exact, limits.offset_m, flags)
 
 
 def feasible_trajectory_of(trajectory: Trajectory, limits: FeasibilityLimits) -> tuple[FeasibleTrajectory, Array]:

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, GROUPS
+from log2sim.datatypes import GROUPS
 from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 
@@ -169,11 +169,6 @@ def choose_classes(names: str | None, count: int | None, default: Classes, where
         listed, names_known = ", ".join(list(by_index.values())[:8]), ", ".join(CATEGORY_OF_NAME)
         raise ConfigError(f"{where}: none of its classes is a road user ({listed}); known: {names_known}")
     return Classes(known)
-
-
-def groups_of(category: NDArray[np.str_]) -> NDArray[np.str_]:
-    """Return the groups (M,) of categories (M,)."""
-    return np.array([GROUP_OF.get(name, name) for name in category.tolist()], dtype="<U16")
 
 
 Outputs = Mapping[str, NDArray[Any]]

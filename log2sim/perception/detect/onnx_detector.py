@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import Detections, Frame, Turn
+from log2sim.datatypes import Detections, Frame, Turn, groups_of
 from log2sim.errors import ConfigError
 from log2sim.files.inputs import read_file
 from log2sim.geometry import Array, box_iou
@@ -28,7 +28,6 @@ from log2sim.perception.detect.layouts import (
     cell_count,
     choose_classes,
     describe_outputs,
-    groups_of,
     single_output_shape,
 )
 from log2sim.perception.detect3d.network import first_line, open_session

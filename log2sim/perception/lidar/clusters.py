@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, TYPICAL_SIZE_M
+from log2sim.datatypes import GROUP_OF, MAX_SIZE_M, TYPICAL_SIZE_M, groups_of
 from log2sim.geometry import NS_PER_S, Array, apply, box_iou, undistort
 from log2sim.perception.boxes import (
     MIN_SIDE_DISTANCE_M,
@@ -22,7 +22,6 @@ from log2sim.perception.boxes import (
     subsample,
     upper_median,
 )
-from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.projection import ProjectedPoints, View
 

@@ -31,6 +31,7 @@ from log2sim.datatypes import (
     Measurements,
     OtherView,
     end_of,
+    groups_of,
     seen_from,
 )
 from log2sim.datatypes.log_odds import MAX_PROBABILITY, MIN_PROBABILITY, log_odds_of, probability_of
@@ -47,7 +48,6 @@ from log2sim.perception.boxes import (
     sort_clusters,
     upper_median,
 )
-from log2sim.perception.detect.layouts import groups_of
 from log2sim.perception.detect3d.box_points import points_of_boxes
 from log2sim.perception.lidar.cloud import Cloud
 from log2sim.perception.lidar.clusters import (
