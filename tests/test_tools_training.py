@@ -279,6 +279,41 @@ def test_a_toy_learns_to_name_colors(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (tmp_path / "colors.onnx").stat().st_size < 480_000
 
 
+def test_a_toy_learns_lines_and_calibrates_whole_markings(tmp_path: Path) -> None:
+    """Half a minute on one street: its lines are found in a map that was not trained on, of the same paint on another course."""
+    import pickle
+
+    from fits.line_maps import EVERYWHERE, RoadMap
+    from painted_ground import Painter, line_of
+    from training import markings
+
+    from log2sim.datatypes import MapFeatures, Marking
+    from log2sim.road.paint_network import find_crests, find_paint_maps, open_markings_network
+
+    def street(seed: int, slope: float) -> RoadMap:
+        painter = Painter((0.0, 60.0, -15.0, 15.0), seed=seed)
+        lines = [line_of(lambda x, y=y: y + slope * (x - 30), 0, 60) for y in (-3.0, 0.0, 3.0)]
+        painter.lines(lines, 0.2)
+        painter.lines([np.array([[50.0, 0.3], [50.0, 2.7]])], 0.5)
+        true = [Marking(f"{k}", "solid", np.column_stack([xy, 0 * xy[:, 0]]), 0.2) for k, xy in enumerate(lines)]
+        stop = Marking("stop", "stop_line", np.array([[50.0, 0.3, 0.0], [50.0, 2.7, 0.0]]), 0.5)
+        return RoadMap(painter.ground(), MapFeatures((*true, stop)), EVERYWHERE)
+
+    maps, held = tmp_path / "maps", tmp_path / "held"
+    for folder, seed, slope in ((maps, 1, 0.0), (maps, 2, 0.15), (held, 3, -0.1)):
+        folder.mkdir(exist_ok=True)
+        (folder / f"0-000{seed}.pkl").write_bytes(pickle.dumps(street(seed, slope)))
+    markings.main(maps, held, tmp_path, pictures=0, steps=120)
+    network, road = open_markings_network(tmp_path / "markings.onnx"), street(3, -0.1)
+    assert set(network.objects) == {"crosswalk", "stop_line", "other"}
+    found = find_paint_maps(road.ground, network)
+    crests = find_crests(found, found.lane_line, 0.5)
+    away = np.abs(crests.xy_map[:, 1, None] + 0.1 * (crests.xy_map[:, :1] - 30) - [-3.0, 0.0, 3.0]).min(axis=1)
+    assert len(away) > 600
+    assert np.mean(away < 0.15) > 0.8
+    assert json.loads((tmp_path / "markings.json").read_text())["simulated"]["solid"]["recall"] > 0.2
+
+
 def test_a_white_surface_in_even_light_is_as_bright_as_the_light() -> None:
     """By spherical harmonics of second order, whichever way it faces; under half a sky it has the share that it sees of it."""
     from training.color_pictures import AREA, COSINE, HARMONICS, ROWS, _harmonics

@@ -17,6 +17,7 @@ from log2sim.geometry import Array, Camera, apply, inverse, project
 from log2sim.road.ground_map import GroundMap, Raster
 from log2sim.road.lane_course import LaneLine, find_lane_lines, find_shape
 from log2sim.road.markings import list_markings
+from log2sim.road.paint_network import find_paint_maps
 from log2sim.road.pictures import Image, View, sample_at, warp_onto
 from log2sim.road.ridges import log_color
 from log2sim.road.surface import Surface
@@ -186,7 +187,7 @@ def find_markings_in_picture(
     if point is None:
         nowhere = _camera_towards(image_bgr, (image_bgr.shape[1] / 2, image_bgr.shape[0] / 2), height_m)
         note = "no markings seen: no lines meet, so the horizon of the road is unknown"
-        return PictureMarkings((), (), (), nowhere, _lay_out(image_bgr, nowhere), (note,))
+        return PictureMarkings((), (), (), nowhere, lay_out(image_bgr, nowhere), (note,))
     found = _find(image_bgr, _camera_towards(image_bgr, point, height_m))
     field = f"{np.rad2deg(HORIZONTAL_FIELD_RAD):.0f} deg"
     assumed = f"camera: {height_m:g} m above the road and a field of view of {field} are assumed"
@@ -195,9 +196,11 @@ def find_markings_in_picture(
 
 def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     """Find markings by a camera's pose, and leave out lines that do not follow the course of the road."""
-    whole = _lay_out(image_bgr, camera)
+    whole = lay_out(image_bgr, camera)
     ground = keep_road(whole, *camera.mount_T_cam[:2, 3].tolist())
-    markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M, symbols=False)
+    markings = list_markings(
+        ground, find_paint_maps(ground), min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M, symbols=False
+    )
     notes = ("markings by a camera only: light streaks are harder to tell from paint",)
     found = PictureMarkings(markings, (), (), camera, ground, notes)
     lines, shares = [], []
@@ -223,7 +226,7 @@ def _visible(found: PictureMarkings, marking: Marking) -> float:
     return float(np.ptp(rows)) if len(rows) > 1 else 0.0
 
 
-def _lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
+def lay_out(image_bgr: Image, camera: Camera) -> GroundMap:
     """Lay the ground in front of a camera out flat."""
     x, y = camera.mount_T_cam[:2, 3]
     raster = Raster.covering((x, x + REACH_M, y - HALF_WIDTH_M, y + HALF_WIDTH_M), CELL_M)

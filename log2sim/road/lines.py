@@ -20,6 +20,7 @@ from log2sim.road.paint import (
     table_of,
     weighted_sum,
 )
+from log2sim.road.paint_network import PaintMaps
 from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
 from log2sim.road.weights import WEIGHTS
@@ -243,6 +244,8 @@ MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or
 MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
+# Lines that one sensor alone shows have to be as likely to the network as the weights ask (`COSTS` in `tools/fits/lines.py`), as its roads are simulated.
+ALONE_LOG_ODDS = {"line, camera": np.log(2), "line, LiDAR": np.log(4), "line, few returns": np.log(4)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,11 +258,13 @@ class PaintedLine:
     pieces: Pieces  # what shows it
     dashes: int
     evidence: dict[str, float]  # that it is a marking, see `evidence_of_line`
+    network: float  # log-odds that it is one, by the network
 
     @cached_property
     def log_odds(self) -> float:
-        """Log-odds that it is a marking."""
-        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, self.kind)])
+        """Log-odds that it is a marking: by its evidence or by the network, whichever is surer, as either knows paint that the other does not."""
+        table = table_of(self.pieces, self.kind)
+        return max(weighted_sum(self.evidence, WEIGHTS[table]), self.network - ALONE_LOG_ODDS.get(table, 0.0))
 
     @property
     def length_m(self) -> float:
@@ -286,7 +291,9 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
     return tuple(name for name, shows in (("camera", camera), ("lidar", lidar)) if shows)
 
 
-def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[list[PaintedLine], Array]:
+def find_lines(
+    ground: GroundMap, maps: PaintMaps, pieces: Pieces, chains: list[Chain]
+) -> tuple[list[PaintedLine], Array]:
     """Make lines of chains; also estimate the shares that paint returns, see `log_probabilities_of_shares`."""
     parts: list[tuple[Array, Stretch, Pieces, float]] = []  # with the length that is painted, m
     for chain in chains:
@@ -295,7 +302,7 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[
             continue
         own = pieces.take(chain.members)
         curve = fit_curve(corners)
-        traced, s = trace(ground, curve, median(own.width_m)), curve.s
+        traced, s = trace(ground, maps, curve, median(own.width_m)), curve.s
         nearest = s[cKDTree(curve.xy).query(own.xy)[1]]
         for stretch in stretches_of(traced.strokes()):
             begin, end = stretch.begin_m, min(stretch.end_m, float(s[-1]))
@@ -308,7 +315,8 @@ def find_lines(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[
     out = []
     for xy, stretch, member, painted_m in parts:
         evidence = evidence_of_line(member, painted_m, dashes=stretch.dashes, shares=shares)
-        out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, evidence))
+        odds = maps.object_log_odds(stretch.kind, member.along)
+        out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, evidence, odds))
     return _in_context(drop_repeats(out)), shares
 
 

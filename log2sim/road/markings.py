@@ -1,4 +1,4 @@
-"""Markings and borders of roads in a map of the ground, without a network."""
+"""Markings and borders of roads in a map of the ground."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.datatypes.log_odds import probability_of
@@ -29,6 +30,7 @@ from log2sim.road.paint import (
     table_of,
     weighted_sum,
 )
+from log2sim.road.paint_network import PaintMaps, find_crests, find_paint_maps
 from log2sim.road.ridges import find_ridges, log_paint
 from log2sim.road.strokes import Curve, thin, trace
 from log2sim.road.weights import WEIGHTS
@@ -37,6 +39,7 @@ from log2sim.road.weights import WEIGHTS
 BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
 MAX_BAR_TURN_RAD = np.deg2rad(10)
 MIN_BARS = 3
+NEAR_RIDGE_M = 1.0  # within which the network's probability reaches beyond the ends of strokes
 # Parts of a crosswalk, between which bars are worn off, hidden by a vehicle or left out on an island, are less than a lane and a bar apart.
 MAX_PART_GAP_M = 5.0
 BARS_IN_LINE = 0.6  # share of their length by which neighbors may be shifted (slanting crosswalks)
@@ -63,12 +66,13 @@ class PaintedArea:
     width_m: float  # of a crosswalk its extent along the road, of others the lesser extent
     pieces: Pieces  # what shows it
     evidence: dict[str, float]  # that it is a marking, see `evidence_of_line`
+    network: float  # log-odds that it is one, by the network
     bars_m: Sequence[float] = ()  # lengths of the bars of a crosswalk
 
     @cached_property
     def log_odds(self) -> float:
-        """Log-odds that it is a marking."""
-        return weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, self.kind)])
+        """Log-odds that it is a marking: by its evidence or by the network, whichever is surer."""
+        return max(weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, self.kind)]), self.network)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +91,18 @@ def evidence_of_bars(pieces: Pieces, lengths_m: Sequence[float], shares: Array =
     return evidence_of_line(pieces, sum(lengths_m), dashes=len(lengths_m), shares=shares, bars=True)
 
 
-def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> tuple[list[PaintedArea], list[Chain]]:
+def find_crosswalks(
+    ground: GroundMap, maps: PaintMaps, pieces: Pieces, chains: list[Chain]
+) -> tuple[list[PaintedArea], list[Chain]]:
     """Find crosswalks among chains of touching pieces; also the chains that are left."""
-    bars = [(k, bar) for k, chain in enumerate(chains) if (bar := _bar_of(ground, pieces, chain)) is not None]
+    bars = [(k, bar) for k, chain in enumerate(chains) if (bar := _bar_of(ground, maps, pieces, chain)) is not None]
     parts = [part for part in _rows_of(bars, BAR_STEP_M[1]) if len(part) >= MIN_BARS]
     areas, used = [], set()
     for chosen in _rows_of([bar for part in parts for bar in part], MAX_PART_GAP_M):
         used |= {k for k, _ in chosen}
         own = pieces.take(np.concatenate([bar.members for _, bar in chosen]))
         lengths = [bar.length_m for _, bar in chosen]
-        evidence = evidence_of_bars(own, lengths)
+        evidence, odds = evidence_of_bars(own, lengths), maps.object_log_odds("crosswalk", own.along)
         corners = []
         for _, bar in chosen:
             d = np.array([np.cos(bar.direction), np.sin(bar.direction)]) * bar.length_m / 2
@@ -105,7 +111,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
         origin = np.mean(corners, axis=0)
         hull = cv2.approxPolyDP(cv2.convexHull((np.array(corners) - origin).astype(np.float32)), HULL_ERROR_M, True)
         outline = np.asarray(hull, np.float64).reshape(-1, 2) + origin
-        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, evidence, lengths))
+        areas.append(PaintedArea("crosswalk", outline, float(np.median(lengths)), own, evidence, odds, lengths))
     # What is left of a bar, as where a shadow parts it, is no line.
     inside = np.zeros(len(pieces), dtype=bool)
     for area in (area for area in areas if area.log_odds > 0):
@@ -113,7 +119,7 @@ def find_crosswalks(ground: GroundMap, pieces: Pieces, chains: list[Chain]) -> t
     return areas, [chain for k, chain in enumerate(chains) if k not in used and not inside[chain.members].all()]
 
 
-def _bar_of(ground: GroundMap, pieces: Pieces, chain: Chain) -> _Bar | None:
+def _bar_of(ground: GroundMap, maps: PaintMaps, pieces: Pieces, chain: Chain) -> _Bar | None:
     width = median(pieces.width_m[chain.members])
     corners = chain.corners(pieces)
     chord = corners[-1] - corners[0]
@@ -121,7 +127,7 @@ def _bar_of(ground: GroundMap, pieces: Pieces, chain: Chain) -> _Bar | None:
     if not (BAR_WIDTH_M[0] <= width <= BAR_WIDTH_M[1] and BAR_LENGTH_M[0] <= length <= BAR_LENGTH_M[1]):
         return None
     # Ridges reach beyond the ends of short strokes.
-    strokes = trace(ground, Curve(corners[[0, -1]]), width).strokes()
+    strokes = trace(ground, maps, Curve(corners[[0, -1]]), width).strokes()
     if not len(strokes):
         return None
     begin, end = strokes[0, 0], strokes[-1, 1]
@@ -150,7 +156,7 @@ def _rows_of(numbered: list[tuple[int, _Bar]], max_step_m: float) -> list[list[t
     return [[numbered[k] for k in np.flatnonzero(group == label)] for label in range(count)]
 
 
-def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[PaintedLine]]:
+def part_stop_lines(maps: PaintMaps, lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[PaintedLine]]:
     """Part wide strokes across the road from lane lines: stop lines, others."""
     lanes = [one for one in lines if one.width_m <= MAX_LANE_LINE_WIDTH_M and one.length_m >= 3.0]
     stops, others = [], []
@@ -170,20 +176,23 @@ def part_stop_lines(lines: list[PaintedLine]) -> tuple[list[PaintedLine], list[P
         if fits and (angle is None or angle >= MIN_STOP_ANGLE_RAD):
             length = min(line.evidence["length"], np.log(SURE_STOP_M))
             evidence = line.evidence | {"no_lane_line": float(angle is None), "length": float(length)}
-            stops.append(replace(line, kind="stop_line", evidence=evidence))
+            odds = maps.object_log_odds("stop_line", line.pieces.along)
+            stops.append(replace(line, kind="stop_line", evidence=evidence, network=odds))
         else:
             others.append(line)
     return stops, others
 
 
-def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[PaintedArea], list[PaintedLine]]:
+def part_symbols(
+    ground: GroundMap, maps: PaintMaps, lines: list[PaintedLine]
+) -> tuple[list[PaintedArea], list[PaintedLine]]:
     """Part arrows, letters and other small paint from lane lines: outlines of all that may be symbols, and the lines that remain."""
     areas, remaining = list[PaintedArea](), []
     for line in lines:
         found: list[PaintedArea | None] = []
         if line.dashes <= MAX_SYMBOLS and line.length_m <= MAX_SYMBOL_M + SYMBOL_STEP_M * (line.dashes - 1):
             # Arrows one behind the other look like dashes: their pieces are looked at one by one.
-            found = [_symbol_at(ground, line, xy) for xy in (line.pieces.xy if line.dashes > 1 else [line.xy])]
+            found = [_symbol_at(ground, maps, line, xy) for xy in (line.pieces.xy if line.dashes > 1 else [line.xy])]
         shapes = [area for area in found if area is not None]
         areas += shapes
         # What lies in a row is of one kind.
@@ -197,7 +206,7 @@ def part_symbols(ground: GroundMap, lines: list[PaintedLine]) -> tuple[list[Pain
     return apart, remaining
 
 
-def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea | None:
+def _symbol_at(ground: GroundMap, maps: PaintMaps, line: PaintedLine, xy: Array) -> PaintedArea | None:
     """Outline the paint at points (N, 2) of a line; None where no camera saw it, or it is too large or too small."""
     xy = xy.reshape(-1, 2)
     low, high = xy.min(axis=0) - MAX_SYMBOL_M / 2, xy.max(axis=0) + MAX_SYMBOL_M / 2
@@ -243,7 +252,10 @@ def _symbol_at(ground: GroundMap, line: PaintedLine, xy: Array) -> PaintedArea |
         "mid_lane": line.evidence.get("mid_lane", 0.0),
         "hidden": float(1 - seen[cv2.dilate(own, np.ones((9, 9), np.uint8)) > 0].mean()),
     }
-    return PaintedArea("other", np.stack([x, y], 1), float(extent.min()), line.pieces, evidence)
+    v, u = np.nonzero(inside)
+    cells = np.stack([x0 + (u + columns.start + 0.5) * res, y1 - (v + rows.start + 0.5) * res], 1)
+    odds = maps.object_log_odds("other", cells)
+    return PaintedArea("other", np.stack([x, y], 1), float(extent.min()), line.pieces, evidence, odds)
 
 
 def _widens(mask: NDArray[np.uint8]) -> float:
@@ -267,14 +279,14 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
     Returns `markings`: sure ones first; `borders`; `notes`: what was not found, and why.
 
     Ridges of color and LiDAR intensity (`ridges`) become straight pieces with profiles (`paint`), chains of pieces
-    (`lines`) and smooth curves. Strokes along a curve are a solid or a dashed line (`strokes`), parallel bars are
+    (`lines`) and smooth curves, and so do lines that a network sees (`paint_network`). Strokes along a curve are a solid or a dashed line (`strokes`), parallel bars are
     crosswalks, and wide strokes across lanes are stop lines. Evidence of each by both sensors is weighed (`paint`,
-    `weights`). The cost grows with the area that was seen.
+    `weights`), beside what the network says. The cost grows with the area that was seen.
     """
     by_camera, by_lidar = ground.has_color, bool(np.isfinite(ground.intensity).any())
     if not by_camera and not by_lidar:
         return (), (), ("no markings seen: no sensor saw the ground",)
-    markings = list_markings(ground, min_confidence=MIN_CONFIDENCE, min_line_m=MIN_LINE_M)
+    markings = list_markings(ground, find_paint_maps(ground), min_confidence=MIN_CONFIDENCE, min_line_m=MIN_LINE_M)
     borders, notes = find_borders(ground, markings)
     if not markings:
         notes = ("no markings seen: no paint stands out from the ground", *notes)
@@ -289,24 +301,30 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
     return markings, borders, notes
 
 
-def find_paint(ground: GroundMap, *, symbols: bool = True) -> tuple[list[PaintedArea], list[PaintedLine]]:
+def find_paint(
+    ground: GroundMap, maps: PaintMaps, *, symbols: bool = True
+) -> tuple[list[PaintedArea], list[PaintedLine]]:
     """Find what may be paint, also the unlikely; `symbols` tells arrows apart."""
-    pieces = find_pieces(ground, find_ridges(ground))
-    areas, chains = find_crosswalks(ground, pieces, touching_chains(pieces))
-    lines, shares = find_lines(ground, pieces, dashed_chains(pieces, chains))
+    points, likely = find_ridges(ground), find_crests(maps, maps.lane_line)
+    # Ridges are where paint is to a few centimeters; the network adds lines where there are none.
+    if len(points.xy_map):
+        likely = likely.take(cKDTree(points.xy_map).query(likely.xy_map)[0] > NEAR_RIDGE_M)
+    pieces = find_pieces(ground, points.join(likely))
+    areas, chains = find_crosswalks(ground, maps, pieces, touching_chains(pieces))
+    lines, shares = find_lines(ground, maps, pieces, dashed_chains(pieces, chains))
     areas = [replace(area, evidence=evidence_of_bars(area.pieces, area.bars_m, shares)) for area in areas]
-    stops, lines = part_stop_lines(lines)
+    stops, lines = part_stop_lines(maps, lines)
     if symbols:
-        small, lines = part_symbols(ground, lines)
+        small, lines = part_symbols(ground, maps, lines)
         areas += small
     return areas, stops + lines
 
 
 def list_markings(
-    ground: GroundMap, *, min_confidence: float, min_line_m: float, symbols: bool = True
+    ground: GroundMap, maps: PaintMaps, *, min_confidence: float, min_line_m: float, symbols: bool = True
 ) -> tuple[Marking, ...]:
     """List markings, sure ones first, from a confidence and, for plain strokes, a length on; `symbols` tells arrows apart."""
-    areas, lines = find_paint(ground, symbols=symbols)
+    areas, lines = find_paint(ground, maps, symbols=symbols)
     return markings_of(ground, areas, lines, min_confidence, min_line_m)
 
 

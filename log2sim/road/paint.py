@@ -89,6 +89,15 @@ class Pieces:
         """Whether a camera saw any of them well enough for its contrast."""
         return bool(np.isfinite(self.color).any())
 
+    @property
+    def along(self) -> Array:
+        """Points (K, 2), m, along all pieces, a coarse cell apart."""
+        count = np.maximum(np.rint(self.length_m / CELL_M).astype(int), 1)
+        piece = np.repeat(np.arange(len(self)), count)
+        share = (np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[piece] - 0.5
+        step = np.stack([np.cos(self.direction), np.sin(self.direction)], 1) * self.length_m[:, None]
+        return np.asarray(self.xy[piece] + share[:, None] * step[piece])
+
     @cached_property
     def ends(self) -> Array:
         """Both ends (N, 2, 2), m."""

@@ -8,7 +8,7 @@ extraction", ITSC 2008), of means along 1 m in several directions, so that grain
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -165,6 +165,14 @@ class RidgePoints:
     xy_map: Array  # (N, 2), m
     direction: Array  # (N,): rad in [0, pi), map frame
     strength: Array  # (N,): response in sigmas of the texture
+
+    def take(self, chosen: Mask) -> RidgePoints:
+        """Choose points by a mask."""
+        return RidgePoints(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+    def join(self, other: RidgePoints) -> RidgePoints:
+        """Return the points of both."""
+        return RidgePoints(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
 def find_ridges(ground: GroundMap) -> RidgePoints:

@@ -13,6 +13,7 @@ from scipy.ndimage import percentile_filter
 
 from log2sim.geometry import Array, median, runs_of
 from log2sim.road.ground_map import GroundMap
+from log2sim.road.paint_network import PaintMaps
 from log2sim.road.ridges import sample
 
 KNOT_M = 0.5
@@ -177,7 +178,7 @@ class Stretch:
     dashes: int  # number of dashes, 1 for a solid line
 
 
-def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:
+def trace(ground: GroundMap, maps: PaintMaps, curve: Curve, width_m: float) -> Trace:
     """Look along a curve for paint of a width."""
     length = float(curve.s[-1])
     s = np.arange(STEP_M / 2, max(length, STEP_M), STEP_M)
@@ -203,7 +204,8 @@ def trace(ground: GroundMap, curve: Curve, width_m: float) -> Trace:
         total[known] += contrast[known] * expected / noise**2
         weight[known] += expected**2 / noise**2
     share = np.divide(total, weight, out=np.full(len(s), np.nan), where=weight > 0)
-    return Trace(s, np.nan_to_num(share) > ON_SHARE, np.isfinite(share))
+    likely = cv2.blur(maps.at(maps.lane_line, xy).reshape(-1, 1), (1, LAG)).ravel() > 0.5
+    return Trace(s, (np.nan_to_num(share) > ON_SHARE) | likely, np.isfinite(share))
 
 
 def _ridge(values: NDArray[np.float32]) -> Array:

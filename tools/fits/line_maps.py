@@ -1,6 +1,6 @@
-"""Make maps of random roads with their true markings, on which `fit.py lines` fits.
+"""Make maps of random roads with their true markings, on which `train.py markings` fits its network.
 
-    python tools/fit.py line_maps FOLDER --maps 320 --plain 80 --seed 0
+    python tools/fit.py line_maps FOLDER --maps 270 --plain 60
 
 Each road is straight or bent, a street or one side of a motorway, with traffic on either side, lines of any usual width, kind, color and
 wear, removed ones, crosswalks, stop lines, arrows, houses, shadows, sidewalks or grass beside it, in any light and weather; it is rendered,
@@ -292,7 +292,7 @@ def main(folder: Path, maps: int = 320, plain: int = 80, first: int = 0, seed: i
     """Make so many maps of roads, from the first index on, and of plain ground."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = [(f"{seed}-{index:04d}", index, make_map) for index in range(first, first + maps)]
-    wanted += [(f"{seed}-plain-{index:04d}", index, plain_map) for index in range(plain)]
+    wanted += [(f"{seed}-plain-{index:04d}", index, plain_map) for index in range(first, first + plain)]
     for name, index, made in wanted:
         path = folder / f"{name}.pkl"
         if path.exists():

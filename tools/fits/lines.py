@@ -30,6 +30,7 @@ from log2sim.geometry import Array
 from log2sim.road.borders import find_edges
 from log2sim.road.markings import MIN_CONFIDENCE, MIN_LINE_M, find_paint, markings_of
 from log2sim.road.paint import table_of, weighted_sum
+from log2sim.road.paint_network import find_paint_maps
 from log2sim.road.strokes import Curve
 from log2sim.road.weights import WEIGHTS
 
@@ -65,7 +66,7 @@ class Judged:
 def judged_of(path: Path) -> list[Judged]:
     """Find what may be markings and borders in a map, and judge it by the truth."""
     road: RoadMap = pickle.loads(path.read_bytes())
-    areas, lines = find_paint(road.ground)
+    areas, lines = find_paint(road.ground, find_paint_maps(road.ground))
     lanes = _Paint([m for m in road.true.markings if m.is_lane_line])
     stops, bars = (_Paint([m for m in road.true.markings if m.kind == kind]) for kind in ("stop_line", "crosswalk"))
     out = []

@@ -167,7 +167,7 @@ def main(out: Path, worlds: int = WORLDS, steps: int = STEPS, seed: int = 1) -> 
     network, path = fit(paths, out, steps, seed), out / "colors.onnx"
     inputs = {"picture": torch.rand((2, 3, SIDE_PX, SIDE_PX), generator=torch.Generator().manual_seed(0))}
     axes = {"picture": {0: "batch"}, "names": {0: "batch"}}
-    export_checked(network, path, inputs, ("names",), axes, halved=True)
+    export_checked(network, path, inputs, ("names",), axes, bits=16)
     info = {"version": 1, "scale": 1.0, "power": 1.0}
     describe(path, info, METADATA_KEY)
     info["scale"], info["power"] = calibrate(open_color_network(path), tune)

@@ -36,8 +36,8 @@ RIGHT = {
     "pedestrian": Criterion("center_m", 1.0),
 }
 MIN_SCORE = 0.1
-# Of the largest value; half floats have 11 bits.
-MAX_EXPORT_ERROR, MAX_HALVED_ERROR = 1e-4, 2e-3
+# Of the largest value, by the bits of the kernels.
+MAX_EXPORT_ERROR = {32: 1e-4, 16: 2e-3, 8: 5e-2}
 RIDGE = 1e-3  # a box, which keeps the weights of rare groups finite
 RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -53,7 +53,7 @@ def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
     network.load_state_dict(state)
     axes, generator = {0: "batch", 2: "x", 3: "y"}, torch.Generator().manual_seed(0)
     checked = {"grid": torch.rand((1, IN_CHANNELS, 192, 256), generator=generator)}
-    export_checked(network.eval(), path, checked, ("maps",), {"grid": axes, "maps": axes}, halved=True)
+    export_checked(network.eval(), path, checked, ("maps",), {"grid": axes, "maps": axes}, bits=16)
     describe(path, info)
 
 
@@ -64,9 +64,9 @@ def export_checked(
     outputs: Sequence[str],
     axes: dict[str, dict[int, str]],
     *,
-    halved: bool = False,
+    bits: int = 32,
 ) -> None:
-    """Write a network as ONNX, its kernels in 16 bits where `halved`; `axes` may have any length.
+    """Write a network as ONNX, its kernels in 32, 16 or 8 `bits`; `axes` may have any length.
 
     Raises `RuntimeError` when it computes something else of the inputs, by more than that share of the greatest output.
     """
@@ -81,12 +81,21 @@ def export_checked(
             opset_version=17, dynamo=False, dynamic_axes=axes,
         )  # fmt: skip
     model = onnx.load(path)
-    for weight in [value for value in model.graph.initializer if halved and len(value.dims) > 1]:
-        half = onnx.numpy_helper.to_array(weight).astype(np.float16)
+    for weight in [value for value in model.graph.initializer if bits < 32 and len(value.dims) > 1]:
+        values, short = onnx.numpy_helper.to_array(weight), f"{weight.name}_short"
         model.graph.initializer.remove(weight)
-        model.graph.initializer.append(onnx.numpy_helper.from_array(half, weight.name + "_half"))
-        cast = onnx.helper.make_node("Cast", [weight.name + "_half"], [weight.name], to=onnx.TensorProto.FLOAT)
-        model.graph.node.insert(0, cast)
+        nodes = [onnx.helper.make_node("Cast", [short], [weight.name], to=onnx.TensorProto.FLOAT)]
+        if bits == 8:  # times the greatest of each output
+            scale = np.abs(values).max(axis=tuple(range(1, values.ndim)), keepdims=True).clip(1e-12) / 127
+            values = np.rint(values / scale).astype(np.int8)
+            model.graph.initializer.append(onnx.numpy_helper.from_array(scale, f"{weight.name}_scale"))
+            nodes[0].output[0] = f"{weight.name}_whole"
+            nodes.append(onnx.helper.make_node("Mul", [f"{weight.name}_whole", f"{weight.name}_scale"], [weight.name]))
+        else:
+            values = values.astype(np.float16)
+        model.graph.initializer.append(onnx.numpy_helper.from_array(values, short))
+        for node in reversed(nodes):
+            model.graph.node.insert(0, node)
     onnx.save(model, path)
     with torch.no_grad():
         expected = network(*inputs.values())
@@ -94,7 +103,7 @@ def export_checked(
     found = session.run(list(outputs), {name: value.numpy() for name, value in inputs.items()})
     for one, other in zip(found, [expected] if isinstance(expected, Tensor) else expected, strict=True):
         error, size = float(np.abs(one - other.numpy()).max()), float(other.abs().max())
-        if not error < (MAX_HALVED_ERROR if halved else MAX_EXPORT_ERROR) * max(size, 1.0):
+        if not error < MAX_EXPORT_ERROR[bits] * max(size, 1.0):
             raise RuntimeError(f"{path}: ONNX and torch differ by {error:.2g} of {size:.2g}")
 
 

@@ -349,7 +349,7 @@ def finish(
         "box": torch.rand((3, BOX_VALUES), generator=generator),
     }
     axes = {name: {0: "boxes"} for name in (*checked, "corrections")}
-    export_checked(network.eval(), path, checked, ("corrections",), axes, halved=True)
+    export_checked(network.eval(), path, checked, ("corrections",), axes, bits=16)
     info = {
         "version": VERSION,
         "groups": list(CATEGORIES),
