@@ -264,7 +264,7 @@ class PaintedLine:
     def log_odds(self) -> float:
         """Log-odds that it is a marking: by its evidence or by the network, whichever is surer, as either knows paint that the other does not."""
         table = table_of(self.pieces, self.kind)
-        return max(weighted_sum(self.evidence, WEIGHTS[table]), self.network - ALONE_LOG_ODDS.get(table, 0.0))
+        return float(max(weighted_sum(self.evidence, WEIGHTS[table]), self.network - ALONE_LOG_ODDS.get(table, 0.0)))
 
     @property
     def length_m(self) -> float:

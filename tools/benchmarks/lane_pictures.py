@@ -1,4 +1,4 @@
-"""Lane lines found in single pictures, without a network, against their annotations.
+"""Lane lines found in single pictures, against their annotations.
 
     python tools/bench.py lane_pictures FOLDER
 
