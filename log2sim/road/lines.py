@@ -17,13 +17,11 @@ from log2sim.road.paint import (
     evidence_of_line,
     log_probabilities_of_shares,
     median_known,
-    table_of,
-    weighted_sum,
+    surer_log_odds,
 )
 from log2sim.road.paint_network import PaintMaps
 from log2sim.road.ridges import Mask
 from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
-from log2sim.road.weights import WEIGHTS
 
 TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
 # The longest gaps of dashed lines are 12 m (Germany: 12 m at 6 m dashes; MUTCD: 30 ft = 9.1 m; UK: 7 m; Japan: 12 m).
@@ -244,8 +242,6 @@ MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or
 MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 PARALLEL_RAD = np.deg2rad(15)
-# Lines that one sensor alone shows have to be as likely to the network as the weights ask (`COSTS` in `tools/fits/lines.py`), as its roads are simulated.
-ALONE_LOG_ODDS = {"line, camera": np.log(2), "line, LiDAR": np.log(4), "line, few returns": np.log(4)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,9 +258,8 @@ class PaintedLine:
 
     @cached_property
     def log_odds(self) -> float:
-        """Log-odds that it is a marking: by its evidence or by the network, whichever is surer, as either knows paint that the other does not."""
-        table = table_of(self.pieces, self.kind)
-        return float(max(weighted_sum(self.evidence, WEIGHTS[table]), self.network - ALONE_LOG_ODDS.get(table, 0.0)))
+        """Log-odds that it is a marking."""
+        return surer_log_odds(self.pieces, self.kind, self.evidence, self.network)
 
     @property
     def length_m(self) -> float:

@@ -27,13 +27,11 @@ from log2sim.road.paint import (
     evidence_of_line,
     find_pieces,
     median_known,
-    table_of,
-    weighted_sum,
+    surer_log_odds,
 )
 from log2sim.road.paint_network import PaintMaps, find_crests, find_paint_maps
 from log2sim.road.ridges import find_ridges, log_paint
 from log2sim.road.strokes import Curve, thin, trace
-from log2sim.road.weights import WEIGHTS
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).
 BAR_WIDTH_M, BAR_LENGTH_M, BAR_STEP_M = (0.22, 0.85), (1.2, 10.0), (0.5, 2.4)
@@ -71,8 +69,8 @@ class PaintedArea:
 
     @cached_property
     def log_odds(self) -> float:
-        """Log-odds that it is a marking: by its evidence or by the network, whichever is surer."""
-        return max(weighted_sum(self.evidence, WEIGHTS[table_of(self.pieces, self.kind)]), self.network)
+        """Log-odds that it is a marking."""
+        return surer_log_odds(self.pieces, self.kind, self.evidence, self.network)
 
 
 @dataclass(frozen=True, eq=False)

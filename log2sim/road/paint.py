@@ -294,6 +294,18 @@ def table_of(pieces: Pieces, kind: str = "line") -> str:
     return "line, LiDAR" if enough else "line, few returns"
 
 
+# Odds that the network has to give to count, as it knows simulated roads alone; more of lines that one sensor alone shows, by the costs of
+# `tools/fits/lines.py`. With 1 instead of 3, lane lines of 17 scenes are .965 instead of .977 precise, of what stands out .862 instead of .853 is found.
+NETWORK_ODDS, ALONE_ODDS = 3.0, {"line, camera": 6.0, "line, LiDAR": 12.0, "line, few returns": 12.0}
+
+
+def surer_log_odds(pieces: Pieces, kind: str, evidence: Mapping[str, float], network: float) -> float:
+    """Log-odds of a marking by its evidence or by those of the network, whichever is surer: either knows paint that the other does not."""
+    table = table_of(pieces, kind)
+    required = np.log(ALONE_ODDS.get(table, NETWORK_ODDS))
+    return float(max(weighted_sum(evidence, WEIGHTS[table]), network - required))
+
+
 def weighted_sum(evidence: Mapping[str, float], weights: Mapping[str, float]) -> float:
     """Add up evidence by its weights: log-odds."""
     return sum(weight * evidence.get(name, 0.0) for name, weight in weights.items())
