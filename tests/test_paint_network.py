@@ -74,7 +74,6 @@ def _cut(ground: GroundMap, first: int) -> GroundMap:
 
 
 def test_crops_say_of_each_cell_what_is_painted_there_at_any_angle(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("torch", reason="training needs the extra 'train'")
     from fits.line_maps import EVERYWHERE, RoadMap
     from training import map_crops
 

@@ -30,7 +30,7 @@ from log2sim.road.paint import (
     surer_log_odds,
 )
 from log2sim.road.paint_network import PaintMaps, find_crests, find_paint_maps
-from log2sim.road.ridges import find_ridges, log_paint
+from log2sim.road.ridges import RidgePoints, find_ridges, log_paint
 from log2sim.road.strokes import Curve, thin, trace
 
 # Bars of crosswalks: 0.3 to 0.6 m wide, as far apart (StVO sign 293: 0.5 m; MUTCD 3C: 12 to 24 in, gaps up to 60 in).
@@ -307,7 +307,7 @@ def find_paint(
     # Ridges are where paint is to a few centimeters; the network adds lines where there are none.
     if len(points.xy_map):
         likely = likely.take(cKDTree(points.xy_map).query(likely.xy_map)[0] > NEAR_RIDGE_M)
-    pieces = find_pieces(ground, points.join(likely))
+    pieces = find_pieces(ground, RidgePoints.join([points, likely]))
     areas, chains = find_crosswalks(ground, maps, pieces, touching_chains(pieces))
     lines, shares = find_lines(ground, maps, pieces, dashed_chains(pieces, chains))
     areas = [replace(area, evidence=evidence_of_bars(area.pieces, area.bars_m, shares)) for area in areas]

@@ -22,7 +22,7 @@ from log2sim.errors import ConfigError
 from log2sim.geometry import Array
 from log2sim.perception.detect3d.network import open_session
 from log2sim.road.ground_map import GroundMap, Raster
-from log2sim.road.ridges import Layer, RidgePoints, log_color, log_intensity
+from log2sim.road.ridges import Layer, RidgePoints, coarse_means, crests_across, high_pass, log_color, log_intensity
 from log2sim.road.surface import USUAL
 
 FILE = Path(__file__).with_name("weights") / "markings.onnx"
@@ -106,44 +106,26 @@ def inputs_of(
     against what is around and against the road; where it is known; height against what is around, and where that is known.
     """
     out = np.zeros((CHANNELS, alpha.shape[0] // 2, alpha.shape[1] // 2), np.float32)
-    seen, hit, known = ((v.astype(np.float32)) for v in (alpha > 0, np.isfinite(intensity), np.isfinite(height_m)))
+    seen, hit, known = alpha > 0, np.isfinite(intensity), np.isfinite(height_m)
     around = round(AROUND_M / CELL_M)
     if seen.any():
         bright, yellow = log_color(color_bgr)
-        paint = _relative(bright + yellow, seen, 2 * around).clip(-MAX_PAINT, MAX_PAINT)
+        paint = high_pass(bright + yellow, seen.astype(np.float32), 2 * around).clip(-MAX_PAINT, MAX_PAINT)
         out[:4] = [paint[i::2, j::2] for i, j in np.ndindex(2, 2)]
-        mean, share = _halved(yellow, seen)
-        out[4], out[5], out[6] = (
-            _relative(mean, share, around),
-            share,
-            _halved(alpha.astype(np.float32) / 255, seen * 0 + 1)[0],
-        )
+        mean, share = coarse_means(yellow, seen, 2)
+        well = cv2.resize(alpha.astype(np.float32) / 255, share.shape[::-1], interpolation=cv2.INTER_AREA)
+        out[4], out[5], out[6] = high_pass(mean, share, around), share, well
     if hit.any():
-        mean, share = _halved(log_intensity(np.nan_to_num(intensity)), hit)
+        mean, share = coarse_means(log_intensity(np.nan_to_num(intensity)), hit, 2)
         there = (share > 0).astype(np.float32)
-        out[7] = _relative(mean, there, around).clip(-MAX_INTENSITY, MAX_INTENSITY) / 1.5
+        out[7] = high_pass(mean, there, around).clip(-MAX_INTENSITY, MAX_INTENSITY) / 1.5
         out[8], out[9] = there * (mean - log_intensity(np.array(USUAL))) / 2, there
     if known.any():
-        mean, share = _halved(np.nan_to_num(height_m), known)
+        mean, share = coarse_means(height_m, known, 2)
         there = (share > 0).astype(np.float32)
-        out[10] = _relative(mean, there, round(HEIGHT_AROUND_M / CELL_M)).clip(-MAX_HEIGHT_M, MAX_HEIGHT_M) * 5
+        out[10] = high_pass(mean, there, round(HEIGHT_AROUND_M / CELL_M)).clip(-MAX_HEIGHT_M, MAX_HEIGHT_M) * 5
         out[11] = there
     return out
-
-
-def _halved(values: NDArray[Any], valid: Layer) -> tuple[Layer, Layer]:
-    """Average valid values (2 R, 2 C) in squares of four cells (R, C), 0 where none is; also the shares that are."""
-    size = (values.shape[1] // 2, values.shape[0] // 2)
-    total, share = (cv2.resize(v, size, interpolation=cv2.INTER_AREA) for v in (values * valid, valid))
-    return np.divide(total, share, out=np.zeros_like(total), where=share > 0), np.asarray(share, np.float32)
-
-
-def _relative(values: Layer, valid: Layer, around: int) -> Layer:
-    """Subtract the mean of what is valid within some cells to all sides; 0 where nothing is."""
-    size = (2 * around + 1,) * 2
-    share = cv2.blur(valid, size)
-    mean = np.divide(cv2.blur(values * valid, size), share, out=np.zeros_like(values), where=share > 1e-4)
-    return np.asarray(np.where(valid > 0, values - mean, 0), np.float32)
 
 
 def find_paint_maps(ground: GroundMap, network: MarkingsNetwork | None = None) -> PaintMaps:
@@ -179,17 +161,10 @@ def find_paint_maps(ground: GroundMap, network: MarkingsNetwork | None = None) -
 
 def find_crests(maps: PaintMaps, layer: Layer, least: float = MIN_PROBABILITY) -> RidgePoints:
     """Find points in the middle of lines of a probability (R, C), with directions across which it bends most."""
-    soft = cv2.GaussianBlur(layer, (0, 0), SMOOTH_CELLS)
+    soft = np.asarray(cv2.GaussianBlur(layer, (0, 0), SMOOTH_CELLS), np.float32)
     xx, yy, xy = (cv2.Sobel(soft, cv2.CV_32F, i, j, ksize=5) for i, j in ((2, 0), (0, 2), (1, 1)))
     rows, columns = np.nonzero(soft > least)
     # Across the line the second derivative is most negative.
     angle = (np.arctan2(2 * xy[rows, columns], xx[rows, columns] - yy[rows, columns]) / 2).astype(np.float64)
-    dx, dy = np.cos(angle + np.pi / 2), np.sin(angle + np.pi / 2)
-    there = soft[rows, columns].astype(np.float64)
-    sides = [map_coordinates(soft, [rows + k * dy, columns + k * dx], order=1, mode="nearest") for k in (-2, -1, 1, 2)]
-    crest = there >= np.max(sides, axis=0)
-    lower, upper, top = sides[1][crest], sides[2][crest], there[crest]
-    bend = 2 * top - lower - upper
-    shift = np.divide(upper - lower, 2 * bend, out=np.zeros_like(bend), where=bend > 0).clip(-0.5, 0.5)
-    points = maps.raster.xy_of(rows[crest] + shift * dy[crest], columns[crest] + shift * dx[crest])
-    return RidgePoints(points, (-angle[crest]) % np.pi, top)
+    crest, x, y = crests_across(soft, rows, columns, -angle)
+    return RidgePoints(maps.raster.xy_of(y, x), (-angle[crest]) % np.pi, soft[rows, columns][crest].astype(np.float64))

@@ -8,13 +8,14 @@ extraction", ITSC 2008), of means along 1 m in several directions, so that grain
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from log2sim.files.arrays import Columns
 from log2sim.geometry import Array
 from log2sim.road.ground_map import GroundMap
 
@@ -159,20 +160,12 @@ MIN_BRIGHT = 100  # cells that tell how much paint reflects
 
 
 @dataclass(frozen=True, eq=False)
-class RidgePoints:
+class RidgePoints(Columns):
     """Points in the middle of ridges, one for each coarse cell along them."""
 
     xy_map: Array  # (N, 2), m
     direction: Array  # (N,): rad in [0, pi), map frame
-    strength: Array  # (N,): response in sigmas of the texture
-
-    def take(self, chosen: Mask) -> RidgePoints:
-        """Choose points by a mask."""
-        return RidgePoints(*(getattr(self, f.name)[chosen] for f in fields(self)))
-
-    def join(self, other: RidgePoints) -> RidgePoints:
-        """Return the points of both."""
-        return RidgePoints(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+    strength: Array  # (N,): response in sigmas of the texture, or probability
 
 
 def find_ridges(ground: GroundMap) -> RidgePoints:
@@ -200,13 +193,14 @@ def _join(tile: CoarseTile, cell_m: float) -> tuple[Layer, Layer, Layer]:
     """
     by_camera = bool(np.any(tile.seen))
     if by_camera:
-        color, peak, dip = (_high_pass(values, tile.seen, cell_m) for values in (tile.paint, tile.peak, tile.dip))
+        around = round(HIGH_PASS_M / cell_m)
+        color, peak, dip = (high_pass(values, tile.seen, around) for values in (tile.paint, tile.peak, tile.dip))
         if not np.any(tile.hit):
             return color, peak, dip
     # Means over what was hit within 3 x 3 cells: rings of LiDAR leave gaps.
     hit = cv2.blur(tile.hit, (3, 3))
     filled = np.divide(cv2.blur(tile.intensity * tile.hit, (3, 3)), hit, out=np.zeros_like(hit), where=hit > 1e-3)
-    intensity = _high_pass(filled, (hit > 1e-3).astype(np.float32), cell_m)
+    intensity = high_pass(filled, (hit > 1e-3).astype(np.float32), round(HIGH_PASS_M / cell_m))
     if not by_camera:
         return intensity, intensity, intensity
     c, i = _spread(color, tile.seen), _spread(intensity, tile.hit)
@@ -231,9 +225,9 @@ def _spread(flat: Layer, valid: Layer) -> float:
     return max(float(np.median(values)) / 0.6745, 0.03) if len(values) else 0.03
 
 
-def _high_pass(values: Layer, valid: Layer, cell_m: float) -> Layer:
-    """Subtract the mean around, so that what was not seen (0 now) looks like its surroundings."""
-    size = (2 * round(HIGH_PASS_M / cell_m) + 1,) * 2
+def high_pass(values: Layer, valid: Layer, around: int) -> Layer:
+    """Subtract the mean within some cells to all sides, so that what was not seen (0 now) looks like its surroundings."""
+    size = (2 * around + 1,) * 2
     share = cv2.blur(valid, size)
     mean = np.divide(cv2.blur(values * valid, size), share, out=np.zeros_like(values), where=share > 1e-6)
     return np.asarray(np.where(valid > 0, values - mean, 0), np.float32)
@@ -338,6 +332,14 @@ def _crests(strength: Layer, direction: NDArray[np.uint8], tile: CoarseTile) -> 
     known[tile.core] = (tile.seen[tile.core] > MIN_SEEN) | (cv2.blur(tile.hit, (7, 7))[tile.core] > MIN_HIT)
     rows, columns = np.nonzero((strength > MIN_SIGMAS) & known)
     angle = direction[rows, columns].astype(np.float64) * (np.pi / DIRECTIONS)
+    crest, x, y = crests_across(strength, rows, columns, angle)
+    return np.stack([x, y, angle[crest], strength[rows, columns][crest].astype(np.float64)], 1)
+
+
+def crests_across(
+    strength: Layer, rows: NDArray[np.intp], columns: NDArray[np.intp], angle: Array
+) -> tuple[Mask, Array, Array]:
+    """Choose cells (N,) that no other exceeds across their direction, rad counterclockwise from the columns; columns and rows between cells."""
     dx, dy = -np.sin(angle), -np.cos(angle)  # to the left of the direction; rows count downwards
     here = strength[rows, columns].astype(np.float64)
     sides = [
@@ -348,5 +350,4 @@ def _crests(strength: Layer, direction: NDArray[np.uint8], tile: CoarseTile) -> 
     lower, upper = sides[1][crest], sides[2][crest]
     bend = 2 * here[crest] - lower - upper
     shift = np.divide(upper - lower, 2 * bend, out=np.zeros_like(bend), where=bend > 0).clip(-0.5, 0.5)
-    x, y = columns[crest] + shift * dx[crest], rows[crest] + shift * dy[crest]
-    return np.stack([x, y, angle[crest], here[crest]], 1)
+    return crest, columns[crest] + shift * dx[crest], rows[crest] + shift * dy[crest]

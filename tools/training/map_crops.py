@@ -236,7 +236,7 @@ def _paint_line(
     free = cv2.distanceTransform((kind == 0).astype(np.uint8), cv2.DIST_L2, 3) > FREE_CELLS
     fine_free = cv2.resize(free.astype(np.uint8), layers.alpha.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     paint = np.zeros(layers.alpha.shape, np.uint8)
-    # Every tenth of a meter, or every dash is as long as the steps.
+    # Finer than the cells, so that dots and short dashes keep their lengths.
     fine = np.arange(0, along_m[-1] - along_m[0], 0.05)
     fine_xy = np.stack([np.interp(fine, along_m - along_m[0], dense[:, k]) for k in range(2)], axis=1) * 2 + 0.5
     on = np.isinf(dash_m) | ((fine + along_m[0]) % (dash_m + gap_m) < dash_m)

@@ -3,7 +3,7 @@
 pip install 'log2sim[train]'
 python tools/fit.py line_maps MAPS --maps 270 --plain 60               # roads as maps show them; 20 minutes on two cores
 python tools/fit.py line_maps HELD --maps 50 --plain 20 --first 270    # others, to report on and to fit weights to
-python tools/train.py markings MAPS HELD DIR                           # everything, with the settings of the shipped weights
+python tools/train.py markings MAPS HELD DIR                           # everything; the card tells the rounds of what ships
 python tools/train.py markings MAPS HELD DIR --pictures 20 --steps 50  # a toy
 """
 
@@ -87,9 +87,9 @@ class Probabilities(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         logits, kinds = self.network(values), 1 + len(KINDS)
-        told = logits[:, :kinds] - torch.log(kind_weights())[:, None, None]
+        calibrated = logits[:, :kinds] - torch.log(kind_weights())[:, None, None]
         parts = (
-            torch.softmax(told, dim=1),
+            torch.softmax(calibrated, dim=1),
             torch.sigmoid(logits[:, kinds : kinds + 1]),
             logits[:, kinds + 1 :],
         )
@@ -162,7 +162,7 @@ def fit(paths: list[Path], out: Path, steps: int, seed: int, start: Path | None)
 def report(network: nn.Module, paths: list[Path], seed: int) -> dict[str, Any]:
     """Measure cells at a probability of a half on disturbed crops: precision and recall of each kind, and how far probabilities err."""
     names = ("none", *KINDS, "border")
-    found, true, right, sure, told = (np.zeros(len(names)) for _ in range(5))
+    found, true, right, expected = (np.zeros(len(names)) for _ in range(4))
     for _, crop in zip(range(REPORT_CROPS), iterate_crops(paths, seed)):
         values, kind, border, _ = tensors_of([crop])
         seen = ((values[:, 5] > 0) | (values[:, 9] > 0))[0]
@@ -171,12 +171,12 @@ def report(network: nn.Module, paths: list[Path], seed: int) -> dict[str, Any]:
         answer = np.stack([kind[0][seen].numpy() == k for k in range(len(names) - 1)] + [border[0][seen].numpy() > 0])
         found, true = found + (probability > 0.5).sum(axis=1), true + answer.sum(axis=1)
         right += ((probability > 0.5) & answer).sum(axis=1)
-        sure, told = sure + probability.sum(axis=1), told + answer.sum(axis=1)
+        expected += probability.sum(axis=1)
     return {
         name: {
             "precision": _share(right[k], found[k]),
             "recall": _share(right[k], true[k]),
-            "expected_over_true": _share(sure[k], told[k]),
+            "expected_over_true": _share(expected[k], true[k]),
         }
         for k, name in enumerate(names)
     }
