@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 from log2sim.datatypes import Agent, MapFeatures, MapLane, Marking, RoadBorder, Scenario
 from log2sim.geometry import Array, Polyline
+from log2sim.road.curves import fit_curve
 from log2sim.road.lane_graph import find_covered, find_side_of_traffic, find_strips, infer_lanes
 from log2sim.road.lane_keeping import find_lane_changes, locate_in_lanes, summarize_lane_keeping
 from log2sim.road.routes import collect_paths
-from log2sim.road.strokes import fit_curve
 
 
 def turn_left(radius_m: float = 9.0) -> Array:

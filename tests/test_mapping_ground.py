@@ -71,20 +71,6 @@ def test_paint_stands_out_in_intensity_at_any_range_and_on_any_scale(ground: Gro
         assert np.percentile(paint, 10) > np.percentile(road, 90)
 
 
-def test_points_are_farther_apart_farther_away_and_nowhere_without_intensity(ground: GroundMap) -> None:
-    xy, spacing = positions(ground), ground.spacing_m
-    rings = [
-        near_path(xy, high) & ~near_path(xy, high - 4) & np.isfinite(ground.intensity) for high in (8.0, 16.0, 24.0)
-    ]
-    near, middle, far = (float(np.median(spacing[ring])) for ring in rings)
-    assert 0.01 < near < middle < far < 1.0
-    whole = ground.around(ground.known)
-    assert whole.spacing_m.shape == whole.intensity.shape
-    assert np.isinf(
-        spacing[~cv2.dilate(np.isfinite(ground.intensity).astype(np.uint8), np.ones((15, 15))).astype(bool)]
-    ).all()
-
-
 def test_colors_lie_where_the_paint_is_on_a_slope(ground: GroundMap) -> None:
     xy = positions(ground)
     seen = (ground.alpha > 200) & clear_of_edges(xy, 0.06) & near_path(xy, 8.0) & (np.abs(xy[..., 1]) < 5)

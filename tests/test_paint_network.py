@@ -77,7 +77,8 @@ def test_crops_say_of_each_cell_what_is_painted_there_at_any_angle(monkeypatch: 
     from fits.line_maps import EVERYWHERE, RoadMap
     from training import map_crops
 
-    monkeypatch.setattr(map_crops, "MORE_LINES", 0.0)
+    for name in ("MORE_LINES", "MORE_SHAPES"):
+        monkeypatch.setattr(map_crops, name, 0.0)
 
     painter = Painter((0.0, 60.0, -30.0, 30.0), base=GRASS)
     painter.lay(painter.cover([outline_of(line_of(lambda x: 0 * x, -1, 61), 12.0)]), (92, 91, 90))
@@ -108,3 +109,33 @@ def test_crops_say_of_each_cell_what_is_painted_there_at_any_angle(monkeypatch: 
         assert crop.line[2, there].astype(np.float64).mean() == pytest.approx(0.3, abs=1e-3)
     assert shown >= 5
     assert np.mean(turned) > 0.98
+
+
+@pytest.mark.parametrize("what", ["MORE_SHAPES", "MORE_LINES", "MORE_ROADS"])
+def test_what_is_added_to_plain_ground_is_labeled_where_it_is(monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+    from fits.line_maps import EVERYWHERE, RoadMap
+    from training import map_crops
+
+    for name in ("MORE_SHAPES", "MORE_LINES", "MORE_ROADS"):
+        monkeypatch.setattr(map_crops, name, float(name == what))
+    drawn = []
+    monkeypatch.setattr(map_crops, "_disturb", lambda layers, *_: drawn.append(layers) or layers)
+    road = RoadMap(Painter((0.0, 60.0, -30.0, 30.0)).ground(grain=0.0, noise=0.0), MapFeatures(), EVERYWHERE)
+    rng, labeled = np.random.default_rng(5), 0
+    crops = [crop for _ in range(12) if (crop := map_crops.draw_crop(road, rng)) is not None]
+    for crop, layers in zip(crops, drawn, strict=True):
+        bright, seen = layers.log_color[..., 1], cv2.erode(layers.alpha, np.ones((9, 9), np.uint8)) > 0
+        painted = (np.abs(bright - np.median(bright[seen])) > 0.08) & seen
+        painted = painted.reshape(256, 2, 256, 2).any(axis=(1, 3))
+        label = (crop.kind > 0) | (crop.border > 0)
+        labeled += label.any()
+        near = cv2.dilate(label.astype(np.uint8), np.ones((7, 7) if what != "MORE_ROADS" else (15, 15))) > 0
+        if what == "MORE_ROADS":
+            # Between its borders, and beyond them, the ground is of one brightness.
+            _, parts = cv2.connectedComponents((~near & seen[::2, ::2]).astype(np.uint8))
+            assert not crop.kind.any()
+            assert all(np.std(bright[::2, ::2][parts == k]) < 0.03 for k in range(1, parts.max() + 1))
+        else:
+            assert not crop.border.any()
+            assert not (painted & ~near).any()
+    assert labeled >= 4

@@ -21,19 +21,17 @@ from conftest import SHARED
 from entry import commands_in, run_named
 from fits import confidence as fit_confidence
 from fits import confidence_logs, late_fusion
-from fits import lines as fit_lines
-from fits.line_maps import EVERYWHERE, RoadMap, draw_scene, plain_map
+from fits.line_maps import draw_scene
 from fits.logistic import logistic_regression
 from kitti.boxes import read_tracks
 from kitti.scoring import evaluate
 from localization_worlds import BEND, HOUSES, LIDAR, drive
 from mutation.harness import BAD, GOOD, Harness
-from painted_ground import Painter, line_of
 from profile_ticks import Measured, figures
 from scipy.optimize import minimize
 from worlds import tiny_toml
 
-from log2sim.datatypes import Frame, MapFeatures, Marking
+from log2sim.datatypes import Frame
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.logs.native.writer import write_log
 
@@ -141,34 +139,6 @@ def test_scales_that_make_confidences_right_are_fitted_for_each_group():
     fitted = fit_confidence.fit_scales(agents)
     for group, scales in true.items():
         assert fitted[group] == pytest.approx(scales, abs=0.15)
-
-
-def test_weights_of_markings_are_those_by_which_the_evidence_was_drawn() -> None:
-    rng, true = np.random.default_rng(4), {"bias": -1.0, "length": 0.8, "contrast": 1.5, "outshone": -2.0}
-    rows = []
-    for _ in range(6000):
-        evidence = {name: float(value) for name, value in zip(fit_lines.SIGNS, rng.normal(0, 1, len(fit_lines.SIGNS)))}
-        odds = sum(weight * evidence.get(name, 1.0) for name, weight in true.items())
-        rows.append(fit_lines.Judged("map", "line, camera", evidence, float(rng.random() < probability_of(odds)), 1.0))
-    found = fit_lines.fit_table(rows)
-    for name, weight in true.items():
-        assert found[name] == pytest.approx(weight, abs=0.2)
-    # What may only speak against paint does not speak for it, by chance either.
-    assert all(found.get(name, 0.0) * sign >= 0 for name, sign in fit_lines.SIGNS.items() if sign)
-
-
-def test_lines_of_a_map_are_judged_by_its_paint_and_those_of_plain_ground_are_none(tmp_path: Path) -> None:
-    painter = Painter()
-    real, removed = line_of(lambda x: 3.0 + 0 * x, 0, 50), line_of(lambda x: -3.0 + 0 * x, 0, 50)
-    painter.lines([real, removed], 0.15)
-    true = Marking("one", "solid", np.column_stack([real, 0 * real[:, 0]]), 0.15)
-    for name, road in (("road", RoadMap(painter.ground(), MapFeatures((true,)), EVERYWHERE)), ("plain", plain_map(5))):
-        (tmp_path / name).write_bytes(pickle.dumps(road))
-    judged = {row.evidence["length"]: row.right for row in fit_lines.judged_of(tmp_path / "road") if row.length_m > 20}
-    assert sorted(judged.values()) == pytest.approx([0.0, 1.0], abs=0.05)
-    plain = fit_lines.judged_of(tmp_path / "plain")
-    assert plain
-    assert not any(row.right for row in plain)
 
 
 def test_random_roads_are_scenes_whose_ego_stays_on_the_side_of_its_traffic() -> None:

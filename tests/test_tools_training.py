@@ -305,7 +305,7 @@ def test_a_toy_learns_lines_and_calibrates_whole_markings(tmp_path: Path) -> Non
         (folder / f"0-000{seed}.pkl").write_bytes(pickle.dumps(street(seed, slope)))
     markings.main(maps, held, tmp_path, pictures=0, steps=120)
     network, road = open_markings_network(tmp_path / "markings.onnx"), street(3, -0.1)
-    assert set(network.objects) == {"crosswalk", "stop_line", "other"}
+    assert set(network.objects) == {"stop_line", "crosswalk", "other", "border"}
     found = find_paint_maps(road.ground, network)
     crests = find_crests(found, found.lane_line, 0.5)
     away = np.abs(crests.xy_map[:, 1, None] + 0.1 * (crests.xy_map[:, :1] - 30) - [-3.0, 0.0, 3.0]).min(axis=1)

@@ -61,6 +61,7 @@ MUTANTS = (
     ("hypotheses are not counted", "agents/hypotheses.py", "- np.log(count))", ")", "hypotheses"),
     ("yellow lines by brightness alone", "road/lane_course.py", "for values in (flat.paint, flat.yellow)", "for values in (flat.paint, flat.paint)", "lane_markings"),
     ("lanes off the road", "road/lane_course.py", "and _is_road(flat, line.offset_m, left.offset_m)", "", "lane_markings"),
+    ("edges of bright ground as lines", "road/lines.py", "if sources := sources_of(member):", "if (sources := sources_of(member)) is not None:", "lane_markings"),
     ("lit lamps", "road/signals.py", "log[k] += 0.0 if", "log[k] += 0.0 if True or", "traffic_lights"),
     ("points beyond a gap of time", "evaluation/metrics/comparison.py", "<= MAX_TRUTH_GAP_S) & table", "<= 2 * MAX_TRUTH_GAP_S) & table", "metrics_evaluate"),
     ("boxes between labels", "evaluation/detection/truth.py", "stamps[partner] - stamps[nearest]", "stamps[partner] + stamps[nearest]", "detection_files"),

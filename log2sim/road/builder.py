@@ -193,13 +193,13 @@ class GroundMapBuilder:
         height = upsample(surface.z_m, factor, shape) + np.float32(self._z0_m)
         known = np.repeat(np.repeat(surface.known, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]]
         height[~known] = np.nan
-        intensity, spacing = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster))
+        intensity = map_intensity(self._swept[0], surface, self.raster, self._road(surface.raster))
         for name in ("_swept", "_surface", "_laid", "_likely_ground"):
             self.__dict__.pop(name, None)
         for layer in (height, intensity):
             layer[standing] = np.nan
         place = self.raster.resolution_m, self.raster.extent_m
-        whole = GroundMap(color, alpha, height, intensity, *place, tuple(self.notes), spacing)
+        whole = GroundMap(color, alpha, height, intensity, *place, tuple(self.notes))
         return whole.around(whole.known)
 
     def _sweep_step_m(self, lidar: str) -> float:

@@ -92,8 +92,6 @@ class GroundMap:
     resolution_m: float  # edge of a cell
     extent_m: Extent  # x0, x1, y0, y1 of the outer edges, m
     notes: tuple[str, ...] = ()  # what could not be mapped, and why
-    # (R, C): mean distance of neighboring LiDAR points; infinite without any
-    spacing_m: NDArray[np.float16] | None = None
 
     @property
     def raster(self) -> Raster:
@@ -139,5 +137,27 @@ class GroundMap:
         extent = (x0 + columns.start * d, x0 + columns.stop * d, y1 - rows.stop * d, y1 - rows.start * d)
         color, alpha = (layer[rows, columns].copy() for layer in (self.color_bgr, self.alpha))
         height, intensity = (layer[rows, columns].copy() for layer in (self.height_m, self.intensity))
-        spacing = None if self.spacing_m is None else self.spacing_m[rows, columns].copy()
-        return GroundMap(color, alpha, height, intensity, d, extent, self.notes, spacing)
+        return GroundMap(color, alpha, height, intensity, d, extent, self.notes)
+
+
+AROUND_M = 0.25
+
+
+def at_height(ground: GroundMap, xy: Array) -> Array:
+    """Put points (N, 2) on the ground: (N, 3), m. Where the height is unknown it is that of the nearest point, or 0."""
+    reach = max(1, round(AROUND_M / ground.resolution_m))
+    rows = ((ground.extent_m[3] - xy[:, 1]) / ground.resolution_m).astype(int)
+    columns = ((xy[:, 0] - ground.extent_m[0]) / ground.resolution_m).astype(int)
+    z = np.full(len(xy), np.nan)
+    for k, (r, c) in enumerate(zip(rows, columns)):
+        part = ground.height_m[max(r - reach, 0) : max(r + reach + 1, 0), max(c - reach, 0) : max(c + reach + 1, 0)]
+        known = part[np.isfinite(part)]
+        if known.size:
+            z[k] = np.median(known)
+    known = np.isfinite(z)
+    if not known.any():
+        everywhere = ground.height_m[::20, ::20]
+        level = float(np.nanmedian(everywhere)) if np.isfinite(everywhere).any() else 0.0
+        return np.column_stack([xy, np.full(len(xy), level)])
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    return np.column_stack([xy, np.interp(s, s[known], z[known])])

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from log2sim.datatypes import Marking
 from log2sim.geometry import Array, Camera
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import sample
+from log2sim.road.samples import sample
 
 TOLERANCE_M, TOLERANCE_PER_M = 0.12, 0.01  # of a line's course: its own error, and that of a ground that is not flat
 SAME_LINE_M = 0.6  # double lines are one lane line

@@ -19,7 +19,7 @@ from log2sim.road.lane_course import LaneLine, find_lane_lines, find_shape
 from log2sim.road.markings import list_markings
 from log2sim.road.paint_network import find_paint_maps
 from log2sim.road.pictures import Image, View, sample_at, warp_onto
-from log2sim.road.ridges import log_color
+from log2sim.road.samples import log_color
 from log2sim.road.surface import Surface
 
 WIDTH_PX = 960  # pictures are made smaller, so that grain is no line
@@ -198,9 +198,7 @@ def _find(image_bgr: Image, camera: Camera) -> PictureMarkings:
     """Find markings by a camera's pose, and leave out lines that do not follow the course of the road."""
     whole = lay_out(image_bgr, camera)
     ground = keep_road(whole, *camera.mount_T_cam[:2, 3].tolist())
-    markings = list_markings(
-        ground, find_paint_maps(ground), min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M, symbols=False
-    )
+    markings = list_markings(ground, find_paint_maps(ground), min_confidence=MIN_CONFIDENCE, min_line_m=MIN_DASH_M)
     notes = ("markings by a camera only: light streaks are harder to tell from paint",)
     found = PictureMarkings(markings, (), (), camera, ground, notes)
     lines, shares = [], []

@@ -1,29 +1,22 @@
-"""Lines of paint: chains of pieces as smooth curves, parted into solid and dashed."""
+"""Lines of paint: chains of pieces as smooth curves, parted into solid, dashed and stop lines."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
 
-from log2sim.geometry import Array, median, wrap_angle
-from log2sim.road.ground_map import GroundMap
-from log2sim.road.paint import (
-    Pieces,
-    evidence_of_line,
-    log_probabilities_of_shares,
-    median_known,
-    surer_log_odds,
-)
-from log2sim.road.paint_network import PaintMaps
-from log2sim.road.ridges import Mask
-from log2sim.road.strokes import Curve, Stretch, fit_curve, stretches_of, trace
+from log2sim.geometry import Array, median, runs_of, wrap_angle
+from log2sim.road.curves import Curve, fit_curve
+from log2sim.road.paint_network import LANE_LINES, LINES, PaintMaps
+from log2sim.road.pieces import Pieces
 
-TOUCH_M = 1.2  # worn paint, and ridges that end before the paint does
+TOUCH_M = 1.2  # worn paint, and points that end before the paint does
 # The longest gaps of dashed lines are 12 m (Germany: 12 m at 6 m dashes; MUTCD: 30 ft = 9.1 m; UK: 7 m; Japan: 12 m).
 MAX_GAP_M = 13.0
 MAX_OVERLAP_M = 1.0
@@ -32,7 +25,6 @@ MAX_OVERLAP_M = 1.0
 MIN_RADIUS_M, MIN_RADIUS_OF_GAPS_M = 6.0, 25.0
 POSITION_SIGMA_M = 0.05  # of the end of a piece across its direction
 MAX_SIGMAS = 3.5
-MAX_WIDTH_RATIO, MAX_CONTRAST_RATIO = 2.2, 3.5
 SHORT_END_M, MAX_END_TURN_RAD = 1.0, np.deg2rad(6)
 BASE_M, LONG_BASE_M = 6.0, 15.0  # the direction of a chain's end is that of its last part
 
@@ -46,7 +38,7 @@ class Chain:
 
     def corners(self, pieces: Pieces) -> Array:
         """List the ends of all pieces in order, (2 K, 2), m."""
-        ends = pieces.ends[self.members]
+        ends = pieces.ends(self.members)
         ends[self.flipped] = ends[self.flipped][:, ::-1]
         return ends.reshape(-1, 2)
 
@@ -61,13 +53,11 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class _Ends:
-    """Ends of chains: two each, first and last. Where it is, where it points to (outwards), how sure, and its paint."""
+    """Ends of chains: two each, first and last. Where it is, where it points to (outwards), and how sure."""
 
     xy: Array  # (2 C, 2)
     outward: Array  # (2 C,) rad
     outward_sigma: Array  # (2 C,) rad
-    width_m: Array  # (2 C,)
-    contrast: Array  # (2 C,)
     length_m: Array  # (2 C,)
 
 
@@ -99,24 +89,18 @@ def _beside(pieces: Pieces, end: int, inner: int) -> bool:
 def dashed_chains(pieces: Pieces, chains: list[Chain]) -> list[Chain]:
     """Join chains across the gaps of dashed lines, short gaps first."""
     # Directions become surer the longer the chains, so the longest gaps are tried again.
-    known = dict[Chain, list[list[float]]]()
     for gap_m in (4.0, MAX_GAP_M, MAX_GAP_M):
-        chains = _join(pieces, chains, gap_m, MIN_RADIUS_OF_GAPS_M, LONG_BASE_M, known)
+        chains = _join(pieces, chains, gap_m, MIN_RADIUS_OF_GAPS_M, LONG_BASE_M)
     return chains
 
 
 def _join(
-    pieces: Pieces,
-    chains: list[Chain],
-    max_gap_m: float,
-    min_radius_m: float,
-    base_m: float = BASE_M,
-    known: dict[Chain, list[list[float]]] | None = None,
+    pieces: Pieces, chains: list[Chain], max_gap_m: float, min_radius_m: float, base_m: float = BASE_M
 ) -> list[Chain]:
-    """Join ends that continue each other best, each end with one other at most; `known` keeps the ends of chains that stay."""
+    """Join ends that continue each other best, each end with one other at most."""
     if len(chains) < 2:
         return chains
-    ends = _ends_of(pieces, chains, base_m, {} if known is None else known)
+    ends = _ends_of(pieces, chains, base_m)
     first, second, cost = _candidates(ends, max_gap_m, min_radius_m)
     partner: dict[int, int] = {}
     joined = DisjointSet(range(len(chains)))
@@ -143,40 +127,18 @@ def _join(
     return out
 
 
-def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float, known: dict[Chain, list[list[float]]]) -> _Ends:
-    contrasts = np.where(np.isfinite(pieces.color), pieces.color, np.nan_to_num(pieces.reflected))
-    if all(len(chain.members) == 1 for chain in chains):
-        return _ends_of_single(pieces, chains, contrasts)
+def _ends_of(pieces: Pieces, chains: list[Chain], base_m: float) -> _Ends:
+    rows = []
     for chain in chains:
-        if chain in known:
-            continue
-        corners, rows = chain.corners(pieces), list[list[float]]()
+        corners = chain.corners(pieces)
         length = float(np.linalg.norm(corners[-1] - corners[0]))
-        width, contrast = median(pieces.width_m[chain.members]), median(contrasts[chain.members])
         for ordered in (corners[::-1], corners):
             tip = ordered[-1]
             near = ordered[np.linalg.norm(ordered - tip, axis=1) <= base_m]
             angle, base = _direction(near if len(near) > 1 else ordered[-2:])
-            sigma = POSITION_SIGMA_M * 2 / max(base, 0.3)
-            rows.append([*tip, angle, sigma, width, contrast, length])
-        known[chain] = rows
-    t = np.array([row for chain in chains for row in known[chain]])
-    return _Ends(t[:, :2], t[:, 2], t[:, 3], t[:, 4], t[:, 5], t[:, 6])
-
-
-def _ends_of_single(pieces: Pieces, chains: list[Chain], contrasts: Array) -> _Ends:
-    """Return the ends of chains of one piece each, all at once."""
-    member = np.array([chain.members[0] for chain in chains], dtype=np.int64)
-    flipped = np.array([chain.flipped[0] for chain in chains], dtype=bool)
-    ends = pieces.ends[member]
-    ends[flipped] = ends[flipped][:, ::-1]
-    chord = ends[:, 1] - ends[:, 0]
-    length = np.hypot(chord[:, 0], chord[:, 1])
-    # First the end at which the piece begins, from which it points backwards.
-    outward = np.stack([np.arctan2(-chord[:, 1], -chord[:, 0]), np.arctan2(chord[:, 1], chord[:, 0])], axis=1)
-    sigma = POSITION_SIGMA_M * 2 / np.maximum(length, 0.3)
-    both = (np.repeat(values, 2) for values in (sigma, pieces.width_m[member], contrasts[member], length))
-    return _Ends(ends.reshape(-1, 2), outward.ravel(), *both)
+            rows.append([*tip, angle, POSITION_SIGMA_M * 2 / max(base, 0.3), length])
+    t = np.array(rows)
+    return _Ends(t[:, :2], t[:, 2], t[:, 3], t[:, 4])
 
 
 def _direction(points: Array) -> tuple[float, float]:
@@ -217,7 +179,6 @@ def _candidates(
     fits = (gap > -overlap) & (gap <= max_gap_m) & (offset <= np.minimum(MAX_SIGMAS * sigma, 0.15 + 0.05 * span))
     fits &= np.abs(turn) <= bend + 2 * turn_sigma
     fits &= np.abs(turn) < np.pi / 3
-    fits &= _alike_chains(ends.width_m, a, b, MAX_WIDTH_RATIO) & _alike_chains(ends.contrast, a, b, MAX_CONTRAST_RATIO)
     # Across a long gap, both sides are dashes: something that is there.
     fits &= span <= 1.5 + 6 * shorter
     a, b = a[fits], b[fits]
@@ -225,45 +186,36 @@ def _candidates(
     return a, b, cost[fits]
 
 
-def _alike_chains(values: Array, a: NDArray[np.int64], b: NDArray[np.int64], ratio: float) -> NDArray[np.bool_]:
-    return np.asarray(np.maximum(values[a], values[b]) <= ratio * np.minimum(values[a], values[b]))
-
-
 MIN_LINE_M = 1.0
 # Contrast of yellowness: paint is 0.5 to 1.2 in daylight, gray and white are below 0.1.
 MIN_YELLOW = 0.2
 REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
-# Lanes are 2 m wide at least; of lines that run beside each other there are two. More are sun through a fence, or a wall.
-BESIDE_M, MAX_BESIDE = (0.45, 1.7), 1
-BESIDE_PER_M = 4  # pairs of points 0.5 m apart, two for each: beside it along half of it or more
-# Half of a lane 2.5 to 4.4 m wide: no lane line has neighbors so near on both sides, arrows have.
-HALF_LANE_M = (1.25, 2.2)
-MAX_CROSSINGS, MAX_CROSSINGS_PER_M = 3, 0.2  # a grid of more lines is a wall or paving
-MAX_LOG_RATIO = np.log(2)  # of widths and contrasts of lines that look alike
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
-PARALLEL_RAD = np.deg2rad(15)
+STEP_M = 0.1
+END_SHARE = 0.5  # a line ends where its probability falls to half of what it usually is
+SMOOTH_M = (
+    0.5  # along which probabilities are averaged to find ends, and gaps are none: flakes of worn paint are shorter
+)
+KIND_M = 10.0  # and to find kinds: a period of most dashed lines
+# Roads that join are 5.5 m wide and lines end some meters before them; a worn dash or two leave less than that, or than three gaps.
+JUNCTION_M, LONG_GAPS = 10.0, 3.0
+MIN_BARE_M, MAX_BARE_M, MAX_BARE = 2.0, 6.0, 0.5  # of solid lines: where less is painted than bare, the line ends
 
 
 @dataclass(frozen=True, eq=False)
-class PaintedLine:
-    """A line of paint."""
+class Paint:
+    """What may be a marking."""
 
-    xy: Array  # (P, 2), m: middle, from end to end
-    kind: str  # "solid", "dashed" or "stop_line"
-    width_m: float
-    pieces: Pieces  # what shows it
-    dashes: int
-    evidence: dict[str, float]  # that it is a marking, see `evidence_of_line`
-    network: float  # log-odds that it is one, by the network
-
-    @cached_property
-    def log_odds(self) -> float:
-        """Log-odds that it is a marking."""
-        return surer_log_odds(self.pieces, self.kind, self.evidence, self.network)
+    kind: str  # of a marking or border
+    xy: Array  # (P, 2), m: of a line its middle, from end to end; of others the outline
+    width_m: float  # of an outline its lesser extent
+    color: str | None  # None where no camera saw it
+    sources: tuple[str, ...]  # the sensors that show a line, or saw most of what has an outline
+    log_odds: float  # that it is a marking
 
     @property
     def length_m(self) -> float:
-        """Length from end to end."""
+        """Length of a line from end to end."""
         return float(np.linalg.norm(np.diff(self.xy, axis=0), axis=1).sum())
 
 
@@ -286,36 +238,72 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
     return tuple(name for name, shows in (("camera", camera), ("lidar", lidar)) if shows)
 
 
-def find_lines(
-    ground: GroundMap, maps: PaintMaps, pieces: Pieces, chains: list[Chain]
-) -> tuple[list[PaintedLine], Array]:
-    """Make lines of chains; also estimate the shares that paint returns, see `log_probabilities_of_shares`."""
-    parts: list[tuple[Array, Stretch, Pieces, float]] = []  # with the length that is painted, m
-    for chain in chains:
+def find_lines(maps: PaintMaps, pieces: Pieces) -> list[Paint]:
+    """Make lines of pieces, also unlikely ones."""
+    out = []
+    for chain in dashed_chains(pieces, touching_chains(pieces)):
         corners = chain.corners(pieces)
         if np.linalg.norm(np.diff(corners, axis=0), axis=1).sum() < MIN_LINE_M:
             continue
         own = pieces.take(chain.members)
         curve = fit_curve(corners)
-        traced, s = trace(ground, maps, curve, median(own.width_m)), curve.s
-        nearest = s[cKDTree(curve.xy).query(own.xy)[1]]
-        for stretch in stretches_of(traced.strokes()):
-            begin, end = stretch.begin_m, min(stretch.end_m, float(s[-1]))
-            member = own.take((nearest > begin - 1.0) & (nearest < stretch.end_m + 1.0))
+        nearest = curve.s[cKDTree(curve.xy).query(own.xy)[1]]
+        painted = nearest[:, None] + own.length_m[:, None] * [-0.5, 0.5]
+        for begin, end, kind in parts_of(maps, curve, painted):
+            member = own.take((nearest > begin - 1.0) & (nearest < end + 1.0))
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
+            s = curve.s
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
-            parts.append((xy, stretch, member, traced.painted_m(begin, end)))
-    shares = log_probabilities_of_shares((member, painted_m, stretch.dashes) for _, stretch, member, painted_m in parts)
-    out = []
-    for xy, stretch, member, painted_m in parts:
-        evidence = evidence_of_line(member, painted_m, dashes=stretch.dashes, shares=shares)
-        odds = maps.object_log_odds(stretch.kind, member.along)
-        out.append(PaintedLine(xy, stretch.kind, median(member.width_m), member, stretch.dashes, evidence, odds))
-    return _in_context(drop_repeats(out)), shares
+            # Edges of bright ground are brighter than one side only: no sensor shows a line.
+            if sources := sources_of(member):
+                odds = maps.object_log_odds("lane_line" if kind in LANE_LINES else kind, member.along)
+                out.append(Paint(kind, xy, median(member.width_m), color_of(member), sources, odds))
+    return drop_repeats(out)
 
 
-def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
+def parts_of(maps: PaintMaps, curve: Curve, painted: Array) -> list[tuple[float, float, str]]:
+    """Part a curve by the likeliest kind: begin and end, m, and kind of each part.
+
+    `painted`: (K, 2): begin and end, m, of what stands out along it.
+    """
+    length = float(curve.s[-1])
+    s = np.arange(STEP_M / 2, max(length, STEP_M), STEP_M)
+    xy = curve.at(s)
+    each = np.stack([maps.at(layer, xy) for layer in maps.probability[: len(LINES)]])
+    seen = maps.at(maps.seen.astype(np.float32), xy) > 0.5
+
+    def size(length_m: float) -> tuple[int, int]:
+        return 2 * round(length_m / STEP_M / 2) + 1, 1
+
+    def mean(values: Array, within_m: float) -> Array:
+        return np.asarray(cv2.blur(values, size(within_m), borderType=cv2.BORDER_CONSTANT), np.float64)
+
+    line = mean(each.sum(axis=0, keepdims=True), SMOOTH_M)[0]
+    # What has no gaps is not dashed.
+    covered = (s >= painted[:, :1] - SMOOTH_M / 2) & (s <= painted[:, 1:] + SMOOTH_M / 2)
+    bare: Array = np.asarray(~np.any(covered, axis=0), np.float64)
+    each[LINES.index("dashed")] *= cv2.dilate(bare[None], np.ones(size(KIND_M)[::-1]))[0]
+    usual = float(np.square(line).sum() / max(line.sum(), 1e-9))  # where there is paint: its mean, weighted by itself
+    kind = np.where(line > END_SHARE * usual, mean(each, KIND_M).argmax(axis=0), -1)
+    runs = sorted((*run, LINES[k]) for k in range(len(LINES)) for run in runs_of(kind == k))
+    gaps = [STEP_M * (b[0] - a[1]) for a, b in pairwise(runs) if a[2] == b[2] == "dashed"]
+    longest_m = max(JUNCTION_M, LONG_GAPS * median(np.array(gaps))) if gaps else JUNCTION_M
+    parts, painted_m = list[tuple[float, float, str]](), 0.0
+    for first, last, of in runs:
+        begin, end = float(s[first]) - STEP_M / 2, float(s[last - 1]) + STEP_M / 2
+        before = parts[-1] if parts else (0.0, 0.0, "")
+        between = seen[(s > before[1]) & (s < begin)]
+        most_m = longest_m if of == "dashed" else max(MIN_BARE_M, min(MAX_BARE * painted_m, MAX_BARE_M))
+        if before[2] == of and (begin - before[1] <= most_m or np.mean(between) <= 0.5):
+            parts[-1], painted_m = (before[0], end, of), painted_m + end - begin
+        else:
+            parts.append((begin, end, of))
+            painted_m = end - begin
+    return parts
+
+
+def drop_repeats(lines: list[Paint]) -> list[Paint]:
     """Leave out lines that lie on stronger ones."""
     order = sorted(lines, key=lambda one: (-one.log_odds, -one.length_m))
     dense = [_dense(line.xy) for line in order]
@@ -338,73 +326,3 @@ def drop_repeats(lines: list[PaintedLine]) -> list[PaintedLine]:
 def _dense(xy: Array) -> Array:
     curve = Curve(xy)
     return curve.at(np.arange(0, curve.s[-1] + 0.05, 0.1))
-
-
-def _in_context(lines: list[PaintedLine]) -> list[PaintedLine]:
-    """Add to the evidence which lines form combs or grids, how much fainter they are than their neighbors, and which are in mid-lane."""
-    if len(lines) < 2:
-        return lines
-    dense = [_dense(line.xy)[::5] for line in lines]
-    owner = np.repeat(np.arange(len(lines)), [len(d) for d in dense])
-    points = np.concatenate(dense)
-    steps = [np.gradient(d, axis=0) if len(d) > 1 else np.tile([1.0, 0.0], (len(d), 1)) for d in dense]
-    dx, dy = np.concatenate(steps).T
-    heading = np.arctan2(dy, dx) % np.pi
-    pairs = cKDTree(points).query_pairs(HALF_LANE_M[1], output_type="ndarray")
-    a, b = np.concatenate([pairs, pairs[:, ::-1]]).T
-    a, b = a[owner[a] != owner[b]], b[owner[a] != owner[b]]
-    turn = np.abs((heading[a] - heading[b] + np.pi / 2) % np.pi - np.pi / 2)
-    offset = points[b] - points[a]
-    left = offset[:, 1] * np.cos(heading[a]) - offset[:, 0] * np.sin(heading[a])
-    distance = np.linalg.norm(offset, axis=1)
-    parallel = (turn < PARALLEL_RAD) & (np.abs(left) > BESIDE_M[0]) & (distance <= BESIDE_M[1])
-    crossing = (turn > np.pi / 4) & (distance < 0.5)
-    length, odds = (np.array([getattr(line, name) for line in lines]) for name in ("length_m", "log_odds"))
-    half_lane = (turn < PARALLEL_RAD) & (np.abs(left) > HALF_LANE_M[0]) & (odds[owner[b]] > 0)
-    sides = np.zeros((len(points), 2))
-    sides[a[half_lane], (left[half_lane] > 0).astype(int)] = 1
-    mid_lane = np.bincount(owner, sides.all(axis=1)) / np.bincount(owner)
-    # Pairs of lines, not a table of all: a long log has thousands.
-    i, j, count = _counted(owner[a[parallel]], owner[b[parallel]])
-    beside = count > BESIDE_PER_M * length[i]
-    i, j = i[beside], j[beside]
-    crowded = np.bincount(i[_alike(lines, odds, i, j)], minlength=len(lines)) > MAX_BESIDE
-    # Combs do not tell against what they cross, unless that is a comb, too.
-    k, other, _ = _counted(owner[a[crossing]], owner[b[crossing]])
-    told = _alike(lines, odds, k, other) & (~crowded[other] | (np.bincount(i, minlength=len(lines)) > 0)[k])
-    crossings = np.bincount(k[told], minlength=len(lines))
-    grid = (crossings > MAX_CROSSINGS) & (crossings > MAX_CROSSINGS_PER_M * length)
-    # Paint of the same time is about as bright; a fainter line next to another is what is left of removed paint.
-    fainter, likely = np.zeros(len(lines)), odds[j] > odds[i] - 1
-    np.maximum.at(fainter, i[likely], _brighter(lines, i[likely], j[likely]))
-    names, combs = ("crowded", "fainter", "mid_lane"), crowded + grid.astype(float)
-    context = zip(combs.tolist(), fainter.tolist(), mid_lane.tolist())
-    return [replace(line, evidence=line.evidence | dict(zip(names, own))) for line, own in zip(lines, context)]
-
-
-def _counted(first: NDArray[np.intp], second: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
-    """Return each pair of numbers (P,), (P,) once, and how often (P,) it is there."""
-    most = int(second.max(initial=0)) + 1
-    pair, count = np.unique(first * most + second, return_counts=True)
-    return pair // most, pair % most, count
-
-
-def _alike(lines: list[PaintedLine], odds: Array, one: NDArray[np.intp], other: NDArray[np.intp]) -> Mask:
-    """Mask (P,) of pairs of lines that look alike, and the other as likely as the one: what combs and grids are made of."""
-    width = np.array([line.width_m for line in lines])
-    same = np.abs(np.log(width[one] / width[other])) <= MAX_LOG_RATIO
-    same &= np.abs(_brighter(lines, one, other)) <= MAX_LOG_RATIO
-    return np.asarray(same & (odds[other] > odds[one] - 2))
-
-
-def _brighter(lines: list[PaintedLine], one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
-    """Logarithm (P,) of the ratio of the contrasts of other lines to those of some.
-
-    Of color where a camera saw both, else of LiDAR intensity; 0 where neither sensor saw both.
-    """
-    ratio = np.zeros(len(one))
-    for name in ("reflected", "color"):
-        contrast = np.array([median_known(getattr(line.pieces, name)) for line in lines])
-        found = np.log(np.maximum(contrast[other], 1e-3) / np.maximum(contrast[one], 1e-3))
-        ratio = np.where(np.isfinite(found), found, ratio)
-    return ratio

@@ -268,16 +268,12 @@ SHARP_RANGE_M = 20.0
 # Points count in cells this near to theirs, in cells: first those nearly in it, then those within the gaps between rings.
 SPREADS = (0.8, 2.5)
 MIN_WEIGHT = 0.02
-# Edge of the square in which points are counted: as far apart as rings are where they still show paint.
-COUNTED_M = 0.45
 
 
 def map_intensity(
     points: GroundPoints, surface: Surface, raster: Raster, road: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
+) -> NDArray[np.float32]:
     """Map relative intensities of points onto a raster: (R, C) in [0, 1], NaN where there are none.
-
-    The second result is the mean distance of neighboring points (R, C), m, infinite where there are none.
 
     `surface`: points off it are left out. `road`: (r, c) bool: cells of the surface's raster that are road surely,
     because the ego drove there.
@@ -289,11 +285,6 @@ def map_intensity(
     fine = cells_of_points(points, raster)[kept]
     weight = 1 / (1 + (points.range_m[kept] / SHARP_RANGE_M) ** 2)
     count = raster.shape[0] * raster.shape[1]
-    points_in_cell = np.bincount(fine, minlength=count).astype(np.float32).reshape(raster.shape)
-    size = round(COUNTED_M / raster.resolution_m) | 1
-    with np.errstate(divide="ignore"):
-        spacing = (raster.resolution_m / np.sqrt(cv2.blur(points_in_cell, (size, size)))).astype(np.float16)
-    del points_in_cell  # four bytes a cell
     total = np.bincount(fine, weight, count).astype(np.float32).reshape(raster.shape)
     sums = np.bincount(fine, weight * relative[kept], count).astype(np.float32).reshape(raster.shape)
     out = np.full(raster.shape, np.nan, np.float32)
@@ -301,7 +292,7 @@ def map_intensity(
         near, near_sums = (cv2.GaussianBlur(a, (0, 0), spread) for a in (total, sums))
         free = np.isnan(out) & (near > MIN_WEIGHT / spread**2)
         out[free] = near_sums[free] / near[free]
-    return np.minimum(out * np.float32(USUAL), 1), spacing
+    return np.asarray(np.minimum(out * np.float32(USUAL), 1))
 
 
 def normalize(points: GroundPoints, ground: NDArray[np.bool_], road: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -32,7 +32,7 @@ from log2sim.evaluation.metrics.evaluator import evaluate
 from log2sim.evaluation.road import MATCH_M, Area, RoadSamples, nearest_road
 from log2sim.road.builder import map_ground
 from log2sim.road.ground_map import GroundMap
-from log2sim.road.ridges import sample
+from log2sim.road.samples import sample
 from log2sim.synth.scene import Scene, load_scene
 from log2sim.synth.synthesis import write_synthetic
 

@@ -1,4 +1,4 @@
-"""Make maps of random roads with their true markings, on which `train.py markings` and `fit.py lines` fit.
+"""Make maps of random roads with their true markings, on which `train.py markings` fits.
 
     python tools/fit.py line_maps FOLDER --maps 270 --plain 60
 

@@ -25,11 +25,14 @@ from log2sim.synth.synthesis import write_synthetic
 
 FINE_CELLS = 512  # of a crop, 25.6 m
 PICTURES_OF_SEED = 900_000  # seeds of roads that no map shows
-PER_MAP, PER_PICTURE, PER_PLAIN = 6, 3, 6  # crops
+PER_MAP, PER_PICTURE, PER_PLAIN = 6, 3, 12  # crops
 NEAR_MARKING, NEAR_M, TRIALS = 0.7, 7.0, 40  # share of the crops around a marking or border, and how far from it
 LINE_CELLS, BORDER_CELLS, SUBPIXEL_BITS = 3, 3, 4  # least widths that are drawn
 OFF_ROAD_CELLS = 25  # from all markings and borders
-MORE_LINES, FREE_CELLS = 0.5, 4  # share of the crops that get one more line, and how far from other markings it is
+MORE_LINES, MORE_SHAPES = 0.5, 0.35  # shares of the crops that get one more line, and another marking
+MORE_ROADS = 0.6  # share of the crops of plain ground that get a road of another surface
+FREE_CELLS = 4  # how far these are from other markings
+SHAPE_TRIALS, CANVAS_CELLS = 5, 128  # places that are tried for another marking, and the side of its drawing
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +135,26 @@ def draw_crop(road: RoadMap, rng: np.random.Generator, *, picture: bool = False)
     curb = cv2.erode(curb, np.ones((int(rng.integers(1, 5)),) * 2, np.uint8))
     layers = _Layers(np.log(color.astype(np.float32) + 4), alpha, intensity, height)
     lanes = [m.points_m for m in road.true.markings if m.is_lane_line] + [edge.points_m for edge in road.true.borders]
+    road_course = None
+    if not lanes and rng.random() < MORE_ROADS:
+        road_course = _draw_course(rng)
+        layers = _lay_road(layers, road_course, border, rng)
     if rng.random() < MORE_LINES:
-        # Beside those of the road, or anywhere on plain ground, as on wide squares that show no border.
-        course = to_crop(lanes[rng.integers(len(lanes))]) if lanes else _draw_course(rng)
+        # Beside those of the road, across it, or anywhere on plain ground, as on wide squares that show no border.
+        along = lanes and rng.random() < 0.7
+        course = (
+            to_crop(lanes[rng.integers(len(lanes))])
+            if along
+            else _draw_course(rng)
+            if road_course is None
+            else road_course
+        )
         where = (off_road > 0) & bool(lanes)
         for _ in range(1 if lanes else int(rng.integers(1, 5))):
             layers = _paint_line(layers, course, kind, line, where, rng)
+    if rng.random() < MORE_SHAPES:
+        course = to_crop(lanes[rng.integers(len(lanes))]) if lanes else _draw_course(rng)
+        layers = _paint_shape(layers, course, kind, line, (off_road > 0) & bool(lanes), rng)
     disturbed = _disturb(layers, off_road > 0, curb > 0, rng)
     color = np.clip(np.exp(disturbed.log_color) - 4, 0, 255).astype(np.uint8)
     values = inputs_of(color, disturbed.alpha, disturbed.intensity, disturbed.height_m)
@@ -192,7 +209,8 @@ def _draw_line(kind: NDArray[np.uint8], line: NDArray[np.float32], points: Array
     """Draw the kind of a line (N, 2), its direction and its width."""
     width = max(LINE_CELLS, round(width_m / CELL_M) | 1)
     _draw(kind, points, value, width)
-    for begin, end in pairwise(points):
+    near = (np.abs(points - len(kind) / 2) < len(kind)).all(axis=1)
+    for begin, end in (pair for pair, drawn in zip(pairwise(points), near) if drawn):
         twice = 2 * np.arctan2(end[1] - begin[1], end[0] - begin[0])
         for layer, of_line in zip(line, (np.cos(twice), np.sin(twice), width_m)):
             _draw(layer, np.stack([begin, end]), float(of_line), width)
@@ -201,10 +219,32 @@ def _draw_line(kind: NDArray[np.uint8], line: NDArray[np.float32], points: Array
 def _draw_course(rng: np.random.Generator) -> Array:
     """Draw an arc (N, 2) through a crop, in coarse cells."""
     along = np.linspace(-FINE_CELLS, FINE_CELLS, 60)
-    across = rng.normal(0, 1e-3) * along**2 / 2
+    radius_m = _log_uniform(rng, 6, 1000)  # of guiding lines in junctions, and of roads
+    across = CELL_M / radius_m * along**2 / 2
     angle = rng.uniform(0, np.pi)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     return np.asarray(rng.uniform(0.2, 0.8, 2) * FINE_CELLS / 2 + np.stack([along, across], axis=1) @ turn)
+
+
+def _lay_road(layers: _Layers, course: Array, border: NDArray[np.uint8], rng: np.random.Generator) -> _Layers:
+    """Lay a road of another surface along a course (N, 2), in coarse cells, with or without curbs, and its borders into `border`."""
+    half_m = rng.uniform(2.0, 8.0)
+    free = np.full(layers.alpha.shape, 255, np.uint8)
+    _draw(free, course * 2 + 0.5, 0, 1)
+    away_m = cv2.distanceTransform(free, cv2.DIST_L2, 5) * FINE_M
+    soft = (half_m - away_m) / rng.uniform(0.05, 0.4)  # how sharp its edge is
+    road = soft.clip(-1, 1).astype(np.float32) / 2 + 0.5
+    tint = np.array([0.0, 1.0, 1.0]) * rng.normal(0, 0.08)  # yellower or bluer
+    color = layers.log_color + road[..., None] * (rng.normal(0, 0.35) + tint).astype(np.float32)
+    intensity = layers.intensity * np.exp(road * np.float32(rng.normal(0, 0.5)))
+    height = layers.height_m - road * np.float32(rng.uniform(0.03, 0.2) if rng.random() < 0.5 else 0.0)
+    edge = cv2.findContours((away_m < half_m).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    drawn = np.zeros(layers.alpha.shape, np.uint8)
+    cv2.drawContours(drawn, edge, -1, 1, 2 * BORDER_CELLS)
+    # The end of the crop is none of the road.
+    drawn[:4], drawn[-4:], drawn[:, :4], drawn[:, -4:] = 0, 0, 0, 0
+    border[cv2.resize(drawn, border.shape[::-1], interpolation=cv2.INTER_AREA) > 0] = 1
+    return _Layers(color, layers.alpha, intensity, height)
 
 
 def _paint_line(
@@ -226,12 +266,9 @@ def _paint_line(
     step = np.gradient(dense, axis=0)
     normal = step[:, ::-1] * [-1, 1] / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
     dense = dense + normal * rng.choice([-1, 1]) * rng.uniform(0.8, 4.0) / CELL_M
-    width_m, way = rng.uniform(0.1, 0.5), rng.integers(4)  # solid, dashes twice, dots
-    dash_m, gap_m = [
-        (np.inf, 0.0),
-        *[(rng.uniform(0.4, 6), rng.uniform(0.4, 9))] * 2,
-        (rng.uniform(0.1, 0.25), rng.uniform(0.5, 1.5)),
-    ][way]
+    width_m, way = _log_uniform(rng, 0.1, 0.5), rng.integers(5)  # solid, dashes three times, dots
+    dash_m = np.inf if way == 0 else rng.uniform(0.1, 0.25) if way == 4 else _log_uniform(rng, 0.3, 8)
+    gap_m = 0.0 if way == 0 else _log_uniform(rng, 0.5, 3) * (1 if way == 4 else dash_m)
     along_m = np.arange(len(dense)) * 2 * CELL_M + rng.uniform(0, 10)
     free = cv2.distanceTransform((kind == 0).astype(np.uint8), cv2.DIST_L2, 3) > FREE_CELLS
     fine_free = cv2.resize(free.astype(np.uint8), layers.alpha.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
@@ -242,14 +279,112 @@ def _paint_line(
     on = np.isinf(dash_m) | ((fine + along_m[0]) % (dash_m + gap_m) < dash_m)
     for begin, end in runs_of(on):
         _draw(paint, fine_xy[begin:end], 255, max(1, round(width_m / FINE_M)))
-    share = cv2.GaussianBlur(paint.astype(np.float32) / 255, (0, 0), rng.uniform(0.3, 1.2)) * (fine_free & ~off_road)
-    color = layers.log_color + share[..., None] * np.float32(rng.uniform(0.15, 0.9))
-    intensity = layers.intensity * (1 + share * np.float32(np.exp(rng.uniform(0.2, 1.4)) - 1))
+    layers = _add_paint(layers, paint.astype(np.float32) / 255, fine_free & ~off_road, rng)
     new_kind, new_line = np.zeros_like(kind), np.zeros_like(line)
     _draw_line(new_kind, new_line, dense, 1 + KINDS.index("solid" if way == 0 else "dashed"), width_m)
     there = (new_kind > 0) & free & ~off_road[::2, ::2]
     kind[there], line[:, there] = new_kind[there], new_line[:, there]
+    return layers
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _add_paint(
+    layers: _Layers, paint: NDArray[np.float32], where: NDArray[np.bool_], rng: np.random.Generator
+) -> _Layers:
+    """Add paint, by the share of each cell that it covers, of any contrast, blurred a little."""
+    share = cv2.GaussianBlur(paint, (0, 0), rng.uniform(0.3, 1.2)) * where
+    color = layers.log_color + share[..., None] * np.float32(rng.uniform(0.15, 0.9))
+    intensity = layers.intensity * (1 + share * np.float32(np.exp(rng.uniform(0.2, 1.4)) - 1))
     return _Layers(color, layers.alpha, intensity, layers.height_m)
+
+
+def _paint_shape(
+    layers: _Layers,
+    course: Array,
+    kind: NDArray[np.uint8],
+    line: NDArray[np.float32],
+    off_road: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> _Layers:
+    """Paint a symbol, a crosswalk or a stop line beside a course (N, 2), in coarse cells, where there is room; its label goes into `kind`."""
+    name, paint, covered, (long_m, wide_m) = _draw_shape(rng)
+    inside = np.flatnonzero((np.abs(course[:-1] - len(kind) / 2) < len(kind) / 2).all(axis=1))
+    free = (cv2.distanceTransform((kind == 0).astype(np.uint8), cv2.DIST_L2, 3) > FREE_CELLS) & ~off_road[::2, ::2]
+    for k in rng.choice(inside, SHAPE_TRIALS) if len(inside) else ():
+        heading = course[k + 1] - course[k]
+        heading = heading / max(float(np.linalg.norm(heading)), 1e-9)
+        left = np.array([-heading[1], heading[0]])
+        away_m = rng.choice([-1, 1]) * rng.uniform(0.5, 4.0)
+        at = course[k] + (rng.uniform(0, 1) * heading + away_m * left) / CELL_M
+        # Columns of the canvas go along the road.
+        axes = np.stack([heading * long_m, left * wide_m], axis=1) / CANVAS_CELLS / FINE_M
+        matrix = np.column_stack([axes, 2 * at + 0.5 - axes @ np.full(2, CANVAS_CELLS / 2)])
+        area, new = (
+            cv2.warpAffine(layer, matrix, layers.alpha.shape[::-1]) / np.float32(255) for layer in (covered, paint)
+        )
+        label = cv2.resize(area, kind.shape[::-1], interpolation=cv2.INTER_AREA) > 0.4
+        if label.any() and free[label].all():
+            kind[label] = 1 + KINDS.index(name)
+            if name == "stop_line":
+                twice = 2 * np.arctan2(left[1], left[0])
+                line[:, label] = np.array([[np.cos(twice)], [np.sin(twice)], [long_m]])
+            return _add_paint(layers, new, np.ones(new.shape, dtype=bool), rng)
+    return layers
+
+
+def _draw_shape(rng: np.random.Generator) -> tuple[str, NDArray[np.uint8], NDArray[np.uint8], tuple[float, float]]:
+    """Draw a marking: its kind, canvases of its paint and of what it covers, whose columns go along the road, its length and width, m."""
+    n = CANVAS_CELLS
+    paint = np.zeros((n, n), np.uint8)
+    way = rng.integers(6)
+    if way == 0:  # bars of a crosswalk, at times between two lines
+        count = int(rng.integers(3, 15))
+        share = rng.uniform(0.35, 0.65)
+        paint[(np.arange(n) / n * (count - 1 + share)) % 1 < share] = 255
+        if rng.random() < 0.2:
+            paint[:, [0, 1, 2, 3, -4, -3, -2, -1]] = 255
+        step_m = rng.uniform(0.6, 1.4)
+        return "crosswalk", paint, np.full_like(paint, 255), (rng.uniform(1.5, 6), (count - 1 + share) * step_m)
+    if way == 1:  # a stop line, or one of blocks or triangles, to give way
+        covered = np.full_like(paint, 255)
+        length_m, width_m = rng.uniform(2, 12), rng.uniform(0.2, 0.8)
+        phase = (np.arange(n) / n * max(3, round(length_m / rng.uniform(0.6, 1.2)))) % 1
+        shape = rng.integers(4)
+        if shape == 0:
+            paint[phase < rng.uniform(0.4, 0.7)] = 255
+        elif shape == 1:
+            paint[np.abs(phase - 0.5)[:, None] < np.arange(n) / n / 2] = 255
+        else:
+            paint[:] = 255
+        return "stop_line", paint, covered, (width_m, length_m)
+    if way == 2:  # a bicycle
+        for column, row in ((28, 40), (28, 88)):
+            cv2.circle(paint, (column, row), 20, 255, 5)
+        frame = np.array(
+            [[28, 40], [60, 52], [58, 78], [28, 62], [60, 52], [78, 50], [58, 78], [28, 88], [58, 78], [80, 84]]
+        )
+        cv2.polylines(paint, [frame], False, 255, 5)
+        size = rng.uniform(1.2, 4), rng.uniform(0.8, 2)
+    elif way == 3:  # an arrow, at times with a head to one side, too
+        tip = int(rng.integers(50, 100))
+        cv2.line(paint, (0, 64), (tip, 64), 255, int(rng.integers(8, 20)))
+        cv2.fillPoly(paint, [np.array([[tip, 64 - 30], [127, 64], [tip, 64 + 30]])], 255)
+        if rng.random() < 0.5:
+            cv2.polylines(paint, [np.array([[40, 64], [70, 100]])], False, 255, 10)
+            cv2.fillPoly(paint, [np.array([[55, 105], [90, 92], [85, 127]])], 255)
+        size = rng.uniform(1.5, 7.5), rng.uniform(0.6, 2)
+    else:  # letters and digits, read in the direction of travel
+        text = "".join(rng.choice(list("ABCDEFGHKLMNOPRSTUX0123456789"), int(rng.integers(1, 5))))
+        font = int(rng.choice([cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX]))
+        (wide, high), _ = cv2.getTextSize(text, font, 2.0, 6)
+        upright = np.zeros((high + 12, wide + 12), np.uint8)
+        cv2.putText(upright, text, (6, high + 6), font, 2.0, 255, int(rng.integers(4, 10)))
+        paint = cv2.rotate(cv2.resize(upright, (n, n), interpolation=cv2.INTER_AREA), cv2.ROTATE_90_CLOCKWISE)
+        size = rng.uniform(1, 4), min(0.7 * len(text), 2.5) * rng.uniform(0.6, 1.2)
+    return "other", paint, paint, size
 
 
 def _disturb(
@@ -275,8 +410,10 @@ def _disturb(
             color[curb] += np.float32(rng.uniform(-0.3, 0.6))
         if chance(0.2):
             color[_strokes(shape, 8, 6, rng.uniform(5, 50), 0.4, rng) & off_road] += np.float32(rng.uniform(-0.5, 0.9))
-        if chance(0.2):
+        if chance(0.3):
             color += _light(shape, rng)[..., None]
+        if chance(0.25):  # repaired places and covers
+            color += _plates(shape, rng)[..., None]
         if chance(0.4):
             grain = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), rng.uniform(0.5, 2.5))
             color += (grain * np.float32(rng.uniform(0.02, 0.15)) / grain.std())[..., None]
@@ -305,6 +442,8 @@ def _disturb(
             rough *= (_blobs(shape, 100, rng.uniform(0.2, 0.9), rng) & off_road) * np.float32(rng.uniform(0.02, 0.25))
             height = height + rough
         intensity = np.clip(intensity, 0, 1)
+        if chance(0.4):
+            intensity = intensity * np.exp(_rings(shape, rng))
         if chance(0.5):
             intensity = intensity * np.exp(rng.normal(0, rng.uniform(0, 0.3), shape)).astype(np.float32)
         if chance(0.3):
@@ -319,9 +458,54 @@ def _disturb(
             intensity = np.full_like(intensity, np.nan)
         else:
             alpha = np.zeros_like(alpha)
+    for _ in range(int(rng.integers(1, 3)) if chance(0.2) else 0):  # where what a sensor saw ends
+        outside, which = _outside(shape, rng), rng.integers(3)
+        if which != 0:
+            intensity, height = np.where(outside, np.nan, intensity), np.where(outside, np.nan, height)
+        if which != 1:
+            alpha = np.where(outside, 0, alpha).astype(np.uint8)
     if chance(0.15):
         height = np.full_like(height, np.nan)
     return _Layers(color, alpha, intensity.astype(np.float32), height.astype(np.float32))
+
+
+def _rings(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Draw rings of sweeps (H, W), as logarithms: lasers differ in what they return, and a map shows where each sweep's points lie."""
+    out = np.zeros(shape, np.float32)
+    radii = rng.uniform(3, 30) / FINE_M * np.cumprod(1 + rng.uniform(0.005, 0.15, int(rng.integers(2, 25))))
+    gains = rng.normal(0, rng.uniform(0.1, 0.5), len(radii))
+    angle, step_m = rng.uniform(0, 2 * np.pi), _log_uniform(rng, 0.1, 2.0)
+    steps = np.arange(int(rng.integers(1, 40)))[:, None] * np.array([np.cos(angle), np.sin(angle)]) * step_m / FINE_M
+    for x, y in (rng.uniform(-0.5, 1.5, 2) * shape[0] + steps).round().astype(int).tolist():
+        for radius, gain in zip(radii.round().astype(int).tolist(), gains.tolist()):
+            cv2.circle(out, (x, y), radius, gain, 2)
+    return out
+
+
+def _plates(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Draw repaired places with straight edges, and covers of shafts, as logarithms (H, W): brighter or darker than the road."""
+    out = np.zeros(shape, np.float32)
+    for _ in range(int(rng.integers(1, 5))):
+        at, change = rng.uniform(0, shape[0], 2), rng.uniform(-0.4, 0.4)
+        if rng.random() < 0.4:
+            radius = int(rng.integers(4, 10))
+            cv2.circle(out, at.astype(int).tolist(), radius, change, int(rng.choice([-1, 2, 3])))
+        else:
+            size = _log_uniform(rng, 0.5, 4) / FINE_M, _log_uniform(rng, 0.5, 20) / FINE_M
+            corners = cv2.boxPoints((at.tolist(), size, rng.uniform(0, 180)))
+            cv2.fillPoly(out, [corners.round().astype(np.int32)], change)
+    return out
+
+
+def _outside(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Draw a mask of what is beyond the reach of a sensor, a circle or beam with a ragged end, or within what is too near."""
+    rows, columns = np.indices(shape).astype(np.float32)
+    center, radius = rng.uniform(-1, 2, 2) * shape[0], rng.uniform(3, 40) / FINE_M
+    distance = np.hypot(rows - center[0], columns - center[1])
+    ragged = cv2.resize(rng.normal(size=(32, 32)).astype(np.float32), shape[::-1]) * rng.uniform(0, 10)
+    beyond = distance + ragged > radius
+    # About as much of the crop is left as is taken away, or more.
+    return np.asarray(beyond if beyond.mean() < 0.6 else ~beyond)
 
 
 def _half_plane(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -366,8 +550,12 @@ def _light(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float
         return np.asarray(
             rng.uniform(0.5, 2) * (np.exp(-np.hypot(across, along) / rng.uniform(60, 250)) - 0.5), np.float32
         )
-    streak = np.exp(-np.square(across / rng.uniform(3, 12)) - np.square(along / rng.uniform(40, 250)))
-    return np.asarray(rng.uniform(0.2, 1) * streak, np.float32)
+    out = np.zeros(shape, np.float32)
+    for _ in range(int(rng.integers(1, 5))):  # of lamps one behind the other
+        off = rng.normal(0, 60, 2)
+        streak = np.square((across - off[0]) / rng.uniform(3, 12)) + np.square((along - off[1]) / rng.uniform(40, 250))
+        out += np.float32(rng.uniform(0.2, 1)) * np.exp(-streak)
+    return out
 
 
 def _stroke_kernel(cells: int, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 pip install 'log2sim[train]'
 python tools/fit.py line_maps MAPS --maps 270 --plain 60               # roads as maps show them; 20 minutes on two cores
-python tools/fit.py line_maps HELD --maps 50 --plain 20 --first 270    # others, to report on and to fit weights to
+python tools/fit.py line_maps HELD --maps 50 --plain 20 --first 270    # others, to calibrate and report on
 python tools/train.py markings MAPS HELD DIR                           # everything; the card tells the rounds of what ships
 python tools/train.py markings MAPS HELD DIR --pictures 20 --steps 50  # a toy
 """
@@ -27,21 +27,38 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 from torch import Tensor, nn
 
+from log2sim.datatypes.scenario import BORDER_KINDS
 from log2sim.errors import Log2SimError
-from log2sim.road.markings import find_paint
-from log2sim.road.paint_network import CHANNELS, KINDS, METADATA_KEY, find_paint_maps, open_markings_network
+from log2sim.road.borders import find_edges
+from log2sim.road.markings import AREA_M2, find_paint
+from log2sim.road.paint_network import (
+    CHANNELS,
+    KINDS,
+    LANE_LINES,
+    METADATA_KEY,
+    OUTPUTS,
+    find_paint_maps,
+    open_markings_network,
+)
 from training import fitting
 from training.export import describe, export_checked
 from training.fitting import FitPlan
 from training.map_crops import Crop, iterate_crops, picture_map
 from training.network import conv
 
-OUTPUTS = 1 + len(KINDS) + 4  # beside the kinds: borders, direction and width of lines, which are taught with them
-PICTURES, STEPS, BATCH, RATE = 320, 16_000, 4, 2e-3
-WAITING, POOL = 32, 64  # crops that wait to be taken, and those among which each step chooses
+PICTURES, STEPS, BATCH, RATE = 640, 40_000, 4, 2e-3
+WAITING, POOL, NEW_CROPS = (
+    32,
+    128,
+    3,
+)  # crops that wait to be taken, those among which each step chooses, and how many of these are new
 REPORT_CROPS = 400
-# Of these whole markings are calibrated: right where half of what is found is on a true one; a weak prior keeps cells' log-odds as they are.
-OBJECTS, MIN_SHARED, STOP_REACH_M, PRECISION = ("crosswalk", "stop_line", "other"), 0.5, 0.3, 0.1
+# Mean log-odds of the cells of lane lines are calibrated as they are; of borders and of what has few cells they are not.
+OBJECTS = ("stop_line", "crosswalk", "other", "border")
+# Right is what overlaps with a true one as `log2sim evaluate` asks, and of lines and borders what is for more than half within 0.3 m of true
+# ones; they count once for each 5 m. A weak prior keeps the log-odds of cells as they are.
+MIN_OVERLAP = {"crosswalk": 0.5, "other": 0.2}
+MIN_SHARED, REACH_M, PART_M, PRECISION = 0.5, 0.3, 5.0, 1.0
 # Markings are a hundredth of all cells.
 KIND_WEIGHT, BORDER_WEIGHT, AXIS_WEIGHT, WIDTH_WEIGHT = 5.0, 2.0, 0.2, 1.0
 # Cells of stop lines and symbols are a ten thousandth of all, and count more; what ships is of their true share again.
@@ -144,10 +161,12 @@ def fit(paths: list[Path], out: Path, steps: int, seed: int, start: Path | None)
     def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         while len(pool) < POOL:
             pool.append(queue.get())
-        for k in rng.integers(0, POOL, BATCH):
+        for k in rng.integers(0, POOL, NEW_CROPS):
             pool[k] = queue.get()
         values, *answers = tensors_of([pool[k] for k in rng.choice(POOL, BATCH, replace=False)])
-        return loss_of(network(values), values, *answers)
+        with torch.autocast("cpu", torch.bfloat16):  # 0.6 of the time where the processor has it
+            logits = network(values)
+        return loss_of(logits.float(), values, *answers)
 
     torch.manual_seed(seed)
     network = PaintNetwork()
@@ -187,33 +206,40 @@ def _share(part: float, whole: float) -> float:
 
 
 def calibrate(path: Path, held: list[Path]) -> dict[str, tuple[float, float]]:
-    """Fit offsets and slopes of mean log-odds by which whole markings are there, for those of few cells, to what is found in maps."""
-    network, rows = open_markings_network(path), {kind: list[tuple[float, bool]]() for kind in OBJECTS}
+    """Fit offsets and slopes of mean log-odds by which whole markings and borders are there to what is found in maps."""
+    network, rows = open_markings_network(path), {name: list[tuple[float, bool]]() for name in OBJECTS}
     for file in held:
         road: RoadMap = pickle.loads(file.read_bytes())
-        maps = find_paint_maps(road.ground, network)
-        areas, lines = find_paint(road.ground, maps)
-        true = {
-            kind: shapely.union_all([_shape(m.kind, m.points_m[:, :2]) for m in road.true.markings if m.kind == kind])
-            for kind in OBJECTS
-        }
-        found = [(area.kind, area.outline, area.network) for area in areas]
-        for kind, xy, odds in found + [(line.kind, line.xy, line.network) for line in lines if line.kind in OBJECTS]:
-            shape = _shape(kind, xy)
-            rows[kind].append((odds, bool(shape.intersection(true[kind]).area > MIN_SHARED * shape.area)))
+        maps, true = find_paint_maps(road.ground, network), {name: list[BaseGeometry]() for name in OBJECTS}
+        for there in (*road.true.markings, *road.true.borders):
+            true.setdefault(_object(there.kind), []).append(_shape(there.kind, there.points_m[:, :2]))
+        for one in find_paint(road.ground, maps) + find_edges(road.ground, maps):
+            name, shape = _object(one.kind), _shape(one.kind, one.xy)
+            if name not in OBJECTS:
+                continue
+            if one.kind in AREA_M2:
+                overlaps = [shape.intersection(there).area / shape.union(there).area for there in true[name]]
+                rows[name].append((one.log_odds, max(overlaps, default=0.0) >= MIN_OVERLAP[one.kind]))
+            else:
+                within = shape.intersection(shapely.union_all(true[name])).area / shape.area
+                rows[name] += [(one.log_odds, within > MIN_SHARED)] * (1 + round(one.length_m / PART_M))
     table = {}
-    for kind, pairs in rows.items():
+    for name, pairs in rows.items():
         odds, right = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
         weights = logistic_regression(np.column_stack([np.ones(len(odds)), odds]), right, PRECISION, (0.0, 1.0))
-        table[kind] = (round(float(weights[0]), 2), round(float(weights[1]), 2))
+        table[name] = (round(float(weights[0]), 2), round(float(weights[1]), 2))
     return table
 
 
+def _object(kind: str) -> str:
+    return "lane_line" if kind in LANE_LINES else "border" if kind in BORDER_KINDS else kind
+
+
 def _shape(kind: str, xy: NDArray[np.float64]) -> BaseGeometry:
-    """Return the ground that a marking covers."""
-    if kind == "stop_line":
-        return shapely.LineString(xy).buffer(STOP_REACH_M)
-    return shapely.buffer(shapely.Polygon(xy), 0)  # an outline that crosses itself is none of its loops twice
+    """Return the ground that a marking covers, or that is near a line or border."""
+    if kind in AREA_M2:
+        return shapely.buffer(shapely.Polygon(xy), 0)  # an outline that crosses itself is none of its loops twice
+    return shapely.LineString(xy).buffer(REACH_M)
 
 
 def draw_pictures(out: Path, count: int, seed: int) -> list[Path]:
@@ -247,7 +273,7 @@ def main(
     paths = sorted(maps.glob("*.pkl")) + draw_pictures(out, pictures, seed)
     begun = time.process_time()
     network, path = fit(paths, out, steps, seed, start), out / "markings.onnx"
-    inputs = {"map": torch.rand((1, CHANNELS, 96, 128), generator=torch.Generator().manual_seed(0))}
+    inputs = {"map": tensors_of([next(iterate_crops(paths, seed))])[0]}
     axes = {name: {2: "rows", 3: "columns"} for name in ("map", "paint")}
     export_checked(Probabilities(network).eval(), path, inputs, ("paint",), axes, bits=8)
     info = {"version": 1, "kinds": KINDS, "objects": {}}
