@@ -35,7 +35,7 @@ class Marking:
     kind: str  # "solid" or "dashed" lane line, "stop_line", "crosswalk", or "other" for arrows and letters
     # (N, 3), m: map frame. Of lines, also dashed, the middle from end to end; of others the outline, its first point once
     points_m: Array
-    width_m: float  # m: of the line; of a crosswalk its extent along the road
+    width_m: float  # m: of the line; of others their lesser extent
     color: str | None = None  # "white" or "yellow", None where unknown
     confidence: float = 1.0  # probability that it is there, in [0, 1]
     sources: tuple[str, ...] = ()  # what shows it: "camera", "lidar"

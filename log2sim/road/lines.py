@@ -204,7 +204,7 @@ MIN_BARE_M, MAX_BARE_M, MAX_BARE = 2.0, 6.0, 0.5  # of solid lines: where less i
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """What may be a marking."""
+    """What may be a marking or border."""
 
     kind: str  # of a marking or border
     xy: Array  # (P, 2), m: of a line its middle, from end to end; of others the outline

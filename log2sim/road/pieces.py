@@ -70,7 +70,8 @@ class Pieces(Columns):
 
 def find_pieces(ground: GroundMap, maps: PaintMaps, points: LinePoints) -> Pieces:
     """Fit straight pieces to points of lines and measure the profile across each."""
-    shown = stand_out(ground, maps, points) if len(points) else np.zeros(0, dtype=bool)
+    parts = (points.take(slice(k, k + PROFILES_AT_ONCE)) for k in range(0, len(points), PROFILES_AT_ONCE))
+    shown = np.concatenate([np.zeros(0, dtype=bool), *(stand_out(ground, maps, part) for part in parts)])
     if shown.any():
         # The probability reaches beyond the ends of strokes, where nothing tells the direction.
         shown |= cKDTree(points.xy_map[shown]).query(points.xy_map)[0] > TAIL_M
@@ -78,8 +79,8 @@ def find_pieces(ground: GroundMap, maps: PaintMaps, points: LinePoints) -> Piece
     lines = fit_lines(points)
     if not len(lines):
         return Pieces.all_alike(lines)
-    parts = (lines[k : k + PROFILES_AT_ONCE] for k in range(0, len(lines), PROFILES_AT_ONCE))
-    return Pieces.join([measure_pieces(ground, maps, part) for part in parts])
+    chunks = (lines[k : k + PROFILES_AT_ONCE] for k in range(0, len(lines), PROFILES_AT_ONCE))
+    return Pieces.join([measure_pieces(ground, maps, chunk) for chunk in chunks])
 
 
 def stand_out(ground: GroundMap, maps: PaintMaps, points: LinePoints) -> NDArray[np.bool_]:
