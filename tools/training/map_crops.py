@@ -31,6 +31,7 @@ LINE_CELLS, BORDER_CELLS, SUBPIXEL_BITS = 3, 3, 4  # least widths that are drawn
 OFF_ROAD_CELLS = 25  # from all markings and borders
 MORE_LINES, MORE_SHAPES = 0.5, 0.35  # shares of the crops that get one more line, and another marking
 MORE_ROADS = 0.6  # share of the crops of plain ground that get a road of another surface
+ALONG = 0.7  # share of those lines that run beside the road's own
 FREE_CELLS = 4  # how far these are from other markings
 SHAPE_TRIALS, CANVAS_CELLS = 5, 128  # places that are tried for another marking, and the side of its drawing
 
@@ -141,14 +142,9 @@ def draw_crop(road: RoadMap, rng: np.random.Generator, *, picture: bool = False)
         layers = _lay_road(layers, road_course, border, rng)
     if rng.random() < MORE_LINES:
         # Beside those of the road, across it, or anywhere on plain ground, as on wide squares that show no border.
-        along = lanes and rng.random() < 0.7
-        course = (
-            to_crop(lanes[rng.integers(len(lanes))])
-            if along
-            else _draw_course(rng)
-            if road_course is None
-            else road_course
-        )
+        course = _draw_course(rng) if road_course is None else road_course
+        if lanes and rng.random() < ALONG:
+            course = to_crop(lanes[rng.integers(len(lanes))])
         where = (off_road > 0) & bool(lanes)
         for _ in range(1 if lanes else int(rng.integers(1, 5))):
             layers = _paint_line(layers, course, kind, line, where, rng)
