@@ -48,9 +48,10 @@ def find_edges(ground: GroundMap, maps: PaintMaps) -> list[Paint]:
     pieces, found = Pieces.all_alike(fit_lines(find_crests(maps, maps.border))), []
     for chain in touching_chains(pieces):
         curve = fit_curve(chain.corners(pieces), POINT_SIGMA_M)
+        if curve.s[-1] < MIN_BORDER_M:
+            continue
         kind, sources = _measure(ground, curve)
-        # Where nobody saw both sides the map ends.
-        if sources and curve.s[-1] >= MIN_BORDER_M:
+        if sources:  # where no sensor observed both sides the map ends
             found.append(Paint(kind, curve.xy, 0.0, None, sources, maps.object_log_odds("border", curve.xy)))
     return found
 
@@ -61,9 +62,8 @@ def _measure(ground: GroundMap, curve: Curve) -> tuple[str, tuple[str, ...]]:
     heights, known = list[Array](), list[NDArray[np.bool_]]()
     for xy in sides:
         seen = sample(ground, xy[..., 0], xy[..., 1])
-        rows, columns = (np.rint(v).astype(int) for v in ground.raster.cells_of(xy.reshape(-1, 2)))
-        inside = (rows >= 0) & (rows < ground.alpha.shape[0]) & (columns >= 0) & (columns < ground.alpha.shape[1])
-        height = np.where(inside, ground.height_m[np.where(inside, rows, 0), np.where(inside, columns, 0)], np.nan)
+        cell, inside = ground.raster.index_of(xy.reshape(-1, 2))
+        height = np.where(inside, ground.height_m.ravel()[cell], np.nan)
         heights.append(height.reshape(xy.shape[:2]))
         known.append(np.array([np.isfinite(v).any(axis=1) for v in (seen.bright, seen.intensity)]))
     share = (known[0] & known[1]).mean(axis=1)

@@ -192,10 +192,8 @@ MIN_YELLOW = 0.2
 REPEAT_M = 0.18  # double lines are 0.2 m apart and more, from middle to middle
 MIN_REFLECTED = 0.1  # logarithm: a tenth more than the road
 STEP_M = 0.1
-END_SHARE = 0.5  # a line ends where its probability falls to half of what it usually is
-SMOOTH_M = (
-    0.5  # along which probabilities are averaged to find ends, and gaps are none: flakes of worn paint are shorter
-)
+END_SHARE = 0.5  # a marking ends where its probability falls to half of what it usually is
+SMOOTH_M = 0.5  # along which probabilities are averaged to find ends, and gaps are none: flakes are shorter
 KIND_M = 10.0  # and to find kinds: a period of most dashed lines
 # Roads that join are 5.5 m wide and lines end some meters before them; a worn dash or two leave less than that, or than three gaps.
 JUNCTION_M, LONG_GAPS = 10.0, 3.0
@@ -247,13 +245,13 @@ def find_lines(maps: PaintMaps, pieces: Pieces) -> list[Paint]:
             continue
         own = pieces.take(chain.members)
         curve = fit_curve(corners)
-        nearest = curve.s[cKDTree(curve.xy).query(own.xy)[1]]
+        s = curve.s
+        nearest = s[cKDTree(curve.xy).query(own.xy)[1]]
         painted = nearest[:, None] + own.length_m[:, None] * [-0.5, 0.5]
         for begin, end, kind in parts_of(maps, curve, painted):
             member = own.take((nearest > begin - 1.0) & (nearest < end + 1.0))
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
-            s = curve.s
             xy = curve.at(np.concatenate([[begin], s[(s > begin + 0.1) & (s < end - 0.1)], [end]]))
             # Edges of bright ground are brighter than one side only: no sensor shows a line.
             if sources := sources_of(member):
@@ -271,7 +269,8 @@ def parts_of(maps: PaintMaps, curve: Curve, painted: Array) -> list[tuple[float,
     s = np.arange(STEP_M / 2, max(length, STEP_M), STEP_M)
     xy = curve.at(s)
     each = np.stack([maps.at(layer, xy) for layer in maps.probability[: len(LINES)]])
-    seen = maps.at(maps.seen.astype(np.float32), xy) > 0.5
+    cell, inside = maps.raster.index_of(xy)
+    observed = inside & maps.seen.ravel()[cell]
 
     def size(length_m: float) -> tuple[int, int]:
         return 2 * round(length_m / STEP_M / 2) + 1, 1
@@ -293,7 +292,7 @@ def parts_of(maps: PaintMaps, curve: Curve, painted: Array) -> list[tuple[float,
     for first, last, of in runs:
         begin, end = float(s[first]) - STEP_M / 2, float(s[last - 1]) + STEP_M / 2
         before = parts[-1] if parts else (0.0, 0.0, "")
-        between = seen[(s > before[1]) & (s < begin)]
+        between = observed[(s > before[1]) & (s < begin)]
         most_m = longest_m if of == "dashed" else max(MIN_BARE_M, min(MAX_BARE * painted_m, MAX_BARE_M))
         if before[2] == of and (begin - before[1] <= most_m or np.mean(between) <= 0.5):
             parts[-1], painted_m = (before[0], end, of), painted_m + end - begin

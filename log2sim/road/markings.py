@@ -10,10 +10,10 @@ from scipy.cluster.hierarchy import DisjointSet
 from log2sim.datatypes import Marking, RoadBorder
 from log2sim.datatypes.log_odds import probability_of
 from log2sim.geometry import Array
-from log2sim.road.borders import find_borders
+from log2sim.road.borders import MIN_CONFIDENCE, find_borders
 from log2sim.road.curves import thin
 from log2sim.road.ground_map import GroundMap, at_height
-from log2sim.road.lines import MIN_YELLOW, Paint, find_lines
+from log2sim.road.lines import END_SHARE, MIN_YELLOW, Paint, find_lines
 from log2sim.road.paint_network import KINDS, PaintMaps, find_crests, find_paint_maps
 from log2sim.road.pieces import find_pieces
 from log2sim.road.samples import sample
@@ -21,7 +21,6 @@ from log2sim.road.samples import sample
 # Crosswalks have three bars of 0.3 m and more, 1.5 m long (MUTCD 3C); letters are as small as 0.4 m (bicycles: 1 m), arrows 7.5 m long and 2 m wide.
 AREA_M2 = {"crosswalk": (2.0, 400.0), "other": (0.15, 12.0)}
 LEAST = {"crosswalk": 0.5, "other": 0.15}  # probability of their cells: those of few cells are unsure
-EDGE_SHARE = 0.5  # a marking ends where its probability falls to half of what it usually is
 OUTLINE_ERROR_M = {"crosswalk": 0.15, "other": 0.05}
 # Parts of a crosswalk, between which bars are worn off, hidden by a vehicle or left out on an island, are less than a lane and a bar apart.
 MAX_PART_GAP_M = 5.0
@@ -37,7 +36,7 @@ def find_areas(ground: GroundMap, maps: PaintMaps, kind: str) -> list[Paint]:
         part = probability[y : y + h, x : x + w] * (labels[y : y + h, x : x + w] == k)
         if k == 0 or count * cell_m2 < AREA_M2[kind][0]:
             continue
-        inside = (part > EDGE_SHARE * np.quantile(part[part > 0], 0.9)).astype(np.uint8)
+        inside = (part > END_SHARE * np.quantile(part[part > 0], 0.9)).astype(np.uint8)
         outlines = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(x, y))[0]
         shapes.append(np.asarray(max(outlines, key=cv2.contourArea), np.int32))
     if kind == "crosswalk":
@@ -90,7 +89,6 @@ def _shown_by(ground: GroundMap, cells: Array) -> tuple[str | None, tuple[str, .
     return color, tuple(name for name, of in zip(("camera", "lidar"), known) if of)
 
 
-MIN_CONFIDENCE = 0.5  # what is rather not there than there is left out
 MIN_LINE_M = 2.0  # shorter plain strokes tell no lane
 
 

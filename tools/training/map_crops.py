@@ -136,6 +136,7 @@ def draw_crop(road: RoadMap, rng: np.random.Generator, *, picture: bool = False)
     curb = cv2.erode(curb, np.ones((int(rng.integers(1, 5)),) * 2, np.uint8))
     layers = _Layers(np.log(color.astype(np.float32) + 4), alpha, intensity, height)
     lanes = [m.points_m for m in road.true.markings if m.is_lane_line] + [edge.points_m for edge in road.true.borders]
+    elsewhere = (off_road > 0) & bool(lanes)  # plain ground may be painted on anywhere
     road_course = None
     if not lanes and rng.random() < MORE_ROADS:
         road_course = _draw_course(rng)
@@ -145,12 +146,11 @@ def draw_crop(road: RoadMap, rng: np.random.Generator, *, picture: bool = False)
         course = _draw_course(rng) if road_course is None else road_course
         if lanes and rng.random() < ALONG:
             course = to_crop(lanes[rng.integers(len(lanes))])
-        where = (off_road > 0) & bool(lanes)
         for _ in range(1 if lanes else int(rng.integers(1, 5))):
-            layers = _paint_line(layers, course, kind, line, where, rng)
+            layers = _paint_line(layers, course, kind, line, elsewhere, rng)
     if rng.random() < MORE_SHAPES:
         course = to_crop(lanes[rng.integers(len(lanes))]) if lanes else _draw_course(rng)
-        layers = _paint_shape(layers, course, kind, line, (off_road > 0) & bool(lanes), rng)
+        layers = _paint_shape(layers, course, kind, line, elsewhere, rng)
     disturbed = _disturb(layers, off_road > 0, curb > 0, rng)
     color = np.clip(np.exp(disturbed.log_color) - 4, 0, 255).astype(np.uint8)
     values = inputs_of(color, disturbed.alpha, disturbed.intensity, disturbed.height_m)
