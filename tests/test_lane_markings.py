@@ -152,6 +152,15 @@ def test_crosswalk_and_stop_line_are_told_from_lane_lines() -> None:
     assert abs(area - 4 * 14.5) < 6
 
 
+@pytest.mark.parametrize(("paint", "color"), [(WHITE, "white"), ((90, 190, 210), "yellow")])
+def test_the_color_of_a_crosswalk_is_told_in_yellow_light_too(paint: tuple[int, int, int], color: str) -> None:
+    painter = Painter(EXTENT)
+    painter.lines([np.array([[34.0, y], [38.0, y]]) for y in np.arange(-7, 8)], 0.5, paint)
+    painter.color *= np.array([0.7, 0.95, 1.0])
+    (crosswalk,) = (m for m in find_markings(painter.ground())[0] if m.kind == "crosswalk")
+    assert crosswalk.color == color
+
+
 @pytest.mark.parametrize(("gap_m", "crosswalks"), [(2.0, 1), (4.0, 1), (8.0, 2)])
 def test_parts_of_a_crosswalk_less_than_a_lane_apart_are_one(gap_m: float, crosswalks: int) -> None:
     painter = Painter(EXTENT)

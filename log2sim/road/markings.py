@@ -21,6 +21,7 @@ from log2sim.road.samples import sample
 # Crosswalks have three bars of 0.3 m and more, 1.5 m long (MUTCD 3C); letters are as small as 0.4 m (bicycles: 1 m), arrows 7.5 m long and 2 m wide.
 AREA_M2 = {"crosswalk": (2.0, 400.0), "other": (0.15, 12.0)}
 LEAST = {"crosswalk": 0.5, "other": 0.15}  # probability of their cells: those of few cells are unsure
+RING_CELLS = 3  # of road around a marking, whose color is compared
 OUTLINE_ERROR_M = {"crosswalk": 0.15, "other": 0.05}
 # Parts of a crosswalk, between which bars are worn off, hidden by a vehicle or left out on an island, are less than a lane and a bar apart.
 MAX_PART_GAP_M = 5.0
@@ -56,7 +57,10 @@ def find_areas(ground: GroundMap, maps: PaintMaps, kind: str) -> list[Paint]:
         width_m = (min(cv2.minAreaRect(shape)[1]) + 1) * maps.raster.resolution_m
         outline = maps.raster.xy_of(simple[:, 1], simple[:, 0])
         odds = maps.object_log_odds(kind, cells)
-        areas.append(Paint(kind, outline, width_m, *_shown_by(ground, cells), odds))
+        ring = cv2.dilate(np.pad(mask, RING_CELLS), np.ones((2 * RING_CELLS + 1,) * 2)) - np.pad(mask, RING_CELLS)
+        rows, columns = np.nonzero(ring)
+        road = maps.raster.xy_of(rows + low[1] - RING_CELLS, columns + low[0] - RING_CELLS)
+        areas.append(Paint(kind, outline, width_m, *_shown_by(ground, cells, road), odds))
     return areas
 
 
@@ -77,15 +81,16 @@ def _hull(shape: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.asarray(cv2.convexHull(shape), np.int32)
 
 
-def _shown_by(ground: GroundMap, cells: Array) -> tuple[str | None, tuple[str, ...]]:
-    """Tell the color of paint in cells (N, 2), m, None where no camera saw them, and the sensors that saw most of them."""
-    seen = sample(ground, cells[:, :1], cells[:, 1:])
+def _shown_by(ground: GroundMap, cells: Array, road: Array) -> tuple[str | None, tuple[str, ...]]:
+    """Tell the color of paint in cells (N, 2), m, against that of the road (M, 2), None where no camera saw both; and the sensors that saw most of it."""
+    seen, around = (sample(ground, xy[:, :1], xy[:, 1:]) for xy in (cells, road))
     known = [bool(np.isfinite(values).mean() > 0.5) for values in (seen.bright, seen.intensity)]
     color = None
-    if known[0]:
-        # Of bars the brighter half.
+    if known[0] and np.isfinite(around.yellow).any():
+        # Of bars the brighter half; light may be yellow, too.
         bright = seen.bright >= np.nanmedian(seen.bright)
-        color = "yellow" if np.nanmedian(seen.yellow[bright]) > MIN_YELLOW else "white"
+        contrast = np.nanmedian(seen.yellow[bright]) - np.nanmedian(around.yellow)
+        color = "yellow" if contrast > MIN_YELLOW else "white"
     return color, tuple(name for name, of in zip(("camera", "lidar"), known) if of)
 
 
