@@ -21,7 +21,7 @@ from log2sim.geometry import apply, box_iou, inverse, project, project_boxes, ro
 from log2sim.logs.opening import open_log
 from log2sim.logs.waymo.messages import RecordFile, WireError, crc32c, masked_crc32c
 from log2sim.logs.waymo.range_images import points_of, read_range_images, row_inclinations, turn_of
-from log2sim.logs.waymo.reader import camera_of
+from log2sim.logs.waymo.reader import READER, camera_of
 from log2sim.logs.waymo.segment import CameraCalibration, LaserCalibration, RangeImages
 from log2sim.pipeline import reconstruct
 
@@ -351,3 +351,9 @@ def test_a_recorded_cloud_survives_a_range_image(recorded_cloud: np.ndarray) -> 
     off = np.linalg.norm(decoded - own[source], axis=1) / reach[source]
     assert len(decoded) > 50_000
     assert off.max() <= np.hypot(np.pi / columns, (high - low) / (rows - 1) / 2) * 1.001
+
+
+def test_segments_are_in_the_order_of_their_names_without_the_suffix(tmp_path: Path) -> None:
+    for name in ("a", "a-b", "a+b"):
+        (tmp_path / f"{name}.tfrecord").touch()
+    assert READER.sequences(tmp_path) == sorted(["a", "a-b", "a+b"])

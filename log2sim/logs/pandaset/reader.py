@@ -373,7 +373,8 @@ def _cameras(path: Path, track: PoseTrack, notes: list[str]) -> tuple[dict[str, 
         if spread_m > MAX_MOUNT_SPREAD_M:
             notes.append(f"{name}: its poses and the ego's do not fit together, typically by {spread_m:.2f} m")
         try:
-            fx, fy, cx, cy = (float(read_json(intrinsics)[k]) for k in ("fx", "fy", "cx", "cy"))
+            lens = read_json(intrinsics)
+            fx, fy, cx, cy = (float(lens[k]) for k in ("fx", "fy", "cx", "cy"))
         except (TypeError, KeyError, ValueError):
             raise LogError(f"{intrinsics}: expected the numbers fx, fy, cx, cy") from None
         if fx <= 0 or fy <= 0:

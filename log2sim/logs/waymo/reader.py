@@ -321,9 +321,10 @@ READER = WaymoReader()
 
 def _files(path: Path) -> list[Path]:
     try:
-        return [path] if path.is_file() else sorted(file for file in path.glob(f"*{SUFFIX}") if file.is_file())
+        found = [path] if path.is_file() else [file for file in path.glob(f"*{SUFFIX}") if file.is_file()]
     except OSError:
         return []
+    return sorted(found, key=lambda file: file.name.removesuffix(SUFFIX))
 
 
 class _SegmentFile(Segment):
