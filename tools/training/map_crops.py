@@ -37,13 +37,31 @@ SHAPE_TRIALS, CANVAS_CELLS = 5, 128  # places that are tried for another marking
 
 
 @dataclass(frozen=True, eq=False)
-class Crop:
-    """Input of the network and what it should answer; H x W cells."""
+class Labels:
+    """What the network should answer; H x W cells."""
 
-    values: NDArray[np.float16]  # (12, H, W)
     kind: NDArray[np.uint8]  # (H, W): 0 for no marking, else 1 + its place in `KINDS`
     border: NDArray[np.uint8]  # (H, W): 1 along borders of roads
-    line: NDArray[np.float16]  # (3, H, W): of lines, cosine and sine of twice the direction, and width in m
+    line: NDArray[np.floating]  # (3, H, W): of lines, cosine and sine of twice the direction, and width in m
+
+    @classmethod
+    def empty(cls) -> Labels:
+        """Labels of a crop without markings and borders."""
+        shape = (FINE_CELLS // 2,) * 2
+        return cls(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros((3, *shape), np.float32))
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Where (H, W) there is room for another marking."""
+        away = cv2.distanceTransform((self.kind == 0).astype(np.uint8), cv2.DIST_L2, 3)
+        return np.asarray(away > FREE_CELLS)
+
+
+@dataclass(frozen=True, eq=False)
+class Crop(Labels):
+    """Labels, and the input of the network."""
+
+    values: NDArray[np.float16]  # (12, H, W)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +146,10 @@ def draw_crop(road: RoadMap, rng: np.random.Generator, *, picture: bool = False)
         fine = np.stack(ground.raster.cells_of(points_m[:, :2])[::-1], axis=1)
         return np.asarray(((fine - matrix[:, 2]) @ np.linalg.inv(fine_A_crop).T - 0.5) / 2)
 
-    kind, border, line = _draw_labels(road, to_crop, wide)
-    off_road = cv2.distanceTransform(((kind == 0) & (border == 0)).astype(np.uint8), cv2.DIST_L2, 3) > OFF_ROAD_CELLS
-    off_road, curb = (
-        np.kron(mask.astype(np.uint8), np.ones((2, 2), np.uint8)) for mask in (off_road, (border > 0) & (kind == 0))
-    )
+    labels = _draw_labels(road, to_crop, wide)
+    no_paint, edge = labels.kind == 0, labels.border > 0
+    off_road = cv2.distanceTransform((no_paint & ~edge).astype(np.uint8), cv2.DIST_L2, 3) > OFF_ROAD_CELLS
+    off_road, curb = (np.kron(mask.astype(np.uint8), np.ones((2, 2), np.uint8)) for mask in (off_road, edge & no_paint))
     curb = cv2.erode(curb, np.ones((int(rng.integers(1, 5)),) * 2, np.uint8))
     layers = _Layers(np.log(color.astype(np.float32) + 4), alpha, intensity, height)
     lanes = [m.points_m for m in road.true.markings if m.is_lane_line] + [edge.points_m for edge in road.true.borders]
@@ -140,21 +157,21 @@ def draw_crop(road: RoadMap, rng: np.random.Generator, *, picture: bool = False)
     road_course = None
     if not lanes and rng.random() < MORE_ROADS:
         road_course = _draw_course(rng)
-        layers = _lay_road(layers, road_course, border, rng)
+        layers = _lay_road(layers, road_course, labels, rng)
     if rng.random() < MORE_LINES:
         # Beside those of the road, across it, or anywhere on plain ground, as on wide squares that show no border.
         course = _draw_course(rng) if road_course is None else road_course
         if lanes and rng.random() < ALONG:
             course = to_crop(lanes[rng.integers(len(lanes))])
         for _ in range(1 if lanes else int(rng.integers(1, 5))):
-            layers = _paint_line(layers, course, kind, line, elsewhere, rng)
+            layers = _paint_line(layers, course, labels, elsewhere, rng)
     if rng.random() < MORE_SHAPES:
         course = to_crop(lanes[rng.integers(len(lanes))]) if lanes else _draw_course(rng)
-        layers = _paint_shape(layers, course, kind, line, elsewhere, rng)
+        layers = _paint_shape(layers, course, labels, elsewhere, rng)
     disturbed = _disturb(layers, off_road > 0, curb > 0, rng)
     color = np.clip(np.exp(disturbed.log_color) - 4, 0, 255).astype(np.uint8)
     values = inputs_of(color, disturbed.alpha, disturbed.intensity, disturbed.height_m)
-    return Crop(values.astype(np.float16), kind, border, line.astype(np.float16))
+    return Crop(labels.kind, labels.border, labels.line.astype(np.float16), values.astype(np.float16))
 
 
 def _draw_place(road: RoadMap, rng: np.random.Generator) -> Array | None:
@@ -174,25 +191,18 @@ def _draw_place(road: RoadMap, rng: np.random.Generator) -> Array | None:
     return None
 
 
-def _draw_labels(
-    road: RoadMap, to_crop: Callable[[Array], Array], wide: float
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+def _draw_labels(road: RoadMap, to_crop: Callable[[Array], Array], wide: float) -> Labels:
     """Draw kinds, borders, and direction and width of lines in the cells of a crop; `wide`: factor of widths."""
-    side = FINE_CELLS // 2
-    kind, border, line = (
-        np.zeros((side, side), np.uint8),
-        np.zeros((side, side), np.uint8),
-        np.zeros((3, side, side), np.float32),
-    )
+    labels = Labels.empty()
     areas = [m for m in road.true.markings if m.kind in ("crosswalk", "other")]
     for marking in areas:
         outline = np.rint(to_crop(marking.points_m) * (1 << SUBPIXEL_BITS)).astype(np.int32)
-        cv2.fillPoly(kind, [outline], 1 + KINDS.index(marking.kind), cv2.LINE_8, SUBPIXEL_BITS)
+        cv2.fillPoly(labels.kind, [outline], 1 + KINDS.index(marking.kind), cv2.LINE_8, SUBPIXEL_BITS)
     for marking in (m for m in road.true.markings if m.kind not in ("crosswalk", "other")):
-        _draw_line(kind, line, to_crop(marking.points_m), 1 + KINDS.index(marking.kind), marking.width_m * wide)
+        _draw_line(labels, to_crop(marking.points_m), marking.kind, marking.width_m * wide)
     for edge in road.true.borders:
-        _draw(border, to_crop(edge.points_m), 1, BORDER_CELLS)
-    return kind, border, line
+        _draw(labels.border, to_crop(edge.points_m), 1, BORDER_CELLS)
+    return labels
 
 
 def _draw(image: NDArray[Any], points: Array, value: float, width: int) -> None:
@@ -201,14 +211,14 @@ def _draw(image: NDArray[Any], points: Array, value: float, width: int) -> None:
     cv2.polylines(image, [corners], False, value, width, cv2.LINE_8, SUBPIXEL_BITS)
 
 
-def _draw_line(kind: NDArray[np.uint8], line: NDArray[np.float32], points: Array, value: int, width_m: float) -> None:
+def _draw_line(labels: Labels, points: Array, kind: str, width_m: float) -> None:
     """Draw the kind of a line (N, 2), its direction and its width."""
     width = max(LINE_CELLS, round(width_m / CELL_M) | 1)
-    _draw(kind, points, value, width)
-    near = (np.abs(points - len(kind) / 2) < len(kind)).all(axis=1)
+    _draw(labels.kind, points, 1 + KINDS.index(kind), width)
+    near = (np.abs(points - len(labels.kind) / 2) < len(labels.kind)).all(axis=1)
     for begin, end in (pair for pair, drawn in zip(pairwise(points), near) if drawn):
         twice = 2 * np.arctan2(end[1] - begin[1], end[0] - begin[0])
-        for layer, of_line in zip(line, (np.cos(twice), np.sin(twice), width_m)):
+        for layer, of_line in zip(labels.line, (np.cos(twice), np.sin(twice), width_m)):
             _draw(layer, np.stack([begin, end]), float(of_line), width)
 
 
@@ -222,8 +232,8 @@ def _draw_course(rng: np.random.Generator) -> Array:
     return np.asarray(rng.uniform(0.2, 0.8, 2) * FINE_CELLS / 2 + np.stack([along, across], axis=1) @ turn)
 
 
-def _lay_road(layers: _Layers, course: Array, border: NDArray[np.uint8], rng: np.random.Generator) -> _Layers:
-    """Lay a road of another surface along a course (N, 2), in coarse cells, with or without curbs, and its borders into `border`."""
+def _lay_road(layers: _Layers, course: Array, labels: Labels, rng: np.random.Generator) -> _Layers:
+    """Lay a road of another surface along a course (N, 2), in coarse cells, with or without curbs, and label its borders."""
     half_m = rng.uniform(2.0, 8.0)
     free = np.full(layers.alpha.shape, 255, np.uint8)
     _draw(free, course * 2 + 0.5, 0, 1)
@@ -239,21 +249,16 @@ def _lay_road(layers: _Layers, course: Array, border: NDArray[np.uint8], rng: np
     cv2.drawContours(drawn, edge, -1, 1, 2 * BORDER_CELLS)
     # The end of the crop is none of the road.
     drawn[:4], drawn[-4:], drawn[:, :4], drawn[:, -4:] = 0, 0, 0, 0
-    border[cv2.resize(drawn, border.shape[::-1], interpolation=cv2.INTER_AREA) > 0] = 1
+    labels.border[cv2.resize(drawn, labels.border.shape[::-1], interpolation=cv2.INTER_AREA) > 0] = 1
     return _Layers(color, layers.alpha, intensity, height)
 
 
 def _paint_line(
-    layers: _Layers,
-    course: Array,
-    kind: NDArray[np.uint8],
-    line: NDArray[np.float32],
-    off_road: NDArray[np.bool_],
-    rng: np.random.Generator,
+    layers: _Layers, course: Array, labels: Labels, off_road: NDArray[np.bool_], rng: np.random.Generator
 ) -> _Layers:
     """Paint one more line beside a course (N, 2), in coarse cells: solid, of dashes of any length and width, or of dots.
 
-    Labels are drawn into `kind` and `line`, where there is no marking yet.
+    It is labeled where there is no marking yet.
     """
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(course, axis=0), axis=1))])
     dense = np.stack([np.interp(np.arange(0, s[-1], 2.0), s, course[:, k]) for k in range(2)], axis=1)
@@ -266,7 +271,7 @@ def _paint_line(
     dash_m = np.inf if way == 0 else rng.uniform(0.1, 0.25) if way == 4 else _log_uniform(rng, 0.3, 8)
     gap_m = 0.0 if way == 0 else _log_uniform(rng, 0.5, 3) * (1 if way == 4 else dash_m)
     along_m = np.arange(len(dense)) * 2 * CELL_M + rng.uniform(0, 10)
-    free = cv2.distanceTransform((kind == 0).astype(np.uint8), cv2.DIST_L2, 3) > FREE_CELLS
+    free = labels.free
     fine_free = cv2.resize(free.astype(np.uint8), layers.alpha.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     paint = np.zeros(layers.alpha.shape, np.uint8)
     # Finer than the cells, so that dots and short dashes keep their lengths.
@@ -276,10 +281,10 @@ def _paint_line(
     for begin, end in runs_of(on):
         _draw(paint, fine_xy[begin:end], 255, max(1, round(width_m / FINE_M)))
     layers = _add_paint(layers, paint.astype(np.float32) / 255, fine_free & ~off_road, rng)
-    new_kind, new_line = np.zeros_like(kind), np.zeros_like(line)
-    _draw_line(new_kind, new_line, dense, 1 + KINDS.index("solid" if way == 0 else "dashed"), width_m)
-    there = (new_kind > 0) & free & ~off_road[::2, ::2]
-    kind[there], line[:, there] = new_kind[there], new_line[:, there]
+    new = Labels.empty()
+    _draw_line(new, dense, "solid" if way == 0 else "dashed", width_m)
+    there = (new.kind > 0) & free & ~off_road[::2, ::2]
+    labels.kind[there], labels.line[:, there] = new.kind[there], new.line[:, there]
     return layers
 
 
@@ -298,17 +303,13 @@ def _add_paint(
 
 
 def _paint_shape(
-    layers: _Layers,
-    course: Array,
-    kind: NDArray[np.uint8],
-    line: NDArray[np.float32],
-    off_road: NDArray[np.bool_],
-    rng: np.random.Generator,
+    layers: _Layers, course: Array, labels: Labels, off_road: NDArray[np.bool_], rng: np.random.Generator
 ) -> _Layers:
-    """Paint a symbol, a crosswalk or a stop line beside a course (N, 2), in coarse cells, where there is room; its label goes into `kind`."""
+    """Paint a symbol, a crosswalk or a stop line beside a course (N, 2), in coarse cells, where there is room, and label it."""
     name, paint, covered, (long_m, wide_m) = _draw_shape(rng)
-    inside = np.flatnonzero((np.abs(course[:-1] - len(kind) / 2) < len(kind) / 2).all(axis=1))
-    free = (cv2.distanceTransform((kind == 0).astype(np.uint8), cv2.DIST_L2, 3) > FREE_CELLS) & ~off_road[::2, ::2]
+    half = FINE_CELLS / 4
+    inside = np.flatnonzero((np.abs(course[:-1] - half) < half).all(axis=1))
+    free = labels.free & ~off_road[::2, ::2]
     for k in rng.choice(inside, SHAPE_TRIALS) if len(inside) else ():
         heading = course[k + 1] - course[k]
         heading = heading / max(float(np.linalg.norm(heading)), 1e-9)
@@ -321,12 +322,12 @@ def _paint_shape(
         area, new = (
             cv2.warpAffine(layer, matrix, layers.alpha.shape[::-1]) / np.float32(255) for layer in (covered, paint)
         )
-        label = cv2.resize(area, kind.shape[::-1], interpolation=cv2.INTER_AREA) > 0.4
+        label = cv2.resize(area, free.shape[::-1], interpolation=cv2.INTER_AREA) > 0.4
         if label.any() and free[label].all():
-            kind[label] = 1 + KINDS.index(name)
+            labels.kind[label] = 1 + KINDS.index(name)
             if name == "stop_line":
                 twice = 2 * np.arctan2(left[1], left[0])
-                line[:, label] = np.array([[np.cos(twice)], [np.sin(twice)], [long_m]])
+                labels.line[:, label] = np.array([[np.cos(twice)], [np.sin(twice)], [long_m]])
             return _add_paint(layers, new, np.ones(new.shape, dtype=bool), rng)
     return layers
 
