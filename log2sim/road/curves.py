@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import cv2
@@ -28,7 +29,7 @@ class Curve:
 
     xy: Array  # (P, 2), m
 
-    @property
+    @cached_property
     def s(self) -> Array:
         """Length (P,) from the first point, m."""
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.xy, axis=0), axis=1))])
@@ -42,8 +43,7 @@ class Curve:
 
     def at(self, s: Array) -> Array:
         """Points (N, 2) at lengths (N,), m."""
-        own = self.s
-        return np.stack([np.interp(s, own, self.xy[:, k]) for k in range(2)], 1)
+        return np.stack([np.interp(s, self.s, self.xy[:, k]) for k in range(2)], 1)
 
 
 def fit_curve(points: Array, sigma_m: float = POINT_SIGMA_M) -> Curve:

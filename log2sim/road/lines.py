@@ -214,7 +214,7 @@ class Paint:
     @property
     def length_m(self) -> float:
         """Length of a line from end to end."""
-        return float(np.linalg.norm(np.diff(self.xy, axis=0), axis=1).sum())
+        return float(Curve(self.xy).s[-1])
 
 
 def color_of(pieces: Pieces) -> str | None:

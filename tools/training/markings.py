@@ -47,11 +47,8 @@ from training.map_crops import Crop, iterate_crops, picture_map
 from training.network import conv
 
 PICTURES, STEPS, BATCH, RATE = 640, 40_000, 4, 2e-3
-WAITING, POOL, NEW_CROPS = (
-    32,
-    128,
-    3,
-)  # crops that wait to be taken, those among which each step chooses, and how many of these are new
+# Crops that wait to be taken, those among which each step chooses, and how many of these are new.
+WAITING, POOL, NEW_CROPS = 32, 128, 3
 REPORT_CROPS = 400
 # Mean log-odds of the cells of lane lines are calibrated as they are; of borders and of what has few cells they are not.
 OBJECTS = ("stop_line", "crosswalk", "other", "border")
