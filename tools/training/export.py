@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from fits.logistic import logistic_regression
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from log2sim.config import LidarConfig
@@ -23,6 +24,7 @@ from log2sim.perception.detect3d.detectors import LidarDetector, NetworkDetector
 from log2sim.perception.detect3d.network import METADATA_KEY
 from training.clouds import Example
 from training.network import GROUPS, IN_CHANNELS, BevNetwork, Widths, widths_of
+from training.rounding import WEIGHT_BITS, in_integers, round_kernels
 
 CATEGORIES = {
     "vehicle": ["car", "truck", "bus"],
@@ -37,7 +39,12 @@ RIGHT = {
 }
 MIN_SCORE = 0.1
 # Of the largest value, by the bits of the kernels.
-MAX_EXPORT_ERROR = {32: 1e-4, 16: 2e-3, 8: 0.2}  # at the edges of lines, where probabilities are steep
+MAX_EXPORT_ERROR = {
+    32: 1e-4,
+    16: 2e-3,
+    8: 0.2,
+    WEIGHT_BITS: 0.1,
+}  # at the edges of lines, where probabilities are steep; in integers biases are, too
 RIDGE = 1e-3  # a box, which keeps the weights of rare groups finite
 RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -45,15 +52,16 @@ RAW_CALIBRATION = [0.0, 1.0, 0.0, 0.0, 0.0]
 def export_onnx(checkpoint: Path, path: Path, info: dict[str, Any]) -> None:
     """Write the averaged weights of a checkpoint as ONNX and check that both compute the same.
 
-    Weights are stored in 16 bits, half the bytes, and everything is computed in 32: activations of 8 bits are a sixth faster
-    and lose up to a third of the vehicles where a LiDAR has few lines.
+    It computes in integers, see `rounding`.
     """
     state = torch.load(checkpoint, weights_only=True)["mean"]
-    network = BevNetwork(widths_of({name.removesuffix(".0.weight"): value for name, value in state.items()}))
+    widths = widths_of({name.removesuffix(".conv.weight"): value for name, value in state.items()})
+    network = in_integers(BevNetwork(widths))
     network.load_state_dict(state)
+    steps = round_kernels(network)
     axes, generator = {0: "batch", 2: "x", 3: "y"}, torch.Generator().manual_seed(0)
     checked = {"grid": torch.rand((1, IN_CHANNELS, 192, 256), generator=generator)}
-    export_checked(network.eval(), path, checked, ("maps",), {"grid": axes, "maps": axes}, bits=16)
+    export_checked(network, path, checked, ("maps",), {"grid": axes, "maps": axes}, bits=WEIGHT_BITS, bias_steps=steps)
     describe(path, info)
 
 
@@ -65,8 +73,11 @@ def export_checked(
     axes: dict[str, dict[int, str]],
     *,
     bits: int = 32,
+    bias_steps: Mapping[str, NDArray[np.float32]] = {},
 ) -> None:
-    """Write a network as ONNX, its kernels in 32, 16 or 8 `bits`; `axes` may have any length.
+    """Write a network as ONNX, its kernels in 32, 16, 8 or 7 `bits`; `axes` may have any length.
+
+    `bias_steps`: by name, what biases are whole multiples of that are stored as integers.
 
     Raises `RuntimeError` when it computes something else of the inputs, by more than that share of the greatest output.
     """
@@ -81,21 +92,23 @@ def export_checked(
             opset_version=17, dynamo=False, dynamic_axes=axes,
         )  # fmt: skip
     model = onnx.load(path)
-    for weight in [value for value in model.graph.initializer if bits < 32 and len(value.dims) > 1]:
+    for weight in [
+        value for value in model.graph.initializer if bits < 32 and (len(value.dims) > 1 or value.name in bias_steps)
+    ]:
         values, short = onnx.numpy_helper.to_array(weight), f"{weight.name}_short"
         model.graph.initializer.remove(weight)
-        nodes = [onnx.helper.make_node("Cast", [short], [weight.name], to=onnx.TensorProto.FLOAT)]
-        if bits == 8:  # times the greatest of each output
-            scale = np.abs(values).max(axis=tuple(range(1, values.ndim)), keepdims=True).clip(1e-12) / 127
-            values = np.rint(values / scale).astype(np.int8)
-            model.graph.initializer.append(onnx.numpy_helper.from_array(scale, f"{weight.name}_scale"))
-            nodes[0].output[0] = f"{weight.name}_whole"
-            nodes.append(onnx.helper.make_node("Mul", [f"{weight.name}_whole", f"{weight.name}_scale"], [weight.name]))
-        else:
+        if bits == 16:
             values = values.astype(np.float16)
+            node = onnx.helper.make_node("Cast", [short], [weight.name], to=onnx.TensorProto.FLOAT)
+        else:
+            largest = np.abs(values).max(axis=tuple(range(1, values.ndim))).clip(1e-12)  # of each output
+            step = bias_steps.get(weight.name, largest / np.float32(2 ** (bits - 1) - 1))
+            whole = np.rint(values / step.reshape(-1, *(1,) * (values.ndim - 1)))
+            values = whole.astype(np.int32 if weight.name in bias_steps else np.int8)
+            model.graph.initializer.append(onnx.numpy_helper.from_array(step, f"{short}_step"))
+            node = onnx.helper.make_node("DequantizeLinear", [short, f"{short}_step"], [weight.name], axis=0)
         model.graph.initializer.append(onnx.numpy_helper.from_array(values, short))
-        for node in reversed(nodes):
-            model.graph.node.insert(0, node)
+        model.graph.node.insert(0, node)
     onnx.save(model, path)
     with torch.no_grad():
         expected = network(*inputs.values())
@@ -110,7 +123,7 @@ def export_checked(
 def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
     """Read a network back from the ONNX file that `export_onnx` wrote, so that its training can go on.
 
-    Normalization was folded into the convolutions. It is put back with the moments of each layer on some grids (B, 12, H, W): the
+    Its weights stay rounded. Normalization was folded into the convolutions. It is put back with the moments of each layer on some grids (B, 12, H, W): the
     network computes what it did, and still trains on normalized layers.
     """
     import onnx
@@ -119,11 +132,11 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
     values = {v.name: onnx.numpy_helper.to_array(v) for v in graph.initializer}
     folded = {}
     for node in graph.node:
-        if node.op_type == "Cast":
-            values[node.output[0]] = values[node.input[0]].astype(np.float32)
+        if node.op_type == "DequantizeLinear" and node.input[0] in values:
+            whole, step = (values[name].astype(np.float32) for name in node.input[:2])
+            values[node.output[0]] = whole * step.reshape(-1, *(1,) * (whole.ndim - 1))
         elif node.op_type == "Conv":
-            # "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0", "maps" of the head.
-            name = node.output[0].split("/")[-2].rsplit(".", 1)[0] if "/" in node.output[0] else "head"
+            name = node.input[1].removesuffix(".weight").removesuffix(".conv")
             folded[name] = [torch.from_numpy(values[k].copy()) for k in node.input[1:]]
     network = BevNetwork(widths_of({name: kernel for name, (kernel, _) in folded.items()})).eval()
     network.head.weight.data, network.head.bias.data = folded["head"]
@@ -159,26 +172,6 @@ def widened(network: BevNetwork, widths: Widths) -> BevNetwork:
         state[name][old] = value
     wide.load_state_dict(state)
     return wide
-
-
-def blend(path: Path, other: Path, share: float) -> None:
-    """Average the weights of an exported network with those of the one that its training began from, which count a `share`.
-
-    The mean keeps more of what the other was right about than training on new scenes alone (Wortsman et al., CVPR 2022). Raises `ValueError`
-    where the layers differ.
-    """
-    import onnx
-
-    model = onnx.load(path)
-    before = {v.name: onnx.numpy_helper.to_array(v) for v in onnx.load(other).graph.initializer}
-    for weight in model.graph.initializer:
-        value = onnx.numpy_helper.to_array(weight)
-        if weight.name not in before or before[weight.name].shape != value.shape:
-            raise ValueError(f"{other}: its layers are not those of {path}")
-        if value.dtype.kind == "f":
-            mean = (1 - share) * value.astype(np.float32) + share * before[weight.name].astype(np.float32)
-            weight.CopyFrom(onnx.numpy_helper.from_array(mean.astype(value.dtype), weight.name))
-    onnx.save(model, path)
 
 
 def describe(path: Path, info: dict[str, Any], key: str = METADATA_KEY) -> None:

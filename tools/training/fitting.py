@@ -83,9 +83,11 @@ def fit(network: nn.Module, step_loss: StepLoss, plan: FitPlan) -> dict[str, Ten
             text = " ".join(f"{k} {np.mean([p[k] for p in recent]):.4f}" for k in recent[0])
             print(f"step {step}, {time.process_time() - begun:.0f} s of CPU, {text}", flush=True)
             recent = []
-        if plan.checkpoint is not None and (time.time() - saved > CHECKPOINT_S or step == plan.steps):
+        if plan.checkpoint is not None and time.time() - saved > CHECKPOINT_S:
             saved = time.time()
             save(plan.checkpoint, network, optimizer, mean, step)
+    if plan.checkpoint is not None:
+        save(plan.checkpoint, network, optimizer, mean, step)
     return mean
 
 

@@ -2,29 +2,21 @@
 
     pip install 'log2sim[train]'
     python tools/train.py lidar roadside DIR            # the first two rounds of the shipped weights, as of `vehicle`
-    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300                           # a toy
+    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --rounding 100            # a toy
     python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
     python tools/train.py lidar vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
     python tools/train.py lidar vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
     python tools/train.py refinement vehicle DIR        # the second stage, which looks at the points of boxes, of the shipped first one
     python tools/train.py zou2021|two_stream --help     # the networks of two papers
 
-The shipped weights of `vehicle` went on from those of such rounds, A.onnx, with scenes of what is close to the sensor's car, end-on and at
-walls, and are means with what they went on from:
-
-    python tools/train.py lidar vehicle B --scenes 6000 --steps 15000 --seed 3 --start A.onnx --blend A.onnx --share 0.5
-    python tools/train.py lidar vehicle C --scenes 6000 --steps 12000 --seed 4 --start B/vehicle.onnx --blend A.onnx --share 0.25
-    python tools/train.py lidar vehicle D --scenes 2500 --steps 5000 --seed 5 --start C/vehicle.onnx --blend C/vehicle.onnx --share 0.25
-
-and then, as a wider network (`WIDTHS`; 16, 32, 48 and 64 channels until then) that computed the same at first:
+The shipped weights went on from those of such rounds (their cards tell all), the last time as a wider network (`WIDTHS`; 16, 32, 48 and
+64 channels until then) that computed the same at first, and then in integers:
 
     python tools/train.py lidar vehicle E --scenes 8000 --steps 30000 --seed 31 --start D/vehicle.onnx --examples 500
-
-Those of `roadside` went on likewise, not averaged: 3,000 scenes and 9,000 steps (seed 3), 3,000 and 6,000 (seed 4), 5,000 and 10,000 (seed 13);
-then 16,000 and 30,000 (seed 23) of a wider network, which computed the same at first.
+    python tools/train.py lidar vehicle F --scenes 2000 --steps 0 --seed 61 --start E/vehicle.onnx --examples 500
 
 --data, of which every n-th sweep is taken, may be given several times; --only does one of generate, fit and finish; --seed holds with --scenes or
---steps; the weights are averaged with those of --blend, which count --share; scores are calibrated and tested with so many --examples.
+--steps; --rounding are the steps in integers; scores are calibrated and tested with so many --examples.
 """
 
 from __future__ import annotations
@@ -49,7 +41,7 @@ from log2sim.errors import ConfigError, LogError
 from log2sim.logs.opening import open_log
 from log2sim.perception.detect3d.detectors import open_network
 from log2sim.synth.traffic import Mount
-from training import export, fitting
+from training import fitting
 from training.clouds import (
     REPORTED_KINDS,
     Example,
@@ -67,6 +59,7 @@ from training.export import calibrate, describe, description, export_onnx, impor
 from training.fitting import FitPlan
 from training.network import BevNetwork, Widths, loss_of, targets_of
 from training.real_logs import example_of, read_sweeps
+from training.rounding import difference, in_integers
 
 PER_SHARD = 100
 # Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.
@@ -74,6 +67,8 @@ HELD_OUT_SHARE = 0.2
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 WARM_UP_STEPS = 100
+# In integers, toward what the network computes in floats.
+ROUNDING_STEPS, ROUNDING_RATE = 3_000, 5e-4
 # To find the moments of the layers of a network that training starts from; and the greatest learning rate from there.
 START_BATCHES, START_RATE = 4, 1.5e-3
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
@@ -169,6 +164,9 @@ class Pool:
         return shard[int(rng.integers(len(shard)))]
 
 
+ROUNDED = "rounded.pt"  # where the state of the network in integers is kept
+
+
 def checkpoint_path(out: Path, number: int) -> Path:
     """Return where the state of a round is kept."""
     return out / f"round-{number}.pt"
@@ -178,17 +176,13 @@ def shard_name(mount: str, seed: int, number: int) -> str:
     return f"{mount}-{seed}-{number:04d}.npz"
 
 
-def batch_of(pool: Pool, mount: str, rng: np.random.Generator):
-    """Draw a batch: grids and targets."""
+def draw_batch(pool: Pool, mount: str, rng: np.random.Generator) -> tuple[list[Sample], list[np.ndarray], Tensor]:
+    """Draw samples, the lower corners of their windows, and their grids (B, 12, H, W)."""
     cells, cell_m = CELLS[mount], CELL_M[mount]
-    samples, lows, grids = [], [], []
-    for _ in range(BATCH):
-        sample = augmented(pool.draw(rng), rng)
-        low = window_of(rng, cells, cell_m, SHIFT_M[mount])
-        samples.append(sample)
-        lows.append(low)
-        grids.append(grid_of(sample, low, cells, cell_m))
-    return torch.from_numpy(np.stack(grids)), targets_of(samples, lows, cells, cell_m)
+    samples = [augmented(pool.draw(rng), rng) for _ in range(BATCH)]
+    lows = [window_of(rng, cells, cell_m, SHIFT_M[mount]) for _ in range(BATCH)]
+    grids = [grid_of(sample, low, cells, cell_m) for sample, low in zip(samples, lows, strict=True)]
+    return samples, lows, torch.from_numpy(np.stack(grids)).to(memory_format=torch.channels_last)
 
 
 def fit(
@@ -213,47 +207,72 @@ def fit(
         before = torch.load(checkpoint_path(out, number - 1), weights_only=True)
         network.load_state_dict(before["mean"])
     elif start is not None:
-        pool.prepare(0)
-        rng = np.random.default_rng(this.seed)
-        grids = torch.cat([batch_of(pool, mount, rng)[0] for _ in range(START_BATCHES)])
-        network = widened(import_onnx(start, grids), WIDTHS[mount]).train()
+        network = widened(import_onnx(start, first_grids(pool, mount, this.seed)), WIDTHS[mount]).train()
     network = network.to(memory_format=torch.channels_last)
 
     def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
         pool.prepare(step)
-        grid, targets = batch_of(pool, mount, rng)
-        return loss_of(network(grid.to(memory_format=torch.channels_last)), targets, grid)
+        samples, lows, grid = draw_batch(pool, mount, rng)
+        return loss_of(network(grid), targets_of(samples, lows, CELLS[mount], CELL_M[mount]), grid)
 
     plan = FitPlan(this.steps, this.seed, this.rate, checkpoint_path(out, number), WARM_UP_STEPS)
     fitting.fit(network, step_loss, plan)
 
 
+def first_grids(pool: Pool, mount: str, seed: int) -> Tensor:
+    """Draw grids by which the layers of a network that is there are scaled."""
+    pool.prepare(0)
+    rng = np.random.default_rng(seed)
+    return torch.cat([draw_batch(pool, mount, rng)[2] for _ in range(START_BATCHES)])
+
+
+def round_off(
+    mount: str, data: Path, out: Path, rounds: Sequence[Round], steps: int, own: Sequence[Path] = (), generator: Popen[bytes] | None = None
+) -> None:  # fmt: skip
+    """Train the averaged weights of the last round on in integers, or go on from the checkpoint of that in `out`."""
+    seed, pool = rounds[-1].seed, Pool(data, mount, rounds, own, generator)
+    exact = BevNetwork(WIDTHS[mount]).eval()
+    exact.load_state_dict(torch.load(checkpoint_path(out, len(rounds)), weights_only=True)["mean"])
+    exact = exact.to(memory_format=torch.channels_last)
+    network = in_integers(exact).train()
+    with torch.no_grad():
+        network(first_grids(pool, mount, seed))
+
+    def step_loss(network: nn.Module, rng: np.random.Generator, step: int) -> tuple[Tensor, dict[str, float]]:
+        pool.prepare(rounds[-1].steps + step)
+        grid = draw_batch(pool, mount, rng)[2]
+        with torch.no_grad():
+            wanted = exact(grid)
+        return difference(network(grid), wanted, grid)
+
+    fitting.fit(network, step_loss, FitPlan(steps, seed, ROUNDING_RATE, out / ROUNDED, WARM_UP_STEPS))
+
+
 def finish(
-    mount: str, out: Path, rounds: Sequence[Round], examples: int, held_out: Sequence[Example] = (), start: Path | None = None,
-    other: Path | None = None, share: float = 0.5,
+    mount: str, out: Path, rounds: Sequence[Round], rounding: int, examples: int, held_out: Sequence[Example] = (), start: Path | None = None
 ) -> None:  # fmt: skip
     """Export, calibrate and report; the files that ship are in `out` afterwards.
 
-    The card tells the rounds of `start`, too. `other` is averaged with the network and counts `share`.
-    Without simulated scenes the scores are calibrated and tested on the held-out sweeps; with both, on both.
+    The card tells the rounds of `start`, too. Without simulated scenes the scores are calibrated and tested on the held-out sweeps; with both, on both.
     """
     seed, simulated = rounds[0].seed, any(r.scenes for r in rounds)
+    before = None if start is None else open_network(start, LidarConfig(), name=mount).network.info
+    only_rounded = before is not None and not any(r.steps for r in rounds)  # its scores are those of the one before
     calibration, test = list(held_out[::2]), list(held_out[1::2])
     if simulated:
-        calibration += [draw_example(mount, (seed, 1_000_000, k), REPORTED_KINDS) for k in range(examples)]
+        draws = range(0 if only_rounded else examples)
+        calibration += [draw_example(mount, (seed, 1_000_000, k), REPORTED_KINDS) for k in draws]
         test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
-    if not calibration or not test:
+    if not test or not (calibration or only_rounded):
         raise ConfigError("--data: too few labeled sweeps to hold any out; give more of them, or --scenes")
     path = out / f"{mount}.onnx"
     info = description(mount, CELL_M[mount], RANGE_M[mount])
-    export_onnx(checkpoint_path(out, len(rounds)), path, info)
-    if other is not None:
-        export.blend(path, other, share)
-    info["calibration"] = calibrate(path, calibration)
-    before = [] if start is None else open_network(start, LidarConfig(), name=mount).network.info.card.get("rounds", [])
+    export_onnx(out / ROUNDED, path, info)
+    info["calibration"] = before.calibration if before and only_rounded else calibrate(path, calibration)
+    trained = [*(before.card.get("rounds", []) if before else []), *(asdict(r) for r in rounds if r.steps)]
     info["card"] = {
         "mount": mount,
-        "rounds": [*before, *(asdict(r) | ({} if other is None else {"blended": share}) for r in rounds)],
+        "rounds": [*trained, {"seed": seed, "steps_in_integers": rounding}],
         "batch": BATCH,
         "widths": WIDTHS[mount],
         "torch": torch.__version__,
@@ -269,14 +288,16 @@ def finish(
 
 def main(
     mount: Mount, out: Path, data: list[Path] = [], scenes: int | None = None, steps: int | None = None, seed: int = 1, every: int = 1,
-    only: str = "", start: Path | None = None, examples: int = 150, blend: Path | None = None, share: float = 0.5,
+    only: str = "", start: Path | None = None, rounding: int = ROUNDING_STEPS, examples: int = 150,
 ) -> None:  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     rounds: Sequence[Round] = ROUNDS[mount]
-    if steps or scenes is not None:
+    if steps is not None or scenes is not None:
         first = rounds[0]
         rate = START_RATE if start else first.rate
-        rounds = (Round(seed, first.scenes if scenes is None else scenes, steps or first.steps, rate),)
+        rounds = (
+            Round(seed, first.scenes if scenes is None else scenes, first.steps if steps is None else steps, rate),
+        )
     if scenes == 0 and not data:
         raise ConfigError("--scenes 0 needs --data")
     shards = out / "data"
@@ -289,8 +310,10 @@ def main(
     try:
         for number in range(1, len(rounds) + 1) if only in ("", "fit") else ():
             fit(mount, shards, out, rounds[:number], own, start=start, generator=generator)
+        if only in ("", "fit"):
+            round_off(mount, shards, out, rounds, rounding, own, generator)
     finally:
         if generator is not None:
             generator.terminate()
     if only in ("", "finish"):
-        finish(mount, out, rounds, examples, held_out, start, blend, share)
+        finish(mount, out, rounds, rounding, examples, held_out, start)

@@ -52,18 +52,20 @@ class BevNetwork(nn.Module):
         self.merge8, self.merge4, self.merge2 = conv(c, c), conv(b, b), conv(a, 32)
         self.head = nn.Conv2d(32, OUT_CHANNELS, 1)
         self.up = nn.Upsample(scale_factor=2, mode="nearest")
+        # Where the network in integers rounds, besides behind layers.
+        self.entrance, self.sum8, self.sum4, self.sum2 = (nn.Identity() for _ in range(4))
         with torch.no_grad():
             self.head.bias[HEAT] = HEAT_PRIOR_LOGIT
 
     def forward(self, grid: Tensor) -> Tensor:
         """Map grids (B, 12, H, W) to maps (B, 25, H/2, W/2)."""
-        s2 = self.stem(grid)
+        s2 = self.stem(self.entrance(grid))
         s4 = self.down4(s2)
         s8 = self.down8(s4)
         s16 = self.down16(s8)
-        s8 = self.merge8(s8 + self.up(self.lateral8(s16)))
-        s4 = self.merge4(s4 + self.up(self.lateral4(s8)))
-        return self.head(self.merge2(s2 + self.up(self.lateral2(s4))))
+        s8 = self.merge8(self.sum8(s8 + self.up(self.lateral8(s16))))
+        s4 = self.merge4(self.sum4(s4 + self.up(self.lateral4(s8))))
+        return self.head(self.merge2(self.sum2(s2 + self.up(self.lateral2(s4)))))
 
 
 VEHICLE_CATEGORIES, TWO_WHEELER_CATEGORIES = 3, 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ class PointsOfBoxes:
         chosen = np.flatnonzero(ramp(counts) % np.maximum(step, 1).take(self.box) == 0)
         return PointsOfBoxes(self.box.take(chosen), self.point.take(chosen), self.boxes)
 
-    @property
+    @cached_property
     def count(self) -> NDArray[np.int64]:
         """Number of points in each box (M,)."""
         return np.bincount(self.box, minlength=self.boxes).astype(np.int64)

@@ -155,7 +155,8 @@ class NetworkDetector:
         boxes, inside = boxes.take(kept), found.inside.take(kept)
         center = boxes.center_m + cloud.origin
         center[:, 2] += ground_under(boxes.center_m[:, :2], inside, cloud, found.index)
-        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s.take(found.index)) * NS_PER_S).astype(np.int64)
+        of_cloud = replace(inside, point=found.index.take(inside.point))
+        t_ns = cloud.stamp_ns + np.round(of_cloud.mean(cloud.t_s) * NS_PER_S).astype(np.int64)
         return Boxes3D(
             t_ns, center, boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.category, score[kept], points[kept]
         )
@@ -184,7 +185,7 @@ class NetworkDetector:
             boxes = decode_centers(maps, info, low)
             if not weak:
                 # Counting points takes longest: for those alone that reach the least score with as many as possible or none.
-                counts, reach = np.rint(np.expm1(3 * grid[3])), bounding_reach(boxes.size_m, boxes.yaw_rad)
+                counts, reach = np.rint(np.exp(3 * grid[3])) - 1, bounding_reach(boxes.size_m, boxes.yaw_rad)
                 most = most_points(counts, low, info.cell_m, boxes.center_m[:, :2], reach)
                 range_m = ranges_m(boxes, sensors)
                 best = np.maximum(*(boxes.score(info, boxes.terms(points, range_m)) for points in (most, 0 * most)))

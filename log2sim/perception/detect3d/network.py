@@ -114,7 +114,8 @@ def rasterize(xyz: NDArray[np.float32], *, cell_m: float, low: Array, shape: tup
     out = np.zeros((CHANNELS, h * w), np.float32)
     if len(inside) == 0:
         return out.reshape(CHANNELS, h, w)
-    x, y, z = x.take(inside), y.take(inside), z.take(inside)
+    if len(inside) < len(x):
+        x, y, z = x.take(inside), y.take(inside), z.take(inside)
     i, j = x.astype(np.intp), y.astype(np.intp)
     cell = i * w + j
     count = np.bincount(cell, minlength=h * w)

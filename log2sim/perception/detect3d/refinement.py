@@ -56,18 +56,18 @@ class Refinement:
     points: int  # number of points of a box that the network takes
 
     def refine(self, boxes: LevelBoxes, xyz: NDArray[np.float32], sensors: Array) -> tuple[LevelBoxes, PointsOfBoxes]:
-        """Correct boxes by their points; those without points are left out.
+        """Correct boxes by their points; those without points in or around them are left out.
 
         `xyz`: (N, 3), m: level frame, above the ground. `sensors`: (V, 2), m: where they were measured from.
 
         Returns the boxes, each of its most probable group, whose heat is the logit of that, and their points.
         """
         around = points_around(xyz, boxes)
-        inside = points_within(around, xyz, boxes)
-        some = np.flatnonzero(inside.count > 0)
+        some = np.flatnonzero(around.count > 0)
         if not len(some):
-            return boxes.take(some), inside.take(some)
-        boxes, around = boxes.take(some), around.take(some)
+            return boxes.take(some), around.take(some)
+        if len(some) < len(boxes):
+            boxes, around = boxes.take(some), around.take(some)
         toward = toward_sensor(boxes, sensors)
         values = box_inputs(xyz, around.sample(MOST_POINTS), around.count, boxes, toward, self.points)
         boxes = corrected(boxes, self.run(*values), self.categories)
