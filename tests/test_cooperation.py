@@ -67,11 +67,12 @@ def test_a_pole_that_is_moved_turned_and_late_is_put_right(street: Log) -> None:
     away_m, turned_deg, late_s = errors_of(found.log, street, POLE)
     assert away_m < 0.1
     assert turned_deg < 0.3
-    # In 2 s three pairs of boxes that move leave the clock unknown to some 50 ms.
+    # In 2 s pairs of boxes that move are few: the clock is known to some 10 or 50 ms by how many both ends find, or said not to be.
     sigma_s = found.faults[1].values["delay_sigma_s"]
     assert abs(late_s) < 2 * sigma_s < 0.15
-    told = ["road_pose", "road_clock", "unknown_road_clock"]
-    assert [fault.kind for fault in found.faults] == told
+    kinds = [fault.kind for fault in found.faults]
+    assert kinds[:2] == ["road_pose", "road_clock"]
+    assert kinds[2:] in ([], ["unknown_road_clock"])
     assert found.figures[0]["treatment"] == "corrected"
 
 
