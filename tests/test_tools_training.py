@@ -38,7 +38,7 @@ def test_a_toy_learns_to_find_people(tmp_path: Path, monkeypatch: pytest.MonkeyP
     rounds = [lidar.Round(5, 40, 200)]
     lidar.generate("roadside", tmp_path / "data", 40, 5)
     lidar.fit("roadside", tmp_path / "data", tmp_path, rounds)
-    lidar.round_off("roadside", tmp_path / "data", tmp_path, rounds, 50)
+    lidar.fit_quantized("roadside", tmp_path / "data", tmp_path, rounds, 50)
     lidar.finish("roadside", tmp_path, rounds, 50, examples=24)
     card = json.loads((tmp_path / "roadside.json").read_text())
     assert card["simulated"]["pedestrian"]["average_precision"] > 0.08
@@ -137,12 +137,12 @@ def test_a_toy_of_the_second_stage_learns_which_boxes_hold_objects(
 
 
 def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any) -> None:
-    """A network that is read back computes what it did before it was rounded, on other grids than those that its layers' moments and steps were taken
+    """A network that is read back computes what it did before it was quantized, on other grids than those that its layers' moments and steps were taken
     from, and so does a wider one.
     """
     from training.export import description, export_onnx, import_onnx, widened
     from training.network import BevNetwork
-    from training.rounding import in_integers, round_kernels
+    from training.quantization import quantize_kernels, quantized_network
 
     network = BevNetwork((16, 24, 32, 40))
     for layer in network.modules():
@@ -152,10 +152,10 @@ def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any)
             for values in (layer.bias.data, layer.running_mean):
                 values.uniform_(-0.5, 0.5)
     grids = torch.rand(6, 12, 64, 64)
-    rounded = in_integers(network).train()
+    quantized = quantized_network(network).train()
     with torch.no_grad():
-        rounded(grids[:4])
-    torch.save({"mean": rounded.state_dict()}, tmp_path / "x.pt")
+        quantized(grids[:4])
+    torch.save({"mean": quantized.state_dict()}, tmp_path / "x.pt")
     export_onnx(tmp_path / "x.pt", tmp_path / "x.onnx", description("vehicle", 0.25, 40.0))
     again = import_onnx(tmp_path / "x.onnx", grids[:4])
     with torch.no_grad():
@@ -168,9 +168,11 @@ def test_training_goes_on_from_the_network_in_a_file(tmp_path: Path, torch: Any)
         for one, other in ((again(grids[4:]), expected), (torch.from_numpy(in_file), expected), (training, before)):
             assert ((one - other).std((0, 2, 3)) < 0.1 * spread).all()
         # Where nothing is, integers are what they were in training, to the last step.
-        round_kernels(rounded.eval())
+        quantize_kernels(quantized.eval())
         empty = torch.zeros(1, 12, 64, 64)
-        np.testing.assert_allclose(session.run(["maps"], {"grid": empty.numpy()})[0], rounded(empty), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(
+            session.run(["maps"], {"grid": empty.numpy()})[0], quantized(empty), rtol=0, atol=1e-5
+        )
         wide = widened(again, (16, 40, 48, 64))
         np.testing.assert_allclose(wide(grids[4:]), again(grids[4:]), rtol=0, atol=1e-4 * float(expected.abs().max()))
         assert (wide.down8[0][0].weight[32:] != 0).any()  # the new channels can learn

@@ -2,7 +2,7 @@
 
     pip install 'log2sim[train]'
     python tools/train.py lidar roadside DIR            # the first two rounds of the shipped weights, as of `vehicle`
-    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --rounding 100            # a toy
+    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --quantize-steps 100            # a toy
     python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
     python tools/train.py lidar vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
     python tools/train.py lidar vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone
@@ -10,13 +10,13 @@
     python tools/train.py zou2021|two_stream --help     # the networks of two papers
 
 The shipped weights went on from those of such rounds (their cards tell all), the last time as a wider network (`WIDTHS`; 16, 32, 48 and
-64 channels until then) that computed the same at first, and then in integers:
+64 channels until then) that computed the same at first, and were quantized then:
 
     python tools/train.py lidar vehicle E --scenes 8000 --steps 30000 --seed 31 --start D/vehicle.onnx --examples 500
     python tools/train.py lidar vehicle F --scenes 2000 --steps 0 --seed 61 --start E/vehicle.onnx --examples 500
 
 --data, of which every n-th sweep is taken, may be given several times; --only does one of generate, fit and finish; --seed holds with --scenes or
---steps; --rounding are the steps in integers; scores are calibrated and tested with so many --examples.
+--steps; --quantize-steps of quantization-aware training follow; scores are calibrated and tested with so many --examples.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ from training.clouds import (
 from training.export import calibrate, describe, description, export_onnx, import_onnx, report, widened
 from training.fitting import FitPlan
 from training.network import BevNetwork, Widths, loss_of, targets_of
+from training.quantization import distillation_loss, quantized_network
 from training.real_logs import example_of, read_sweeps
-from training.rounding import difference, in_integers
 
 PER_SHARD = 100
 # Of the sweeps of each log the last are not trained on, half to calibrate the scores with and half to test.
@@ -67,8 +67,8 @@ HELD_OUT_SHARE = 0.2
 FIRST_SHARDS, STEPS_PER_SHARD = 4, 100
 BATCH = 4
 WARM_UP_STEPS = 100
-# In integers, toward what the network computes in floats.
-ROUNDING_STEPS, ROUNDING_RATE = 3_000, 5e-4
+# Of quantization-aware training, toward what the network computes in floats.
+QUANTIZE_STEPS, QUANTIZE_RATE = 3_000, 5e-4
 # To find the moments of the layers of a network that training starts from; and the greatest learning rate from there.
 START_BATCHES, START_RATE = 4, 1.5e-3
 # Side of the square grids of training; a roadside sensor sees cars to some 25 m.
@@ -164,7 +164,7 @@ class Pool:
         return shard[int(rng.integers(len(shard)))]
 
 
-ROUNDED = "rounded.pt"  # where the state of the network in integers is kept
+QUANTIZED = "quantized.pt"  # where the state of the quantized network is kept
 
 
 def checkpoint_path(out: Path, number: int) -> Path:
@@ -226,15 +226,15 @@ def first_grids(pool: Pool, mount: str, seed: int) -> Tensor:
     return torch.cat([draw_batch(pool, mount, rng)[2] for _ in range(START_BATCHES)])
 
 
-def round_off(
+def fit_quantized(
     mount: str, data: Path, out: Path, rounds: Sequence[Round], steps: int, own: Sequence[Path] = (), generator: Popen[bytes] | None = None
 ) -> None:  # fmt: skip
-    """Train the averaged weights of the last round on in integers, or go on from the checkpoint of that in `out`."""
+    """Train the averaged weights of the last round on as a quantized network, or go on from the checkpoint of that in `out`."""
     seed, pool = rounds[-1].seed, Pool(data, mount, rounds, own, generator)
     exact = BevNetwork(WIDTHS[mount]).eval()
     exact.load_state_dict(torch.load(checkpoint_path(out, len(rounds)), weights_only=True)["mean"])
     exact = exact.to(memory_format=torch.channels_last)
-    network = in_integers(exact).train()
+    network = quantized_network(exact).train()
     with torch.no_grad():
         network(first_grids(pool, mount, seed))
 
@@ -243,13 +243,13 @@ def round_off(
         grid = draw_batch(pool, mount, rng)[2]
         with torch.no_grad():
             wanted = exact(grid)
-        return difference(network(grid), wanted, grid)
+        return distillation_loss(network(grid), wanted, grid)
 
-    fitting.fit(network, step_loss, FitPlan(steps, seed, ROUNDING_RATE, out / ROUNDED, WARM_UP_STEPS))
+    fitting.fit(network, step_loss, FitPlan(steps, seed, QUANTIZE_RATE, out / QUANTIZED, WARM_UP_STEPS))
 
 
 def finish(
-    mount: str, out: Path, rounds: Sequence[Round], rounding: int, examples: int, held_out: Sequence[Example] = (), start: Path | None = None
+    mount: str, out: Path, rounds: Sequence[Round], quantize_steps: int, examples: int, held_out: Sequence[Example] = (), start: Path | None = None
 ) -> None:  # fmt: skip
     """Export, calibrate and report; the files that ship are in `out` afterwards.
 
@@ -257,22 +257,22 @@ def finish(
     """
     seed, simulated = rounds[0].seed, any(r.scenes for r in rounds)
     before = None if start is None else open_network(start, LidarConfig(), name=mount).network.info
-    only_rounded = before is not None and not any(r.steps for r in rounds)  # its scores are those of the one before
+    only_quantized = before is not None and not any(r.steps for r in rounds)  # its scores are those of the one before
     calibration, test = list(held_out[::2]), list(held_out[1::2])
     if simulated:
-        draws = range(0 if only_rounded else examples)
+        draws = range(0 if only_quantized else examples)
         calibration += [draw_example(mount, (seed, 1_000_000, k), REPORTED_KINDS) for k in draws]
         test = [draw_example(mount, (seed, 2_000_000, k)) for k in range(examples)]
-    if not test or not (calibration or only_rounded):
+    if not test or not (calibration or only_quantized):
         raise ConfigError("--data: too few labeled sweeps to hold any out; give more of them, or --scenes")
     path = out / f"{mount}.onnx"
     info = description(mount, CELL_M[mount], RANGE_M[mount])
-    export_onnx(out / ROUNDED, path, info)
-    info["calibration"] = before.calibration if before and only_rounded else calibrate(path, calibration)
+    export_onnx(out / QUANTIZED, path, info)
+    info["calibration"] = before.calibration if before and only_quantized else calibrate(path, calibration)
     trained = [*(before.card.get("rounds", []) if before else []), *(asdict(r) for r in rounds if r.steps)]
     info["card"] = {
         "mount": mount,
-        "rounds": [*trained, {"seed": seed, "steps_in_integers": rounding}],
+        "rounds": [*trained, {"seed": seed, "quantize_steps": quantize_steps}],
         "batch": BATCH,
         "widths": WIDTHS[mount],
         "torch": torch.__version__,
@@ -288,7 +288,7 @@ def finish(
 
 def main(
     mount: Mount, out: Path, data: list[Path] = [], scenes: int | None = None, steps: int | None = None, seed: int = 1, every: int = 1,
-    only: str = "", start: Path | None = None, rounding: int = ROUNDING_STEPS, examples: int = 150,
+    only: str = "", start: Path | None = None, quantize_steps: int = QUANTIZE_STEPS, examples: int = 150,
 ) -> None:  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     rounds: Sequence[Round] = ROUNDS[mount]
@@ -311,9 +311,9 @@ def main(
         for number in range(1, len(rounds) + 1) if only in ("", "fit") else ():
             fit(mount, shards, out, rounds[:number], own, start=start, generator=generator)
         if only in ("", "fit"):
-            round_off(mount, shards, out, rounds, rounding, own, generator)
+            fit_quantized(mount, shards, out, rounds, quantize_steps, own, generator)
     finally:
         if generator is not None:
             generator.terminate()
     if only in ("", "finish"):
-        finish(mount, out, rounds, rounding, examples, held_out, start)
+        finish(mount, out, rounds, quantize_steps, examples, held_out, start)

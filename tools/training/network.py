@@ -52,7 +52,7 @@ class BevNetwork(nn.Module):
         self.merge8, self.merge4, self.merge2 = conv(c, c), conv(b, b), conv(a, 32)
         self.head = nn.Conv2d(32, OUT_CHANNELS, 1)
         self.up = nn.Upsample(scale_factor=2, mode="nearest")
-        # Where the network in integers rounds, besides behind layers.
+        # Where the quantized network quantizes, besides behind layers.
         self.entrance, self.sum8, self.sum4, self.sum2 = (nn.Identity() for _ in range(4))
         with torch.no_grad():
             self.head.bias[HEAT] = HEAT_PRIOR_LOGIT

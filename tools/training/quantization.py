@@ -1,8 +1,9 @@
-"""A network that computes in integers: weights of 7 bits, what layers hand on of 8, and the training that goes on with both rounded.
+"""Quantization-aware training: a network that computes in integers, its weights of 7 bits, what layers hand on of 8.
 
-Rounding after training loses what a LiDAR of few lines shows little of. Trained on with it, by gradients that pass rounding by, for
-the steps as well (LSQ, Esser et al., ICLR 2020), the network does without. Products of 8 and 7 bits add up in 16 without saturation
-on processors that have no instruction for more.
+Quantization after training loses vehicles of which a LiDAR of few lines shows little. Trained on with quantized weights and activations,
+by straight-through gradients, for the step sizes as well (LSQ, Esser et al., ICLR 2020), toward what the network computes in floats
+(distillation, Hinton et al., 2015), the network loses next to nothing. Products of 8 and 7 bits add up in 16 without saturation on
+processors that have no instruction for more.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ INPUT_STEP, INPUT_ZERO = 1 / 64, 32
 LARGEST_SHARE, MAX_VALUES, LEAST_LARGEST = 0.9999, 1_000_000, 1e-3
 
 
-def rounded(value: Tensor, step: Tensor | float, low: int, high: int) -> Tensor:
+def quantized(value: Tensor, step: Tensor | float, low: int, high: int) -> Tensor:
     """Round to multiples of a step from `low` to `high` of them; gradients pass as if it were only limited."""
     whole = value / step
     return (whole + (whole.round() - whole).detach()).clamp(low, high) * step
 
 
-def kernel_step(kernel: Tensor) -> Tensor:
-    """Return the steps (outputs,) that the weights of a kernel (outputs, inputs, k, k) are rounded in, by the largest of each output."""
+def weight_step(kernel: Tensor) -> Tensor:
+    """Return the step sizes (outputs,) of the weights of a kernel (outputs, inputs, k, k), by the largest of each output."""
     return kernel.detach().abs().amax((1, 2, 3)).clamp(min=1e-12) / WEIGHT_LEVELS
 
 
-class Rounding(nn.Module):
-    """Rounds to 8 bits, in steps that are learned where none is given; the first values, not negative, that it meets set them."""
+class Quantizer(nn.Module):
+    """Quantizes to 8 bits, in steps that are learned where none is given; the first values, not negative, that it meets set them."""
 
     def __init__(self, step: float = math.nan, zero: int = 0) -> None:
         super().__init__()
@@ -49,92 +50,92 @@ class Rounding(nn.Module):
         self.zero = zero
 
     def forward(self, x: Tensor) -> Tensor:
-        """Round values of any shape."""
+        """Quantize values of any shape."""
         if not self.training:
             return torch.fake_quantize_per_tensor_affine(x, float(self.log_step.exp()), self.zero, 0, LEVELS)
         if self.log_step.isnan():
             largest = x.detach().flatten()[:: max(x.numel() // MAX_VALUES, 1)].quantile(LARGEST_SHARE)
             self.log_step.data = (largest.clamp(min=LEAST_LARGEST) / LEVELS).log()
         step, share = self.log_step.exp(), 1 / math.sqrt(x.numel() * LEVELS)  # of the gradient, as LSQ has it
-        return rounded(x, step * share + (step * (1 - share)).detach(), -self.zero, LEVELS - self.zero)
+        return quantized(x, step * share + (step * (1 - share)).detach(), -self.zero, LEVELS - self.zero)
 
 
-class RoundedConv(nn.Module):
-    """Convolution with a rounded kernel, ReLU or not, and rounding of the output or none.
+class QuantizedConv(nn.Module):
+    """Convolution with a quantized kernel, ReLU or not, and quantization of the output or none.
 
-    Where the output is rounded, so is the bias, to multiples of a step of the input times one of the kernel: what is empty is the same everywhere, and
+    Where the output is quantized, so is the bias, to multiples of a step of the input times one of the kernel: what is empty is the same everywhere, and
     one step more of it everywhere would be too much.
     """
 
-    def __init__(self, conv: nn.Conv2d, relu: nn.Module, before: Rounding | None, out: nn.Module) -> None:
+    def __init__(self, conv: nn.Conv2d, relu: nn.Module, before: Quantizer | None, out: nn.Module) -> None:
         super().__init__()
         self.conv, self.relu, self.out = conv, relu, out
-        self._before = (before,)  # the rounding of the input, which is no part of this module
+        self._before = (before,)  # the quantizer of the input, which is no part of this module
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, inputs, H, W) to (B, outputs, H', W')."""
         conv = self.conv
-        kernel, bias = self.rounded() if self.training else (conv.weight, conv.bias)
+        kernel, bias = self.quantized() if self.training else (conv.weight, conv.bias)
         return self.out(self.relu(F.conv2d(x, kernel, bias, conv.stride, conv.padding)))
 
     @property
     def bias_step(self) -> Tensor | None:
-        """What the bias is rounded in (outputs,), or None."""
+        """Step sizes of the bias (outputs,), or None."""
         (before,) = self._before
-        return None if before is None else kernel_step(self.conv.weight) * before.log_step.detach().exp()
+        return None if before is None else weight_step(self.conv.weight) * before.log_step.detach().exp()
 
-    def rounded(self) -> tuple[Tensor, Tensor]:
-        """Round the kernel and the bias."""
+    def quantized(self) -> tuple[Tensor, Tensor]:
+        """Quantize the kernel and the bias."""
         kernel, bias, step = self.conv.weight, self.conv.bias, self.bias_step
         if step is not None:
-            bias = rounded(bias, step, -(2**31), 2**31)
-        return rounded(kernel, kernel_step(kernel)[:, None, None, None], -WEIGHT_LEVELS, WEIGHT_LEVELS), bias
+            bias = quantized(bias, step, -(2**31), 2**31)
+        return quantized(kernel, weight_step(kernel)[:, None, None, None], -WEIGHT_LEVELS, WEIGHT_LEVELS), bias
 
 
-def in_integers(network: BevNetwork) -> BevNetwork:
-    """Make a network that rounds, of the same weights; normalization is folded into its kernels.
+def quantized_network(network: BevNetwork) -> BevNetwork:
+    """Make a quantized network of the same weights; normalization is folded into its kernels.
 
-    What is enlarged and added stays exact until the sum is rounded, and so do the maps.
+    What is enlarged and added stays exact until the sum is quantized, and so do the maps.
     """
 
-    def rounding(layers: Any, before: Rounding) -> tuple[list[RoundedConv], Rounding]:
-        steps = [before, *(Rounding() for _ in layers)]
+    def quantize(layers: Any, before: Quantizer) -> tuple[list[QuantizedConv], Quantizer]:
+        steps = [before, *(Quantizer() for _ in layers)]
         convs = [
-            RoundedConv(fuse_conv_bn_eval(layer[0], layer[1]), nn.ReLU(), *pair)
+            QuantizedConv(fuse_conv_bn_eval(layer[0], layer[1]), nn.ReLU(), *pair)
             for layer, pair in zip(layers, pairwise(steps))
         ]
         return convs, steps[-1]
 
     network = copy.deepcopy(network).eval()
-    before = network.entrance = Rounding(INPUT_STEP, INPUT_ZERO)
+    before = network.entrance = Quantizer(INPUT_STEP, INPUT_ZERO)
     for name in ("stem", "down4", "down8", "down16"):
-        convs, before = rounding(getattr(network, name), before)
+        convs, before = quantize(getattr(network, name), before)
         setattr(network, name, nn.Sequential(*convs))
     for k in (8, 4, 2):
         lateral = getattr(network, f"lateral{k}")
-        exact = RoundedConv(fuse_conv_bn_eval(lateral[0], lateral[1]), nn.ReLU(), None, nn.Identity())
-        before = Rounding()
-        (merge,), _ = rounding([getattr(network, f"merge{k}")], before)
+        exact = QuantizedConv(fuse_conv_bn_eval(lateral[0], lateral[1]), nn.ReLU(), None, nn.Identity())
+        before = Quantizer()
+        (merge,), _ = quantize([getattr(network, f"merge{k}")], before)
         for name, part in ((f"lateral{k}", exact), (f"sum{k}", before), (f"merge{k}", merge)):
             setattr(network, name, part)
-    network.head = RoundedConv(network.head, nn.Identity(), None, nn.Identity())
+    network.head = QuantizedConv(network.head, nn.Identity(), None, nn.Identity())
     return network.eval()
 
 
-def round_kernels(network: nn.Module) -> dict[str, NDArray[np.float32]]:
-    """Round kernels and biases for good, which training rounds at each step; return the steps (outputs,) of the biases by name."""
+def quantize_kernels(network: nn.Module) -> dict[str, NDArray[np.float32]]:
+    """Quantize kernels and biases for good, which training does at each step; return the steps (outputs,) of the biases by name."""
     steps = {}
     with torch.no_grad():
         for name, part in network.named_modules():
-            if isinstance(part, RoundedConv):
+            if isinstance(part, QuantizedConv):
                 if part.bias_step is not None:
                     steps[f"{name}.conv.bias"] = part.bias_step.numpy()
-                for value, rounded_value in zip((part.conv.weight, part.conv.bias), part.rounded()):
-                    value.copy_(rounded_value)
+                for value, new in zip((part.conv.weight, part.conv.bias), part.quantized()):
+                    value.copy_(new)
     return steps
 
 
-def difference(maps: Tensor, wanted: Tensor, grid: Tensor) -> tuple[Tensor, dict[str, float]]:
+def distillation_loss(maps: Tensor, wanted: Tensor, grid: Tensor) -> tuple[Tensor, dict[str, float]]:
     """Return how far maps (B, 25, h, w) are from those of the network in floats, where objects are to it, and the parts of that."""
     p = torch.sigmoid(wanted[:, HEAT])
     there = p.amax(1, keepdim=True)
