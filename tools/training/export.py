@@ -134,9 +134,8 @@ def import_onnx(path: Path, grids: Tensor) -> BevNetwork:
             values[node.output[0]] = whole * step.reshape(-1, *(1,) * (whole.ndim - 1))
         elif node.op_type == "Conv":
             name = node.input[1].removesuffix(".weight").removesuffix(".conv")
-            if name.startswith(
-                "onnx::"
-            ):  # such name no kernels; "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0"
+            if name.startswith("onnx::"):
+                # Kernels in floats have no names; "/down4/down4.0/down4.0.2/Relu_output_0" is of the layer "down4.0".
                 name = node.output[0].split("/")[-2].rsplit(".", 1)[0]
             folded[name] = [torch.from_numpy(values[k].copy()) for k in node.input[1:]]
     network = BevNetwork(widths_of({name: kernel for name, (kernel, _) in folded.items()})).eval()

@@ -2,7 +2,7 @@
 
     pip install 'log2sim[train]'
     python tools/train.py lidar roadside DIR            # the first two rounds of the shipped weights, as of `vehicle`
-    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --quantize-steps 100            # a toy
+    python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --quantize-steps 100      # a toy
     python tools/train.py lidar vehicle DIR --scenes 200 --steps 300 --start FILE.onnx         # goes on from a network that is there
     python tools/train.py lidar vehicle DIR --data LOGS --steps 2000     # half of each batch from labeled logs of any format
     python tools/train.py lidar vehicle DIR --data LOGS --scenes 0 --steps 2000                # from these alone

@@ -321,10 +321,10 @@ READER = WaymoReader()
 
 def _files(path: Path) -> list[Path]:
     try:
-        found = [path] if path.is_file() else [file for file in path.glob(f"*{SUFFIX}") if file.is_file()]
+        files = [path] if path.is_file() else [file for file in path.glob(f"*{SUFFIX}") if file.is_file()]
     except OSError:
         return []
-    return sorted(found, key=lambda file: file.name.removesuffix(SUFFIX))
+    return sorted(files, key=lambda file: file.name.removesuffix(SUFFIX))
 
 
 class _SegmentFile(Segment):

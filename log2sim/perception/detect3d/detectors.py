@@ -117,8 +117,7 @@ class Candidates:
     """Boxes of a cloud before the weak ones and those that overlap are left out."""
 
     boxes: LevelBoxes  # M LevelBoxes
-    inside: PointsOfBoxes  # their points above the ground
-    index: NDArray[np.intp]  # (n,): of the points that `inside` numbers in the cloud
+    inside: PointsOfBoxes  # their points of the cloud above the ground
     terms: NDArray[np.float64]  # (5, M): see `LevelBoxes.terms`
 
 
@@ -154,9 +153,8 @@ class NetworkDetector:
         kept = good[suppress(boxes.rectangles[good], score[good], boxes.group[good])]
         boxes, inside = boxes.take(kept), found.inside.take(kept)
         center = boxes.center_m + cloud.origin
-        center[:, 2] += ground_under(boxes.center_m[:, :2], inside, cloud, found.index)
-        of_cloud = replace(inside, point=found.index.take(inside.point))
-        t_ns = cloud.stamp_ns + np.round(of_cloud.mean(cloud.t_s) * NS_PER_S).astype(np.int64)
+        center[:, 2] += ground_under(boxes.center_m[:, :2], inside, cloud)
+        t_ns = cloud.stamp_ns + np.round(inside.mean(cloud.t_s) * NS_PER_S).astype(np.int64)
         return Boxes3D(
             t_ns, center, boxes.size_m, boxes.yaw_rad, boxes.heading_score, boxes.category, score[kept], points[kept]
         )
@@ -199,7 +197,8 @@ class NetworkDetector:
             boxes, inside = self.refinement.refine(boxes, xyz, sensors)
         else:
             inside = points_of_boxes(xyz, boxes.center_m, boxes.size_m, boxes.yaw_rad)
-        return Candidates(boxes, inside, index, boxes.terms(inside.count, ranges_m(boxes, sensors)))
+        inside = replace(inside, point=index.take(inside.point))
+        return Candidates(boxes, inside, boxes.terms(inside.count, ranges_m(boxes, sensors)))
 
     def _least(self, found: LevelBoxes) -> NDArray[np.float64]:
         """Return the least score (M,) that each box needs."""

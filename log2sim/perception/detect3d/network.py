@@ -196,15 +196,15 @@ def _cropped(cloud: Cloud, centers: Array, range_m: float) -> tuple[NDArray[np.f
     return np.stack([x[index], y[index], height[index]]).T, index
 
 
-def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud, index: NDArray[np.intp]) -> Array:
+def ground_under(xy: Array, inside: PointsOfBoxes, cloud: Cloud) -> Array:
     """Estimate the height (M,) of the ground under centers (M, 2), m, by a plane through that under the points of each box.
 
-    All are relative to the cloud's origin. Each box has a point; `index` (n,) are those that `inside` numbers in the cloud.
+    All are relative to the cloud's origin. Each box has a point of the cloud.
 
     A car is seen from one side: on a slope of 10 % the ground under its points is 0.1 to 0.2 m off that under its center.
     """
     inside = inside.sample(PLANE_POINTS)
-    box, point = inside.box, index.take(inside.point)
+    box, point = inside.box, inside.point
     x, y = (cloud.xyz[:, axis].take(point) - xy[:, axis].take(box) for axis in range(2))
     z = (cloud.xyz[:, 2].take(point) - cloud.height.take(point)).astype(np.float64)
     count = inside.count
