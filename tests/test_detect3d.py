@@ -13,12 +13,12 @@ from log2sim.evaluation.detection.boxes import SceneBoxes
 from log2sim.evaluation.detection.protocols import Criterion, match_detections
 from log2sim.geometry import Array, wrap_angle
 from log2sim.perception.detect3d.boxes import (
+    MAX_PEAKS,
     MIN_HEAT,
     decode_centers,
     decode_votes,
     headings,
     mean_shift,
-    peaks,
     sigmoid,
     suppress,
 )
@@ -76,17 +76,31 @@ def test_the_heading_points_to_the_likelier_side_and_knows_how_likely_that_is(ya
     assert -np.pi <= found[0] < np.pi
 
 
-def test_peaks_are_greatest_among_their_neighbors_and_strongest_first() -> None:
+def test_peaks_are_greatest_among_neighbors_of_the_same_center_and_strongest_first() -> None:
     rng = np.random.default_rng(1)
-    heat = rng.normal(0, 1, (2, 30, 20)).astype(np.float32)
-    group, flat = peaks(heat)
-    padded = np.pad(heat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
+    maps = empty_maps(30, 20)
+    maps[:3] = rng.normal(-2, 1, (3, 30, 20))
+    maps[8:14] = np.arange(6)[
+        :, None, None
+    ]  # the same box relative to each cell, so wide that all neighbors mean one object
+    found = decode_centers(maps, info(), LOW)
+    padded = np.pad(maps[:3], ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     around = np.max([padded[:, i : i + 30, j : j + 20] for i in range(3) for j in range(3)], axis=0)
-    expected = {
-        (g, int(i * 20 + j)) for g, i, j in np.argwhere((heat == around) & (heat >= np.log(MIN_HEAT / (1 - MIN_HEAT))))
-    }
-    assert set(zip(group.tolist(), flat.tolist())) == expected
-    assert np.all(np.diff(heat.reshape(2, -1)[group, flat]) <= 0)
+    likely = maps[:3] >= np.log(MIN_HEAT / (1 - MIN_HEAT))
+    np.testing.assert_allclose(found.heat, np.sort(maps[:3][likely & (maps[:3] == around)])[::-1])
+    maps[8:14] = 0  # a width of 1 m, and centers as far apart as cells, 0.5 m
+    found = decode_centers(maps, info(), LOW)
+    np.testing.assert_allclose(found.heat, np.sort(maps[:3][likely])[: -MAX_PEAKS - 1 : -1])
+
+
+def test_people_side_by_side_are_two() -> None:
+    maps = empty_maps(80, 48)
+    people = [(0.2, 0.2, 0.9, *SIZES["pedestrian"], 0.3), (0.2, 0.8, 0.9, *SIZES["pedestrian"], 2.0)]
+    encode(maps, people[0], "pedestrian", low=LOW, logit=5.0, cells=1)
+    encode(maps, people[1], "pedestrian", low=LOW, logit=2.5)
+    found = decode_centers(maps, info(), LOW)
+    np.testing.assert_allclose(found.center_m, [person[:3] for person in people], atol=1e-5)
+    np.testing.assert_allclose(found.heat, [5.0, 2.5])
 
 
 def rectangles(*rows: tuple[float, ...]) -> Array:

@@ -130,25 +130,35 @@ class MapCells:
 
 
 def cells_around(
-    maps: NDArray[np.float32], flat: NDArray[np.intp], group: NDArray[np.intp], info: NetworkInfo, low: Array
-) -> MapCells:
-    """Average the cells around each of some cells (K,) whose boxes are centered where that of the cell itself is.
+    maps: NDArray[np.float32], flat: NDArray[np.intp], info: NetworkInfo
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return flat indices (K, 9) of the cells around some cells (K,), themselves in the middle, and which regress the same center.
 
-    Cells are weighted by their heat for the group (K,). `maps`, `flat` and `low` are as for `MapCells.at`.
+    `maps` is as for `MapCells.at`; what is outside of it has the index 0 and not the same center.
     """
     h, w = maps.shape[1:]
     step = np.arange(-AROUND_CELLS, AROUND_CELLS + 1)
     di, dj = (d.ravel() for d in np.meshgrid(step, step, indexing="ij"))
     i, j = flat[:, None] // w + di, flat[:, None] % w + dj
     inside = (i >= 0) & (i < h) & (j >= 0) & (j < w)
-    cells = MapCells.at(maps, np.where(inside, i * w + j, 0).ravel(), info, low)
-    own = slice(len(di) // 2, len(di) // 2 + 1)
-    x, y, _, _, width, _ = cells.values[info.channels.box].reshape(6, *i.shape)
+    around = np.where(inside, i * w + j, 0)
+    x, y, _, _, width, _ = maps[info.channels.box].reshape(6, -1)
+    side_m = np.float32(info.stride * info.cell_m)
     with np.errstate(over="ignore", invalid="ignore"):
-        x, y = (v + middle.reshape(i.shape) for v, middle in zip((x, y), cells.middle_m.T, strict=True))
-        same = np.hypot(x - x[:, own], y - y[:, own]) < SAME_CENTER_WIDTHS * np.exp(width[:, own])
-    heat = sigmoid(cells.values[info.channels.heat].reshape(len(info.groups), *i.shape)[group, np.arange(len(flat))])
-    return cells.means(np.where(inside & same & (heat >= MIN_HEAT_SHARE * heat[:, own]), heat, 0.0))
+        dx, dy = (v[around] - v[flat, None] + d * side_m for v, d in ((x, di), (y, dj)))
+        same = np.hypot(dx, dy) < SAME_CENTER_WIDTHS * np.exp(width[flat, None])
+    return around, inside & same
+
+
+def mean_cells(
+    maps: NDArray[np.float32], around: NDArray[np.intp], same: NDArray[np.bool_], group: NDArray[np.intp], info: NetworkInfo, low: Array
+) -> MapCells:  # fmt: skip
+    """Average cells and those around them of the same center, as from `cells_around`, by their heat for the group (K,) of each."""
+    cells = MapCells.at(maps, around.ravel(), info, low)
+    logits = cells.values[info.channels.heat].reshape(len(info.groups), *around.shape)
+    heat = sigmoid(logits[group, np.arange(len(group))])
+    own = heat.shape[1] // 2
+    return cells.means(np.where(same & (heat >= MIN_HEAT_SHARE * heat[:, own : own + 1]), heat, 0.0))
 
 
 def boxes_of_cells(cells: MapCells, group: NDArray[np.intp], heat: Array, info: NetworkInfo) -> LevelBoxes:
@@ -213,32 +223,17 @@ def decode_centers(maps: NDArray[np.float32], info: NetworkInfo, low: Array) -> 
     `maps`: (C, h, w): output of the network. `low`: (2,), m: lower corner of the maps.
 
     Zhou, Wang and Kraehenbuehl (2019), "Objects as Points": a cell of the greatest heat among its eight neighbors is an
-    object's center. Networks are taught an object's box in the cells around its center too; the mean over those that mean
-    the same object errs less than the box of a single cell.
+    object's center. Here among those of the same center, since people side by side are in neighboring cells. Networks are taught an
+    object's box in the cells around its center too; the mean over those that mean the same object errs less than the box of a single cell.
     """
-    group, flat = peaks(maps[info.channels.heat])
-    cells = cells_around(maps, flat, group, info, low)
-    heat = maps.reshape(len(maps), -1)[info.channels.heat][group, flat].astype(np.float64)
-    return boxes_of_cells(cells, group, heat, info)
-
-
-def peaks(heat: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Find cells that no neighbor exceeds in maps of logits (G, h, w).
-
-    Returns `group`, `flat`: (K,): map and flat index in it, greatest logit first.
-    """
-    import cv2
-
-    least = np.float32(np.log(MIN_HEAT / (1 - MIN_HEAT)))
-    kernel = np.ones((3, 3), np.uint8)
-    groups, cells = [], []
-    for k, logits in enumerate(heat):
-        flat = np.flatnonzero((logits >= least) & (logits >= cv2.dilate(logits, kernel)))
-        groups.append(np.full(len(flat), k, dtype=np.intp))
-        cells.append(flat)
-    group, flat = np.concatenate(groups), np.concatenate(cells)
-    order = np.argsort(-heat.reshape(len(heat), -1)[group, flat], kind="stable")[:MAX_PEAKS]
-    return group[order], flat[order]
+    heat = maps[info.channels.heat].reshape(len(info.groups), -1)
+    group, flat = np.nonzero(heat >= np.float32(np.log(MIN_HEAT / (1 - MIN_HEAT))))
+    around, same = cells_around(maps, flat, info)
+    own = heat[group, flat]
+    peak = np.flatnonzero(~(same & (heat[group[:, None], around] > own[:, None])).any(axis=1))
+    peak = peak[np.argsort(-own[peak], kind="stable")[:MAX_PEAKS]]
+    cells = mean_cells(maps, around[peak], same[peak], group[peak], info, low)
+    return boxes_of_cells(cells, group[peak], own[peak].astype(np.float64), info)
 
 
 # Cells of the ground and its roughness; the lowest hoods and saddles are higher.
@@ -284,7 +279,7 @@ def decode_votes(maps: NDArray[np.float32], grid: NDArray[np.float32], info: Net
     h, w = maps.shape[1:]
     middle = np.clip(i, 0, h - 1) * w + np.clip(j, 0, w - 1)
     logit = np.log(mean) - np.log1p(-np.minimum(mean, 1 - 1e-12))
-    found = boxes_of_cells(cells_around(maps, middle, group, info, low), group, logit, info)
+    found = boxes_of_cells(mean_cells(maps, *cells_around(maps, middle, info), group, info, low), group, logit, info)
     limits = [(min(MIN_SIZE_M[n][2] for n in GROUPS[g]), max(MAX_SIZE_M[n][2] for n in GROUPS[g])) for g in info.groups]
     (least, most), height = np.array(limits)[found.group].T, found.size_m[:, 2]
     return found.take((height >= least / HEIGHT_TOLERANCE) & (height <= most * HEIGHT_TOLERANCE))
