@@ -28,6 +28,8 @@ WEIGHT_LEVELS, LEVELS = 2 ** (WEIGHT_BITS - 1) - 1, 255  # largest values
 INPUT_STEP, INPUT_ZERO = 1 / 64, 32
 # Of all values, the part that the first steps reach, of as many as are looked at, and the least that they reach.
 LARGEST_SHARE, MAX_VALUES, LEAST_LARGEST = 0.9999, 1_000_000, 1e-3
+# Of the heat in the distillation loss, so that it counts as much as boxes: as divergence it is small where scores are nearly the same.
+HEAT_WEIGHT = 40
 
 
 def quantized(value: Tensor, step: Tensor | float, low: int, high: int) -> Tensor:
@@ -141,7 +143,7 @@ def distillation_loss(maps: Tensor, wanted: Tensor, grid: Tensor) -> tuple[Tenso
     there = p.amax(1, keepdim=True)
     entropy = F.binary_cross_entropy_with_logits(maps[:, HEAT], p, reduction="none")
     least = F.binary_cross_entropy_with_logits(wanted[:, HEAT], p, reduction="none")
-    parts = {"heat": (entropy - least).sum() / p.sum()}
+    parts = {"heat": HEAT_WEIGHT * (entropy - least).sum() / p.sum()}
     of_box = torch.cat([maps[:, part] - wanted[:, part] for part in (BOX, AXIS, DIRECTION)], 1).abs()
     parts["box"] = (of_box * there).sum() / there.sum()
     of_kind = torch.cat([maps[:, part] - wanted[:, part] for part in (CATEGORY, QUALITY)], 1).abs()
