@@ -426,15 +426,16 @@ def test_a_group_wins_before_a_category_does_and_images_tell_two_wheelers_apart(
 
 
 @pytest.mark.parametrize(
-    ("speed_mps", "riders", "category"), [(0.0, 10, "bicycle"), (1.5, 10, "cyclist"), (1.5, 0, "bicycle")]
-)
-def test_a_bicycle_that_moves_and_shows_a_rider_is_ridden(speed_mps: float, riders: int, category: str) -> None:
+    ("speed_mps", "third", "category"),
+    [(0.0, "pedestrian", "bicycle"), (1.5, "pedestrian", "cyclist"), (1.5, "motorcycle", "bicycle"), (1.5, "bicycle", "bicycle")],
+)  # fmt: skip
+def test_a_bicycle_that_moves_and_shows_a_rider_is_ridden(speed_mps: float, third: str, category: str) -> None:
     t_ns = stamps(30)
     rng = np.random.default_rng(2)
     xy = np.column_stack([speed_mps * (t_ns - t_ns[0]) / NS_PER_S, np.zeros(len(t_ns))]) + rng.normal(0, 0.3, (30, 2))
     xy[4] += 9.0
     rows = seen(xy, t_ns, category="bicycle")
-    shown = np.where(np.arange(30) % 3 < riders / 10, "pedestrian", "bicycle")
+    shown = np.where(np.arange(30) % 3 < 1, third, "bicycle")
     assert decide_category(replace(rows, category=shown)) == category
 
 

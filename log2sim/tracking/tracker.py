@@ -30,8 +30,8 @@ SPEED_BASELINE_S = 0.6
 SPEED_QUANTILE = 0.75
 # A bicycle that got farther than its own length and the errors of both positions moved, and none moves without a rider.
 MIN_RIDDEN_M = 3.0
-# Share of the measurements of a ridden bicycle that show the rider, who is larger than the bicycle.
-MIN_RIDER_SHARE = 0.25
+# Share of the measurements of a ridden bicycle that show the rider, who is larger than the bicycle, as one of these.
+MIN_RIDER_SHARE, SHOW_A_RIDER = 0.25, ("cyclist", "pedestrian")
 # Measurements at either end of a track whose median position counts, so that single wrong ones do not.
 CATEGORY_END_MEASUREMENTS = 5
 
@@ -67,7 +67,7 @@ def decide_category(m: Measurements, rows: Any = slice(None), *, whole_boxes: bo
         if len(start) and float(np.quantile(speed_mps, SPEED_QUANTILE)) > MAX_PEDESTRIAN_SPEED_MPS:
             return "cyclist"
     count = min(CATEGORY_END_MEASUREMENTS, len(shown) // 2)
-    if category == "bicycle" and count and (shown != category).mean() >= MIN_RIDER_SHARE:
+    if category == "bicycle" and count and np.isin(shown, SHOW_A_RIDER).mean() >= MIN_RIDER_SHARE:
         xy = m.center_m[rows, :2]
         first, last = np.median(xy[:count], axis=0), np.median(xy[-count:], axis=0)
         if np.hypot(*(last - first)) > MIN_RIDDEN_M:
