@@ -272,9 +272,14 @@ def maps_along(*strokes: tuple[float, float, str], hidden: tuple[float, float] =
     return PaintMaps(probability * seen, nothing, nothing, seen, raster, {})
 
 
-def parts_along(*strokes: tuple[float, float, str], hidden: tuple[float, float] = (0.0, 0.0)):
+def parts_along(
+    *strokes: tuple[float, float, str], hidden: tuple[float, float] = (0.0, 0.0), crosswalk: tuple[float, float] = (0.0, 0.0)
+):  # fmt: skip
     curve = Curve(np.column_stack([np.linspace(0, 199, 400), np.zeros(400)]))
-    return parts_of(maps_along(*strokes, hidden=hidden), curve, np.array([stroke[:2] for stroke in strokes]))
+    maps = maps_along(*strokes, hidden=hidden)
+    x = maps.raster.xy_of(*np.indices(maps.raster.shape))[..., 0]
+    crossed = (x > crosswalk[0]) & (x < crosswalk[1])
+    return parts_of(maps, curve, np.array([stroke[:2] for stroke in strokes]), crossed)
 
 
 def dashes(dash_m: float, gap_m: float, *spans: tuple[float, float]) -> list[tuple[float, float, str]]:
@@ -282,6 +287,16 @@ def dashes(dash_m: float, gap_m: float, *spans: tuple[float, float]) -> list[tup
     begin = np.arange(0.0, 198.0, dash_m + gap_m)
     inside = [b for b in begin if any(low <= b and b + dash_m <= high for low, high in spans)]
     return [(b, b + dash_m, "dashed") for b in inside]
+
+
+@pytest.mark.parametrize("strokes", [[(0.0, 120.0, "solid")], [(0.0, 58.0, "solid"), (63.0, 120.0, "solid")], [(k, k + 3.0, "dashed") for k in range(0, 120, 6)]])  # fmt: skip
+def test_lines_end_at_a_crosswalk_and_go_on_behind(strokes: list[tuple[float, float, str]]) -> None:
+    before, behind = parts_along(*strokes, crosswalk=(58.0, 63.0))
+    assert before[0] == pytest.approx(0.0, abs=0.3)
+    assert 56.7 < before[1] < 58.1
+    assert 62.9 < behind[0] < 66.3
+    assert behind[1] == pytest.approx(strokes[-1][1], abs=0.3)
+    assert {before[2], behind[2]} == {strokes[0][2]}
 
 
 @pytest.mark.parametrize(("dash_m", "gap_m"), [(3.0, 3.0), (1.5, 4.5), (6.0, 12.0), (3.0, 9.0)])

@@ -236,8 +236,8 @@ def sources_of(pieces: Pieces) -> tuple[str, ...]:
     return tuple(name for name, shows in (("camera", camera), ("lidar", lidar)) if shows)
 
 
-def find_lines(maps: PaintMaps, pieces: Pieces) -> list[Paint]:
-    """Make lines of pieces, also unlikely ones."""
+def find_lines(maps: PaintMaps, pieces: Pieces, crosswalks: NDArray[np.bool_]) -> list[Paint]:
+    """Make lines of pieces, also unlikely ones; they end at cells of `crosswalks` (R, C)."""
     out = []
     for chain in dashed_chains(pieces, touching_chains(pieces)):
         corners = chain.corners(pieces)
@@ -248,7 +248,7 @@ def find_lines(maps: PaintMaps, pieces: Pieces) -> list[Paint]:
         s = curve.s
         nearest = s[cKDTree(curve.xy).query(own.xy)[1]]
         painted = nearest[:, None] + own.length_m[:, None] * [-0.5, 0.5]
-        for begin, end, kind in parts_of(maps, curve, painted):
+        for begin, end, kind in parts_of(maps, curve, painted, crosswalks):
             member = own.take((nearest > begin - 1.0) & (nearest < end + 1.0))
             if not len(member) or end - begin < MIN_LINE_M:
                 continue
@@ -260,17 +260,19 @@ def find_lines(maps: PaintMaps, pieces: Pieces) -> list[Paint]:
     return drop_repeats(out)
 
 
-def parts_of(maps: PaintMaps, curve: Curve, painted: Array) -> list[tuple[float, float, str]]:
+def parts_of(
+    maps: PaintMaps, curve: Curve, painted: Array, crosswalks: NDArray[np.bool_]
+) -> list[tuple[float, float, str]]:
     """Part a curve by the likeliest kind: begin and end, m, and kind of each part.
 
-    `painted`: (K, 2): begin and end, m, of what stands out along it.
+    `painted`: (K, 2): begin and end, m, of what stands out along it. `crosswalks`: (R, C): cells of crosswalks, where lines end.
     """
     length = float(curve.s[-1])
     s = np.arange(STEP_M / 2, max(length, STEP_M), STEP_M)
     xy = curve.at(s)
     each = np.stack([maps.at(layer, xy) for layer in maps.probability[: len(LINES)]])
     cell, inside = maps.raster.index_of(xy)
-    observed = inside & maps.seen.ravel()[cell]
+    observed, crossed = (inside & layer.ravel()[cell] for layer in (maps.seen, crosswalks))
 
     def size(length_m: float) -> tuple[int, int]:
         return 2 * round(length_m / STEP_M / 2) + 1, 1
@@ -284,7 +286,7 @@ def parts_of(maps: PaintMaps, curve: Curve, painted: Array) -> list[tuple[float,
     bare: Array = np.asarray(~np.any(covered, axis=0), np.float64)
     each[LINES.index("dashed")] *= cv2.dilate(bare[None], np.ones(size(KIND_M)[::-1]))[0]
     usual = float(np.square(line).sum() / max(line.sum(), 1e-9))  # where there is paint: its mean, weighted by itself
-    kind = np.where(line > END_SHARE * usual, mean(each, KIND_M).argmax(axis=0), -1)
+    kind = np.where((line > END_SHARE * usual) & ~crossed, mean(each, KIND_M).argmax(axis=0), -1)
     runs = sorted((*run, LINES[k]) for k in range(len(LINES)) for run in runs_of(kind == k))
     gaps = [STEP_M * (b[0] - a[1]) for a, b in pairwise(runs) if a[2] == b[2] == "dashed"]
     longest_m = max(JUNCTION_M, LONG_GAPS * median(np.array(gaps))) if gaps else JUNCTION_M
@@ -292,9 +294,10 @@ def parts_of(maps: PaintMaps, curve: Curve, painted: Array) -> list[tuple[float,
     for first, last, of in runs:
         begin, end = float(s[first]) - STEP_M / 2, float(s[last - 1]) + STEP_M / 2
         before = parts[-1] if parts else (0.0, 0.0, "")
-        between = observed[(s > before[1]) & (s < begin)]
+        between = (s > before[1]) & (s < begin)
         most_m = longest_m if of == "dashed" else max(MIN_BARE_M, min(MAX_BARE * painted_m, MAX_BARE_M))
-        if before[2] == of and (begin - before[1] <= most_m or np.mean(between) <= 0.5):
+        near = begin - before[1] <= most_m or np.mean(observed[between]) <= 0.5
+        if before[2] == of and near and not crossed[between].any():
             parts[-1], painted_m = (before[0], end, of), painted_m + end - begin
         else:
             parts.append((begin, end, of))

@@ -130,7 +130,12 @@ def find_markings(ground: GroundMap) -> tuple[tuple[Marking, ...], tuple[RoadBor
 def find_paint(ground: GroundMap, maps: PaintMaps) -> list[Paint]:
     """Find what may be paint, also the unlikely."""
     areas = [area for kind in AREA_M2 for area in find_areas(ground, maps, kind)]
-    return areas + find_lines(maps, find_pieces(ground, maps, find_crests(maps, maps.line)))
+    crosswalks = np.zeros(maps.raster.shape, np.uint8)
+    for one in areas:
+        if one.kind == "crosswalk" and one.log_odds > 0:
+            cells = np.rint(np.column_stack(maps.raster.cells_of(one.xy)[::-1])).astype(np.int32)
+            cv2.fillPoly(crosswalks, [cells], 1)
+    return areas + find_lines(maps, find_pieces(ground, maps, find_crests(maps, maps.line)), crosswalks > 0)
 
 
 def list_markings(
