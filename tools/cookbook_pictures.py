@@ -30,7 +30,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
         "detect samples/crossing --detector lidar:vehicle --out {work}/boxes.json",
         "evaluate {work}/boxes.json --truth samples/crossing --protocol kitti --plot {out}",
     ),
-    "doubts": ("plot {work}/two_hertz.json --start 6.5 --stop 8.6 --extent 0,-14,75,14 --size 900x480 --out {out}",),
+    "doubts": ("plot {work}/motorway.json --start 2 --stop 4 --extent 60,-15,135,20 --size 900x480 --out {out}",),
     "evaluation": (f"plot {{sample}} --truth samples/crossing {SIZE} --out {{out}}",),
     "exports": ("plot {work}/motorway.json --extent 60,-15,130,20 --size 900x480 --out {out}",),
     "faults": ("inspect {work}/yawed --overlay {out}",),
