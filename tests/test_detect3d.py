@@ -80,9 +80,8 @@ def test_peaks_are_greatest_among_neighbors_of_the_same_center_and_strongest_fir
     rng = np.random.default_rng(1)
     maps = empty_maps(30, 20)
     maps[:3] = rng.normal(-2, 1, (3, 30, 20))
-    maps[8:14] = np.arange(6)[
-        :, None, None
-    ]  # the same box relative to each cell, so wide that all neighbors mean one object
+    # The same box relative to each cell, so wide that all neighbors mean one object.
+    maps[8:14] = np.arange(6)[:, None, None]
     found = decode_centers(maps, info(), LOW)
     padded = np.pad(maps[:3], ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     around = np.max([padded[:, i : i + 30, j : j + 20] for i in range(3) for j in range(3)], axis=0)

@@ -289,7 +289,14 @@ def dashes(dash_m: float, gap_m: float, *spans: tuple[float, float]) -> list[tup
     return [(b, b + dash_m, "dashed") for b in inside]
 
 
-@pytest.mark.parametrize("strokes", [[(0.0, 120.0, "solid")], [(0.0, 58.0, "solid"), (63.0, 120.0, "solid")], [(k, k + 3.0, "dashed") for k in range(0, 120, 6)]])  # fmt: skip
+@pytest.mark.parametrize(
+    "strokes",
+    [
+        [(0.0, 120.0, "solid")],
+        [(0.0, 58.0, "solid"), (63.0, 120.0, "solid")],
+        [(k, k + 3.0, "dashed") for k in range(0, 120, 6)],
+    ],
+)
 def test_lines_end_at_a_crosswalk_and_go_on_behind(strokes: list[tuple[float, float, str]]) -> None:
     before, behind = parts_along(*strokes, crosswalk=(58.0, 63.0))
     assert before[0] == pytest.approx(0.0, abs=0.3)

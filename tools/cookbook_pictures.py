@@ -20,7 +20,7 @@ from entry import run
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "samples/pictures"
 WIDTH_PX, MAX_BYTES = 800, 42_000
-SCENES = ("market", "motorway", "roadside", "two_hertz")
+SCENES = ("motorway", "roadside")
 SIZE = "--size 900x600"
 FRAME = 22  # of a film
 # By name: commands of log2sim, in which {work}, {sample} and {out} are the folder, the sample's scenario and the picture.

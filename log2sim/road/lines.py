@@ -296,8 +296,8 @@ def parts_of(
         before = parts[-1] if parts else (0.0, 0.0, "")
         between = (s > before[1]) & (s < begin)
         most_m = longest_m if of == "dashed" else max(MIN_BARE_M, min(MAX_BARE * painted_m, MAX_BARE_M))
-        near = begin - before[1] <= most_m or np.mean(observed[between]) <= 0.5
-        if before[2] == of and near and not crossed[between].any():
+        same = before[2] == of and not crossed[between].any()
+        if same and (begin - before[1] <= most_m or np.mean(observed[between]) <= 0.5):
             parts[-1], painted_m = (before[0], end, of), painted_m + end - begin
         else:
             parts.append((begin, end, of))
